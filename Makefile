@@ -1,0 +1,52 @@
+# Everything from a bare clone: Python 3.11+, pip and a C++17 compiler are all that is needed.
+SHELL := /bin/bash
+PYTHON ?= python3
+VENV ?= .venv
+RUN := $(VENV)/bin/python
+SOURCES := $(wildcard ops/csrc/* CMakeLists.txt)
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-slow bench lint format clean
+
+help: ## this list
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+setup: $(VENV)/.installed ## make the environment and build the kernels
+
+$(VENV)/.python:
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else f"gsparc needs Python 3.11 or newer; {sys.executable} is {sys.version.split()[0]}. Say: make PYTHON=python3.11")'
+	@command -v c++ >/dev/null || command -v g++ >/dev/null || command -v clang++ >/dev/null || { echo "gsparc needs a C++17 compiler (for example: apt-get install g++)"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES)
+	@echo "Installing what gsparc needs into $(VENV) (a few minutes the first time)"
+	$(VENV)/bin/pip install --quiet -c constraints.txt torch
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[dev,sweep]'
+	@touch $@
+
+demo: setup ## train on a small simulated site, print the table, draw the spectra (about two minutes)
+	$(RUN) train.py experiment=demo hydra.run.dir=demo
+
+test: setup ## fast tests (under 10 minutes on two cores)
+	$(RUN) -m pytest -m "not slow" --durations=10
+
+test-slow: setup ## slow tests: whole training runs, kills, sanitizers
+	$(RUN) -m pytest -m slow --durations=10
+
+bench: setup ## timings of the kernels as ratios
+	$(RUN) -m gsparc.bench
+
+lint: setup ## ruff and mypy
+	$(RUN) -m ruff check .
+	$(RUN) -m ruff format --check .
+	@rm -rf build/typed && mkdir -p build/typed/gsparc  # mypy sees the packages under their installed names
+	@cp -rs $(CURDIR)/gsparc/. build/typed/gsparc/ && for room in ops callbacks conf; do cp -rs $(CURDIR)/$$room build/typed/gsparc/; done
+	cd build/typed && $(CURDIR)/$(RUN) -m mypy --config-file $(CURDIR)/pyproject.toml gsparc
+
+format: setup ## let ruff rewrite the code
+	$(RUN) -m ruff check --fix .
+	$(RUN) -m ruff format .
+
+clean: ## remove what was built (keeps runs)
+	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache

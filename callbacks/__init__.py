@@ -1,0 +1,1 @@
+"""Lightning callbacks: densify and prune, opacity reset, cost ledger, pictures."""

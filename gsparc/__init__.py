@@ -1,0 +1,1 @@
+"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map."""

@@ -1,0 +1,1 @@
+"""Dataset rooms: one loader per layout, one schema for all."""

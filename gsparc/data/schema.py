@@ -1,0 +1,152 @@
+"""What a dataset declares about itself, and what one sample and one batch hold."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.ops import Pose, SphereGrid
+
+Kind = Literal["spectrum", "csi", "rssi"]
+
+
+@dataclass(frozen=True)
+class Site:
+    """The fixed facts of a measurement campaign.
+
+    Attributes:
+        name: dataset name as it appears in every log and summary.
+        kind: what a target is: `spectrum` (H, W) in [0, 1]; `csi` (antennas, subcarriers) complex;
+            `rssi` (1,) linear power.
+        static_end: which end never moves: `rx` (RFID) or `tx` (Sionna, NeWRF).
+        grid: directions of a spectrum; None for CSI and RSSI.
+        array: (M, 3) [m] receive element positions, receiver frame; None when unknown or one element.
+        normalisation: how the published spectrum was scaled: `max`, `minmax`, `power` or `none`.
+        carrier_hz: carrier frequency [Hz]; None when unknown.
+        subcarriers_hz: (K,) absolute frequencies [Hz]; None for spectra.
+        origin: (3,) float64 [m], world position that local coordinates are measured from.
+        box: (2, 3) float64 [m], lower and upper corner of everything measured, *local* coordinates.
+        target_scale: stored target = physical target / target_scale.
+        sha256: content hash of what was loaded.
+        stand_in: for a simulated replacement, the name of the release it stands in for; else None.
+        convergence_error: NMSE between two solver seeds for simulated data; else None.
+    """
+
+    name: str
+    kind: Kind
+    static_end: Literal["rx", "tx"]
+    grid: SphereGrid | None
+    array: np.ndarray | None
+    carrier_hz: float | None
+    subcarriers_hz: np.ndarray | None
+    origin: np.ndarray
+    box: np.ndarray
+    sha256: str
+    normalisation: str = "none"
+    target_scale: float = 1.0
+    stand_in: str | None = None
+    convergence_error: float | None = None
+
+    @property
+    def moving_end(self) -> Literal["rx", "tx"]:
+        """The end whose position is the query."""
+        return "tx" if self.static_end == "rx" else "rx"
+
+    @property
+    def wavelength(self) -> float | None:
+        """Carrier wavelength [m]; None when the carrier is unknown."""
+        return None if self.carrier_hz is None else 299_792_458.0 / self.carrier_hz
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Samples handed to a model together; positions are local float32 [m].
+
+    Attributes:
+        index: (B,) int64 row in the dataset.
+        tx: (B, 3) [m].
+        rx: one shared Pose, or B poses.
+        target: (B, H, W) float32, or (B, antennas, subcarriers) complex64, or (B, 1) float32.
+        mask: like target, bool, True where measured; None when everything was.
+        noise_variance: (B,) float32 in target units; None when unknown.
+    """
+
+    index: Tensor
+    tx: Tensor
+    rx: Pose
+    target: Tensor
+    mask: Tensor | None = None
+    noise_variance: Tensor | None = None
+
+    @property
+    def shared_pose(self) -> bool:
+        """Whether all samples see the field from the same pose (one plan serves them all)."""
+        return not self.rx.batched
+
+    def __len__(self) -> int:
+        return self.index.shape[0]
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """A whole dataset in memory; the arrays keep the precision and type they were stored in.
+
+    Attributes:
+        site: the fixed facts.
+        tx: (S, 3) float64 [m], local coordinates.
+        rx_position: (S, 3) float64 [m], local coordinates.
+        rx_rotation: (S, 3, 3) float64, local to world.
+        target: (S, ...) uint8 (255 = 1.0), float32 or complex64, divided by `site.target_scale`.
+        mask: bool like target, or None.
+        noise_variance: (S,) float32, or None.
+        directions: list of (paths, 3) unit vectors per sample, receiver frame, or None.
+        row_names: what a user calls each row (file name, CSV line), for messages.
+    """
+
+    site: Site
+    tx: np.ndarray
+    rx_position: np.ndarray
+    rx_rotation: np.ndarray
+    target: np.ndarray
+    mask: np.ndarray | None = None
+    noise_variance: np.ndarray | None = None
+    directions: list[np.ndarray] | None = None
+    row_names: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.target)
+
+    @property
+    def moving(self) -> np.ndarray:
+        """Positions of the moving end (S, 3) float64 [m]: the query axis of every method."""
+        return self.tx if self.site.moving_end == "tx" else self.rx_position
+
+    def targets(self, index: np.ndarray | Tensor) -> Tensor:
+        """Targets of the given rows as float32 or complex64, in stored units."""
+        chosen = torch.from_numpy(np.ascontiguousarray(self.target[np.asarray(index)]))
+        return chosen.float() / 255 if chosen.dtype == torch.uint8 else chosen
+
+    def batch(self, index: np.ndarray | Tensor) -> Batch:
+        """The given rows as one batch."""
+        rows = np.asarray(index)
+        if self.site.static_end == "rx":
+            first = rows[:1]
+            rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
+        else:
+            rx = Pose(self._f32(self.rx_position[rows]), self._f32(self.rx_rotation[rows]))
+        return Batch(
+            index=torch.from_numpy(rows.astype(np.int64)),
+            tx=self._f32(self.tx[rows]),
+            rx=rx,
+            target=self.targets(rows),
+            mask=None if self.mask is None else torch.from_numpy(self.mask[rows]),
+            noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
+        )
+
+    @staticmethod
+    def _f32(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

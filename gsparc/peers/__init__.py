@@ -1,0 +1,1 @@
+"""Other methods of the field behind the same face, from the mean image to the Gaussian process."""

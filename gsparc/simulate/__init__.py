@@ -1,0 +1,1 @@
+"""Simulators whose ground truth is known."""

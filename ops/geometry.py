@@ -1,0 +1,133 @@
+"""Where a receiver stands and which directions it looks at."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Receiver poses.
+
+    Attributes:
+        position: (3,) or (P, 3) [m], world frame.
+        rotation: (3, 3) or (P, 3, 3), local to world; columns are the local axes seen from the world.
+    """
+
+    position: Tensor
+    rotation: Tensor
+
+    def __post_init__(self) -> None:
+        if self.position.shape[-1:] != (3,) or self.rotation.shape[-2:] != (3, 3):
+            raise ValueError(
+                f"a pose needs position (..., 3) and rotation (..., 3, 3), "
+                f"got {tuple(self.position.shape)} and {tuple(self.rotation.shape)}"
+            )
+        if self.position.shape[:-1] != self.rotation.shape[:-2] or self.position.dim() > 2:
+            raise ValueError(
+                f"position and rotation must agree on one optional leading axis, "
+                f"got {tuple(self.position.shape)} and {tuple(self.rotation.shape)}"
+            )
+
+    @property
+    def batched(self) -> bool:
+        """Whether there is one pose per sample (P, 3) rather than one for all (3,)."""
+        return self.position.dim() == 2
+
+    def __len__(self) -> int:
+        return self.position.shape[0] if self.batched else 1
+
+    def __getitem__(self, index: int | slice | Tensor) -> Pose:
+        if not self.batched:
+            raise TypeError("this pose is shared by all samples and cannot be indexed")
+        return Pose(self.position[index], self.rotation[index])
+
+    def to(self, *args, **kwargs) -> Pose:
+        """The same poses with another dtype or on another device."""
+        return Pose(self.position.to(*args, **kwargs), self.rotation.to(*args, **kwargs))
+
+    def local(self, points: Tensor) -> Tensor:
+        """World points (N, 3) [m] in the receiver frame: (N, 3), or (P, N, 3) for P poses."""
+        # (x - p) R applies R^T to each row.
+        return (points - self.position.unsqueeze(-2)) @ self.rotation
+
+    @staticmethod
+    def identity(position: Tensor) -> Pose:
+        """Poses at `position` (3,) or (P, 3) [m] whose local axes are the world's."""
+        eye = torch.eye(3, dtype=position.dtype, device=position.device)
+        return Pose(position, eye.expand(*position.shape[:-1], 3, 3))
+
+
+@dataclass(frozen=True)
+class SphereGrid:
+    """Directions on the receiver's sphere; row i and column j are pixel *centres*.
+
+    Elevation is `atan2(z, hypot(x, y))` in [-pi/2, pi/2], azimuth `atan2(y, x)` in (-pi, pi],
+    both in the receiver's local frame (boresight z).
+
+    Attributes:
+        height, width: number of elevations and azimuths.
+        first_elevation, first_azimuth: centre of pixel (0, 0) [rad].
+        elevation_step, azimuth_step: spacing of the centres, positive [rad].
+    """
+
+    height: int
+    width: int
+    first_elevation: float
+    first_azimuth: float
+    elevation_step: float
+    azimuth_step: float
+
+    def __post_init__(self) -> None:
+        if self.height < 1 or self.width < 1 or self.elevation_step <= 0 or self.azimuth_step <= 0:
+            raise ValueError(f"a grid needs at least one pixel and positive steps, got {self}")
+        if self.width * self.azimuth_step > 2 * math.pi * (1 + 1e-6):
+            raise ValueError(f"{self.width} columns of {self.azimuth_step} rad exceed the circle")
+
+    @property
+    def periodic(self) -> bool:
+        """Whether the columns close the circle, so that footprints wrap in azimuth."""
+        return abs(self.width * self.azimuth_step - 2 * math.pi) < 1e-6
+
+    def elevations(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Row centres (H,) [rad]."""
+        return self.first_elevation + self.elevation_step * torch.arange(self.height, dtype=dtype)
+
+    def azimuths(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Column centres (W,) [rad]."""
+        return self.first_azimuth + self.azimuth_step * torch.arange(self.width, dtype=dtype)
+
+    def directions(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Unit vectors of the pixel centres (H, W, 3), receiver frame."""
+        elevation, azimuth = self.elevations(torch.float64)[:, None], self.azimuths(torch.float64)[None, :]
+        horizontal = elevation.cos()
+        return torch.stack(
+            [
+                horizontal * azimuth.cos(),
+                horizontal * azimuth.sin(),
+                elevation.sin().expand(self.height, self.width),
+            ],
+            dim=-1,
+        ).to(dtype)
+
+    def solid_angles(self, dtype: torch.dtype = torch.float64) -> Tensor:
+        """Solid angle of each pixel (H, W) [sr]; cells are cut off at the poles."""
+        elevation, half = self.elevations(torch.float64), self.elevation_step / 2
+        upper = (elevation + half).clamp(-math.pi / 2, math.pi / 2).sin()
+        lower = (elevation - half).clamp(-math.pi / 2, math.pi / 2).sin()
+        return ((upper - lower) * self.azimuth_step)[:, None].expand(self.height, self.width).to(dtype)
+
+    @staticmethod
+    def hemisphere(height: int = 90, width: int = 360) -> SphereGrid:
+        """The RFID release's grid: row i at i steps above the horizon, column j at j steps of azimuth."""
+        return SphereGrid(height, width, 0.0, 0.0, math.pi / 2 / height, 2 * math.pi / width)
+
+    @staticmethod
+    def full_sphere(height: int = 180, width: int = 360) -> SphereGrid:
+        """All directions; row centres half a step from the poles, column 0 at azimuth 0."""
+        step = math.pi / height
+        return SphereGrid(height, width, -math.pi / 2 + step / 2, 0.0, step, 2 * math.pi / width)
