@@ -1,0 +1,81 @@
+"""How sure the field is of a position: C = 1 + exp(g(x)) (paper, eq. 7; DUSt3R's form)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.encoding import EncodingSettings, PositionEncoding
+
+
+@dataclass(frozen=True)
+class ConfidenceSettings:
+    """The confidence network and its weight in the loss.
+
+    Attributes:
+        enabled: off means C = 1 and no network.
+        hidden: hidden units (paper: 32).
+        alpha: weight of -log C (paper: 0.3); the optimum without the floor is C = alpha / L.
+        clamp: bound on |g|, so that exp(g) and C L stay finite in float32.
+        encoding: how the moving end's position enters (paper: raw).
+    """
+
+    enabled: bool = True
+    hidden: int = 32
+    alpha: float = 0.3
+    clamp: float = 10.0
+    encoding: EncodingSettings = field(default_factory=lambda: EncodingSettings(kind="raw"))
+
+
+class Confidence(nn.Module):
+    """A network E -> hidden -> 1 of the moving end's position, and the stored range of its output.
+
+    Args:
+        settings: shape and weight.
+        encoding: encoder of the position.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(self, settings: ConfidenceSettings, encoding: PositionEncoding) -> None:
+        super().__init__()
+        self.settings = settings
+        self.encoding = encoding
+        self.network = nn.Sequential(
+            nn.Linear(encoding.width, settings.hidden), nn.ReLU(), nn.Linear(settings.hidden, 1)
+        )
+        # The range that normalises C is measured on calibration data, never on the test set.
+        self.register_buffer("low", torch.zeros(()))
+        self.register_buffer("high", torch.ones(()))
+
+    def exponent(self, position: Tensor) -> Tensor:
+        """g (B,), clamped: position (B, 3) [m]."""
+        g = self.network(self.encoding(position)).squeeze(-1).float()
+        return g.clamp(-self.settings.clamp, self.settings.clamp)
+
+    def calibrate(self, position: Tensor) -> None:
+        """Store the range of g over calibration positions (n, 3) [m]."""
+        with torch.no_grad():
+            g = self.exponent(position)
+            self.low.copy_(g.min())
+            self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
+
+    def normalised(self, position: Tensor) -> Tensor:
+        """Confidence in [0, 1] (B,): C between the least and the largest C of the calibration data."""
+        low, high, g = self.low.exp(), self.high.exp(), self.exponent(position).exp()
+        return ((g - low) / (high - low)).clamp(0, 1)
+
+    def error_level(self, position: Tensor) -> Tensor:
+        """The task loss this confidence expects, alpha / C (B,)."""
+        return self.settings.alpha / (1 + self.exponent(position).exp())
+
+
+def weighted(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:
+    """C L - alpha log C per sample (paper, eq. 7): loss (B,), exponent g (B,) -> (B,).
+
+    log C = log(1 + e^g) is a softplus, finite and with a finite slope for every g.
+    """
+    return (1 + exponent.exp()) * loss - alpha * nn.functional.softplus(exponent)

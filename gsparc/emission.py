@@ -1,0 +1,87 @@
+"""What each Gaussian sends towards the receiver: one small network per Gaussian, evaluated together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.encoding import EncodingSettings, PositionEncoding
+
+
+@dataclass(frozen=True)
+class EmissionSettings:
+    """Shape of the emission networks (paper: 3-16-2, raw coordinates).
+
+    Attributes:
+        encoding: how the moving end's position enters.
+        hidden: hidden units; 0 makes the network linear in the encoding.
+        activation: of the output: `sigmoid` (powers in (0, 1), carries the log-distance term),
+            `softplus` (powers without a ceiling) or `linear` (signed CSI).
+        log_distance: subtract log d_i before the sigmoid (eq. 1 of the paper).
+        init_scale: standard deviation of the last layer's initial weights.
+        init_bias: initial bias of the output, in units of the activation's input.
+    """
+
+    encoding: EncodingSettings = field(default_factory=EncodingSettings)
+    hidden: int = 32
+    activation: Literal["sigmoid", "softplus", "linear"] = "sigmoid"
+    log_distance: bool = True
+    init_scale: float = 0.1
+    init_bias: float = 0.0
+
+
+class Emission(nn.Module):
+    """N networks E -> hidden -> C; every weight has the Gaussian as its first axis.
+
+    Args:
+        settings: shape of the networks.
+        count: number of Gaussians N.
+        channels: real output channels C.
+        encoding: encoder shared by all Gaussians.
+    """
+
+    per_gaussian = True  # every weight has one row per Gaussian; surgery edits them together
+
+    def __init__(self, settings: EmissionSettings, count: int, channels: int, encoding: PositionEncoding) -> None:
+        super().__init__()
+        if settings.log_distance and settings.activation != "sigmoid":
+            raise ValueError(
+                f"model.emission.log_distance=true needs activation=sigmoid, got {settings.activation!r}: "
+                "a signed or unbounded output has no logarithm to shift"
+            )
+        self.settings = settings
+        self.channels = channels
+        self.encoding = encoding
+        width, hidden = encoding.width, settings.hidden
+        inner = hidden or width
+        if hidden:
+            self.weight1 = nn.Parameter(torch.randn(count, width, hidden) / math.sqrt(width))
+            self.bias1 = nn.Parameter(torch.randn(count, hidden) * 0.1)
+        self.weight2 = nn.Parameter(torch.randn(count, inner, channels) * settings.init_scale / math.sqrt(inner))
+        self.bias2 = nn.Parameter(torch.full((count, channels), float(settings.init_bias)))
+
+    def logits(self, position: Tensor) -> Tensor:
+        """Network outputs before the activation: position (B, 3) [m] -> (B, N, C)."""
+        encoded = self.encoding(position)
+        if not self.settings.hidden:
+            count, width, channels = self.weight2.shape
+            flat = self.weight2.permute(1, 0, 2).reshape(width, count * channels)
+            return (encoded @ flat).view(-1, count, channels) + self.bias2
+        count, width, hidden = self.weight1.shape
+        # One product for all Gaussians: the encoded position is the same for each of them.
+        inner = (encoded @ self.weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(-1, count, hidden)
+        inner = torch.relu(inner + self.bias1)
+        return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
+
+    def forward(self, position: Tensor, distance: Tensor) -> Tensor:
+        """Emission (B, N, C) at position (B, 3) [m]; distance (B, N) is d_i / d_ref, without unit (eq. 1)."""
+        logits = self.logits(position)
+        if self.settings.log_distance:
+            logits = logits - distance.log().unsqueeze(-1)
+        if self.settings.activation == "sigmoid":
+            return torch.sigmoid(logits)
+        return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits

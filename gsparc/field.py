@@ -1,0 +1,113 @@
+"""The Gaussian field: where radio energy comes from, as N anisotropic 3D Gaussians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """Size and initial state of the field.
+
+    Attributes:
+        count: initial number of Gaussians N.
+        init: `uniform` in the scene box enlarged by `margin` (the paper), or `sphere`: evenly spread
+            directions around the static receiver at distances between `near` and `far`.
+        margin: enlargement of the box on each side [m].
+        near, far: range of distances of `sphere` [m].
+        opacity: initial opacity in (0, 1).
+        scale: initial standard deviation [m]; null takes the spacing between neighbours.
+    """
+
+    count: int = 500
+    init: Literal["uniform", "sphere"] = "sphere"
+    margin: float = 2.0
+    near: float = 1.0
+    far: float = 6.0
+    opacity: float = 0.3
+    scale: float | None = None
+
+
+class GaussianField(nn.Module):
+    """Geometry and opacity of N Gaussians, in unconstrained form, with permanent ids.
+
+    Attributes:
+        means: (N, 3) [m], local world frame.
+        log_scales: (N, 3), log of the standard deviations [m].
+        quats: (N, 4), (w, x, y, z), any length but zero.
+        opacity_logits: (N,).
+        ids: (N,) int64, permanent: ties in depth are ordered by them.
+        next_id: () int64, the first id never used.
+        version: () int64, counts every edit of the parameters: frozen plans check it.
+    """
+
+    per_gaussian = True
+    ids: Tensor
+    next_id: Tensor
+    version: Tensor
+
+    def __init__(self, means: Tensor, scales: Tensor, opacity: float) -> None:
+        super().__init__()
+        count = len(means)
+        self.means = nn.Parameter(means.float())
+        self.log_scales = nn.Parameter(scales.float().log())
+        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
+        self.opacity_logits = nn.Parameter(torch.full((count,), math.log(opacity / (1 - opacity))))
+        self.register_buffer("ids", torch.arange(count))
+        self.register_buffer("next_id", torch.tensor(count))
+        self.register_buffer("version", torch.tensor(0))
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations (N, 3) [m]."""
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        """Opacities (N,) in (0, 1)."""
+        return torch.sigmoid(self.opacity_logits)
+
+
+def initial_field(
+    settings: FieldSettings, box: Tensor, receiver: Tensor | None, rotation: Tensor | None
+) -> GaussianField:
+    """A field before training.
+
+    Args:
+        settings: size and initial state.
+        box: (2, 3) [m], scene box, local frame.
+        receiver: (3,) [m], the static receiver; None when it moves (then `sphere` is refused).
+        rotation: (3, 3), its local-to-world rotation.
+
+    Raises:
+        ValueError: `init=sphere` without a static receiver, or an unknown `init`.
+    """
+    count = settings.count
+    if settings.init == "uniform":
+        low, high = box[0] - settings.margin, box[1] + settings.margin
+        means = low + (high - low) * torch.rand(count, 3)
+        spacing = ((high - low).prod() / max(count, 1)) ** (1 / 3)
+        scales = torch.full((count, 3), float(settings.scale or spacing / 2))
+        return GaussianField(means, scales, settings.opacity)
+    if settings.init != "sphere":
+        raise ValueError(f"model.field.init={settings.init!r}: choose uniform or sphere")
+    if receiver is None or rotation is None:
+        raise ValueError("model.field.init=sphere needs a static receiver; here it moves: use init=uniform")
+    step = torch.arange(count) + 0.5
+    height = step / count  # equal areas on the upper hemisphere
+    azimuth = math.pi * (1 + 5**0.5) * step  # golden angle: a Fibonacci lattice
+    horizontal = (1 - height**2).sqrt()
+    directions = torch.stack([horizontal * azimuth.cos(), horizontal * azimuth.sin(), height], -1)
+    distance = settings.near + (settings.far - settings.near) * torch.rand(count, 1)
+    means = receiver.float() + distance * directions @ rotation.float().T
+    spacing = math.sqrt(2 * math.pi / max(count, 1))
+    scales = settings.scale * torch.ones(count, 3) if settings.scale else (distance * spacing * 0.6).expand(-1, 3)
+    return GaussianField(means, scales, settings.opacity)

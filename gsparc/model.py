@@ -1,0 +1,201 @@
+"""A position becomes a spectrum or a channel: field -> emission -> attenuation -> rasterizer."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.confidence import Confidence, ConfidenceSettings
+from gsparc.data.schema import Site
+from gsparc.emission import Emission, EmissionSettings
+from gsparc.encoding import PositionEncoding
+from gsparc.field import FieldSettings, GaussianField, initial_field
+from gsparc.ops import Cutoff, FrozenPlan, Pose, Raster, SphereGrid, freeze, make_plan, mean_weights, rasterize
+
+FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
+
+
+@dataclass(frozen=True)
+class AttenuationSettings:
+    """Distance law between transmitter and Gaussians.
+
+    Attributes:
+        inverse_distance: multiply emissions by gain / d_i (paper, eq. 3); off multiplies by 1.
+        d_min: softening of d_i at the transmitter [m].
+        d_ref: distance that counts as 1 [m]; null takes the distance between the static end and the
+            middle of the moving end's box, because 1/d in metres caps the image.
+        gain: initial gain.
+        learn_gain: whether the gain is trained.
+    """
+
+    inverse_distance: bool = True
+    d_min: float = 0.05
+    d_ref: float | None = None
+    gain: float = 2.0
+    learn_gain: bool = True
+
+
+@dataclass(frozen=True)
+class RasterSettings:
+    """How footprints become pixels.
+
+    Attributes:
+        projection: `equirect` (the paper; inexact near the pole) or `tangent`.
+        low_pass: variance added to every footprint [px^2].
+        compensate: keep a footprint's energy under the low-pass.
+        alpha_cutoff: smallest alpha that counts in images.
+        relative_cutoff: smallest share of a footprint's peak that counts in channels.
+        backend: `reference`, `cpu`, `cuda`; null chooses by device.
+    """
+
+    projection: str = "equirect"
+    low_pass: float = 0.3
+    compensate: bool = True
+    alpha_cutoff: float = 1 / 255
+    relative_cutoff: float = 1e-3
+    backend: str | None = None
+
+
+@dataclass(frozen=True)
+class ModelSettings:
+    """Everything that shapes the model; see the parts."""
+
+    field: FieldSettings = field(default_factory=FieldSettings)
+    emission: EmissionSettings = field(default_factory=EmissionSettings)
+    attenuation: AttenuationSettings = field(default_factory=AttenuationSettings)
+    raster: RasterSettings = field(default_factory=RasterSettings)
+    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A prediction and, for spectra, the raster it came from (densification reads its gradients)."""
+
+    mean: Tensor
+    raster: Raster | None
+
+
+class GaussianModel(nn.Module):
+    """The trainable model for one site.
+
+    Args:
+        settings: all switches.
+        site: what the dataset declares.
+        receiver: the static receiver's pose, or None when it moves.
+        transmitter: (3,) [m], the static transmitter, or None when it moves.
+    """
+
+    def __init__(
+        self, settings: ModelSettings, site: Site, receiver: Pose | None = None, transmitter: Tensor | None = None
+    ) -> None:
+        super().__init__()
+        self.settings = settings
+        self.site = site
+        box = torch.as_tensor(site.box).float()
+        self.gaussians: GaussianField = initial_field(
+            settings.field,
+            box,
+            None if receiver is None else receiver.position,
+            None if receiver is None else receiver.rotation,
+        )
+        encoding = PositionEncoding(settings.emission.encoding, box, site.wavelength)
+        self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
+        self.confidence = (
+            Confidence(settings.confidence, PositionEncoding(settings.confidence.encoding, box, site.wavelength))
+            if settings.confidence.enabled
+            else None
+        )
+        static = receiver.position if receiver is not None else transmitter
+        apart = None if static is None else float((static.float() - box.mean(0)).norm())
+        self.d_ref = settings.attenuation.d_ref or (apart if apart and apart > 0.1 else 1.0)
+        self.log_gain = nn.Parameter(
+            torch.tensor(math.log(settings.attenuation.gain)), requires_grad=settings.attenuation.learn_gain
+        )
+        if site.kind == "csi":
+            self.response = ChannelResponse(len(self.gaussians), site)
+
+    @property
+    def channels(self) -> int:
+        """Real outputs of each emission network: one power, or one complex gain."""
+        return 2 if self.site.kind == "csi" else 1
+
+    def moving(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Position of the moving end (B, 3) [m]."""
+        return tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3)
+
+    def features(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
+        settings = self.settings.attenuation
+        offset = tx[:, None, :] - self.gaussians.means
+        distance = (offset.square().sum(-1) + settings.d_min**2).sqrt() / self.d_ref
+        emitted = self.emission(self.moving(tx, rx), distance)
+        gain = self.log_gain.exp()
+        return emitted * (gain / distance).unsqueeze(-1) if settings.inverse_distance else emitted
+
+    def forward(self, tx: Tensor, rx: Pose) -> Rendered:
+        """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
+        features = self.features(tx, rx)
+        if self.site.kind == "spectrum":
+            raster = rasterize(*self._geometry(), features, rx, self._grid(), **self._raster_options())
+            return Rendered(raster.image.squeeze(1), raster)
+        weights = mean_weights(*self._geometry(), rx, self._grid(), **self._raster_options()).share
+        if self.site.kind == "rssi":
+            return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
+        gains = torch.view_as_complex(features.contiguous())
+        return Rendered(self.response(weights * gains), None)
+
+    def freeze(self, rx: Pose) -> FrozenPlan:
+        """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
+        with torch.no_grad():
+            plan = make_plan(*self._geometry(), rx, self._grid(), **self._raster_options())
+            return freeze(plan, *self._geometry(), version=int(self.gaussians.version))
+
+    def _geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        g = self.gaussians
+        return g.means, g.quats, g.scales, g.opacities
+
+    def _grid(self) -> SphereGrid:
+        return self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
+
+    def _raster_options(self) -> dict:
+        settings = self.settings.raster
+        spectrum = self.site.kind == "spectrum"
+        cutoff = Cutoff(settings.alpha_cutoff if spectrum else settings.relative_cutoff, relative=not spectrum)
+        return {
+            "projection": settings.projection,
+            "low_pass": settings.low_pass,
+            "compensate": settings.compensate,
+            "cutoff": cutoff,
+            "ids": self.gaussians.ids,
+            "backend": settings.backend,
+        }
+
+
+class ChannelResponse(nn.Module):
+    """Factored channels: each Gaussian's gain spreads over antennas and subcarriers by its own response.
+
+    H = w g R with R (N, A K) complex, so that many channels are one small matrix product and never one
+    network output each. R starts at one.
+
+    Args:
+        count: number of Gaussians N.
+        site: declares antennas A and subcarriers K.
+    """
+
+    per_gaussian = True
+
+    def __init__(self, count: int, site: Site) -> None:
+        super().__init__()
+        self.antennas = 1 if site.array is None else len(site.array)
+        self.subcarriers = 1 if site.subcarriers_hz is None else len(site.subcarriers_hz)
+        width = self.antennas * self.subcarriers
+        self.real = nn.Parameter(torch.ones(count, width))
+        self.imaginary = nn.Parameter(torch.zeros(count, width))
+
+    def forward(self, weighted: Tensor) -> Tensor:
+        """Visible gains (B, N) complex -> channels (B, A, K) complex."""
+        response = torch.complex(self.real, self.imaginary)
+        return (weighted @ response).view(-1, self.antennas, self.subcarriers)

@@ -1,0 +1,99 @@
+"""The one place that adds and removes Gaussians: parameters, Adam moments, statistics and ids together."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from gsparc.field import GaussianField
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Rows to keep and rows to append.
+
+    Attributes:
+        keep: (N,) bool.
+        parents: (M,) int64, row each appended Gaussian is copied from.
+        replace: values (M, ...) that differ from the parents', by parameter name.
+    """
+
+    keep: Tensor
+    parents: Tensor
+    replace: Mapping[str, Tensor] = field(default_factory=dict)
+
+
+def row_parameters(root: nn.Module, count: int) -> dict[str, nn.Parameter]:
+    """Every parameter that belongs to single Gaussians, by dotted name; their first axis is N."""
+    rows = {}
+    for name, module in root.named_modules():
+        if not getattr(module, "per_gaussian", False):
+            continue
+        for key, parameter in module.named_parameters(recurse=False):
+            if parameter.dim() and parameter.shape[0] == count:
+                rows[f"{name}.{key}" if name else key] = parameter
+    return rows
+
+
+def apply(
+    edit: Edit,
+    root: nn.Module,
+    gaussians: GaussianField,
+    optimizer: Optimizer | None = None,
+    statistics: Mapping[str, Tensor] | None = None,
+) -> dict[str, Tensor]:
+    """Edit all per-Gaussian state at once.
+
+    Appended rows start with zero Adam moments and zero statistics and get fresh ids; kept rows stay
+    bit-identical in everything.
+
+    Args:
+        edit: what to keep and what to append.
+        root: module that holds the field and every other per-Gaussian parameter.
+        gaussians: the field inside `root`.
+        optimizer: one parameter tensor per group.
+        statistics: (N, ...) tensors kept per Gaussian.
+
+    Returns:
+        The edited statistics.
+    """
+    rows = row_parameters(root, len(gaussians))
+    groups = {} if optimizer is None else {id(g["params"][0]): g for g in optimizer.param_groups}
+    for name, old in rows.items():
+        added = edit.replace.get(name, old.detach()[edit.parents])
+        new = nn.Parameter(torch.cat([old.detach()[edit.keep], added.to(old.dtype)]))
+        _set(root, name, new)
+        group = groups.get(id(old))
+        if optimizer is None or group is None:
+            continue
+        group["params"][0] = new
+        state = optimizer.state.pop(old, None)
+        if state is not None:
+            for key in ("exp_avg", "exp_avg_sq"):
+                moment = state[key]
+                state[key] = torch.cat([moment[edit.keep], torch.zeros_like(added, dtype=moment.dtype)])
+            optimizer.state[new] = state
+    fresh = gaussians.next_id + torch.arange(len(edit.parents))
+    gaussians.ids = torch.cat([gaussians.ids[edit.keep], fresh])
+    gaussians.next_id += len(edit.parents)
+    gaussians.version += 1
+    return {
+        key: torch.cat([value[edit.keep], value.new_zeros(len(edit.parents), *value.shape[1:])])
+        for key, value in (statistics or {}).items()
+    }
+
+
+def resize(root: nn.Module, gaussians: GaussianField, count: int) -> None:
+    """Give every per-Gaussian tensor `count` rows of zeros, so that a state dict of that size fits."""
+    for name, old in row_parameters(root, len(gaussians)).items():
+        _set(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
+    gaussians.ids = gaussians.ids.new_zeros(count)
+
+
+def _set(root: nn.Module, dotted: str, parameter: nn.Parameter) -> None:
+    path, _, leaf = dotted.rpartition(".")
+    setattr(root.get_submodule(path), leaf, parameter)
