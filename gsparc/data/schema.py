@@ -90,6 +90,25 @@ class Batch:
     def __len__(self) -> int:
         return self.index.shape[0]
 
+    def to(self, device: torch.device | str) -> Batch:
+        """The same batch on another device."""
+        return Batch(
+            index=self.index.to(device),
+            tx=self.tx.to(device),
+            rx=self.rx.to(device),
+            target=self.target.to(device),
+            mask=None if self.mask is None else self.mask.to(device),
+            noise_variance=None if self.noise_variance is None else self.noise_variance.to(device),
+        )
+
+    def to(self, device: torch.device | str) -> Batch:
+        """The same samples on another device."""
+        moved = {
+            name: value.to(device) if isinstance(value, (Tensor, Pose)) else value
+            for name, value in vars(self).items()
+        }
+        return Batch(**moved)
+
 
 @dataclass(frozen=True)
 class Measurements:
@@ -105,6 +124,8 @@ class Measurements:
         noise_variance: (S,) float32, or None.
         directions: list of (paths, 3) unit vectors per sample, receiver frame, or None.
         row_names: what a user calls each row (file name, CSV line), for messages.
+        release_split: (train, test) int64 rows that the data themselves name, or None.
+        provenance: where the data came from, as their makers wrote it down.
     """
 
     site: Site
@@ -116,6 +137,8 @@ class Measurements:
     noise_variance: np.ndarray | None = None
     directions: list[np.ndarray] | None = None
     row_names: list[str] = field(default_factory=list)
+    release_split: tuple[np.ndarray, np.ndarray] | None = None
+    provenance: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.target)

@@ -1,10 +1,26 @@
-"""Which rows train, validate and test; stored as index files with a hash."""
+"""Which rows train, validate and test: pure functions of positions and settings, stored with a hash."""
 
 from __future__ import annotations
 
+import difflib
+import hashlib
+import json
+import logging
+import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.data.errors import DataError
+
+log = logging.getLogger(__name__)
+
+NAMES = ("random", "grouped", "block", "sparse")
+PATH_STEP_RATIO = (
+    4.0  # rows form a path while their median step is below this many nearest-neighbour distances
+)
 
 
 @dataclass(frozen=True)
@@ -33,3 +49,231 @@ class Split:
     name: str
     folds: tuple[Fold, ...]
     sha256: str
+
+
+@dataclass(frozen=True)
+class SplitSettings:
+    """How to split; one instance of the config group `split`.
+
+    Attributes:
+        name: `random`, `grouped`, `block` or `sparse`.
+        seed: of every random choice below.
+        val_fraction: share of each fold's training rows kept for validation.
+        test_fraction: share of the rows that `random` (without files) and `block` hold out.
+        redraw: `random` ignores the release's own files and draws anew.
+        folds: number of folds of `grouped`.
+        stretches_per_fold: `grouped` cuts the path into folds x this many stretches.
+        buffer_m: `grouped` and `block` drop training rows this close to a test row [m].
+        corner: of `block`, lower or upper end in x and y as `--`, `-+`, `+-` or `++`.
+        train_fraction: share of the rows that `sparse` trains on.
+        train_count: thin each fold's training rows to this many (validation included); None keeps all.
+        thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
+    """
+
+    name: str = "random"
+    seed: int = 0
+    val_fraction: float = 0.1
+    test_fraction: float = 0.2
+    redraw: bool = False
+    folds: int = 5
+    stretches_per_fold: int = 1
+    buffer_m: float = 0.03
+    corner: str = "++"
+    train_fraction: float = 0.1
+    train_count: int | None = None
+    thin: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.name not in NAMES:
+            close = difflib.get_close_matches(self.name, [*NAMES, "file"], n=1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            raise DataError(f"split: {self.name!r} is none of {', '.join(NAMES)}, file{hint}")
+        for key in ("test_fraction", "train_fraction"):
+            if not 0 < getattr(self, key) < 1:
+                raise DataError(f"split.{key}={getattr(self, key)}: expected a share between 0 and 1")
+        if not 0 <= self.val_fraction < 1:
+            raise DataError(
+                f"split.val_fraction={self.val_fraction}: expected a share of at least 0, below 1"
+            )
+        if not 0 < self.thin <= 1:
+            raise DataError(f"split.thin={self.thin}: expected a share above 0, at most 1")
+        if self.train_count is not None and self.train_count < 1:
+            raise DataError(f"split.train_count={self.train_count}: expected at least 1 row")
+        if self.folds < 2 or self.stretches_per_fold < 1:
+            raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
+        if not (np.isfinite(self.buffer_m) and self.buffer_m >= 0):
+            raise DataError(f"split.buffer_m={self.buffer_m}: expected metres, at least 0")
+        if len(self.corner) != 2 or set(self.corner) - set("+-"):
+            raise DataError(f"split.corner={self.corner!r}: expected one of --, -+, +-, ++")
+
+
+def make_split(
+    positions: np.ndarray,
+    settings: SplitSettings,
+    release_split: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Split:
+    """Split rows by the positions of the moving end.
+
+    Args:
+        positions: (S, 3) [m] of the moving end.
+        settings: how.
+        release_split: (train, test) rows that the release names; used by `random` only.
+
+    Raises:
+        DataError: a fold would have no training, or no test rows.
+    """
+    rows = len(positions)
+    if settings.name == "grouped":
+        pairs = _grouped(positions, settings)
+    elif settings.name == "block":
+        pairs = [_block(positions, settings)]
+    elif settings.name == "random" and release_split is not None and not settings.redraw:
+        pairs = [(np.sort(release_split[0]), np.sort(release_split[1]))]
+    else:
+        test_share = settings.test_fraction if settings.name == "random" else 1 - settings.train_fraction
+        order = np.random.default_rng(settings.seed).permutation(rows)
+        train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
+        pairs = [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
+    folds = tuple(_finish(i, train, test, positions, settings) for i, (train, test) in enumerate(pairs))
+    return Split(settings.name, folds, indices_hash(folds))
+
+
+def path_order(positions: np.ndarray) -> np.ndarray:
+    """Rows (S,) in the order of the measuring path.
+
+    Rows taken one after the other keep their order. Where consecutive rows are far apart compared with
+    nearest neighbours (a shuffled file, random drops) there is no path: rows are ordered along the
+    longest side of the box, so that a stretch becomes a slab.
+    """
+    rows = np.arange(len(positions))
+    if len(positions) < 3:
+        return rows
+    step = np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1))
+    nearest = np.median(cKDTree(positions).query(positions, k=2)[0][:, 1])
+    if step <= PATH_STEP_RATIO * nearest:
+        return rows
+    longest = int(np.argmax(np.ptp(positions, axis=0)))
+    return np.argsort(positions[:, longest], kind="stable")
+
+
+def far_from(
+    positions: np.ndarray, candidates: np.ndarray, others: np.ndarray, distance: float
+) -> np.ndarray:
+    """Those of `candidates` (rows) that are more than `distance` [m] away from each of `others` (rows)."""
+    if len(candidates) == 0 or len(others) == 0:
+        return candidates
+    return candidates[cKDTree(positions[others]).query(positions[candidates])[0] > distance]
+
+
+def indices_hash(folds: tuple[Fold, ...]) -> str:
+    """SHA-256 of all indices of all folds."""
+    digest = hashlib.sha256()
+    for fold in folds:
+        for part in (fold.train, fold.val, fold.test):
+            digest.update(len(part).to_bytes(8, "little") + part.astype("<i8").tobytes())
+    return digest.hexdigest()
+
+
+def write_split(path: str | Path, split: Split, rows: int, dataset_sha256: str = "") -> None:
+    """Store a split of `rows` rows as a JSON index file (atomically)."""
+    content = {
+        "schema": 1,
+        "name": split.name,
+        "rows": rows,
+        "dataset_sha256": dataset_sha256,
+        "sha256": split.sha256,
+        "folds": [{k: getattr(f, k).tolist() for k in ("train", "val", "test")} for f in split.folds],
+    }
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
+    """Read an index file for a dataset of `rows` rows; warns when it was made for other data.
+
+    Raises:
+        DataError: not an index file, made for another number of rows, edited, or with overlapping parts.
+    """
+    path = Path(path)
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        folds = tuple(
+            Fold(*(np.array(f[k], dtype=np.int64).reshape(-1) for k in ("train", "val", "test")))
+            for f in content["folds"]
+        )
+        name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
+        raise DataError(f"{path}: not a split file ({type(error).__name__}: {error})") from None
+    if stored_rows != rows:
+        raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
+    for i, fold in enumerate(folds):
+        every = np.concatenate([fold.train, fold.val, fold.test])
+        if len(np.unique(every)) != len(every):
+            raise DataError(f"{path}: fold {i} names a row twice (train, val and test must be disjoint)")
+        if len(every) and (every.min() < 0 or every.max() >= rows):
+            raise DataError(f"{path}: fold {i} names a row outside 0 to {rows - 1}")
+    if not folds or indices_hash(folds) != stored_hash:
+        raise DataError(f"{path}: the indices do not match their sha256; the file was edited or damaged")
+    if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
+        log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
+    return Split(name, folds, stored_hash)
+
+
+def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Each fold tests on whole stretches of the path, training rows near them dropped."""
+    order = path_order(positions)
+    if len(order) < 2 * settings.folds * settings.stretches_per_fold:
+        raise DataError(
+            f"split=grouped: {len(order)} rows are too few for {settings.folds} folds of "
+            f"{settings.stretches_per_fold} stretches; lower split.folds or take split=random"
+        )
+    stretches = np.array_split(order, settings.folds * settings.stretches_per_fold)
+    pairs = []
+    for fold in range(settings.folds):
+        test = np.concatenate(stretches[fold :: settings.folds])
+        # Path order is kept here: the validation stretch is cut from it.
+        rest = order[~np.isin(order, test)]
+        pairs.append((far_from(positions, rest, test, settings.buffer_m), np.sort(test)))
+    return pairs
+
+
+def _block(positions: np.ndarray, settings: SplitSettings) -> tuple[np.ndarray, np.ndarray]:
+    """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
+    lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
+    unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)
+    corner = np.array([sign == "+" for sign in settings.corner], dtype=np.float64)
+    depth = np.abs(unit - corner).max(axis=1)
+    count = max(round(settings.test_fraction * len(positions)), 1)
+    test = np.sort(np.argsort(depth, kind="stable")[:count])
+    rest = np.setdiff1d(np.arange(len(positions)), test)
+    return far_from(positions, rest, test, settings.buffer_m), test
+
+
+def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarray, s: SplitSettings) -> Fold:
+    """Thin the training rows, then set some of them aside for validation."""
+    rng = np.random.default_rng([s.seed, fold, 1])
+    keep = len(train) if s.train_count is None else s.train_count
+    keep = max(min(keep, round(s.thin * len(train))), 1) if len(train) else 0
+    # A prefix of one permutation: smaller training sets are subsets of larger ones.
+    train = train[np.sort(rng.permutation(len(train))[:keep])]
+    if len(train) == 0 or len(test) == 0:
+        raise DataError(
+            f"split={s.name}: fold {fold} has {len(train)} training and {len(test)} test rows of "
+            f"{len(positions)}; measure more, or change split.buffer_m or the shares"
+        )
+    count = min(round(s.val_fraction * len(train)), len(train) - 1)
+    if s.val_fraction > 0 and len(train) > 1:
+        count = max(count, 1)
+    rng = np.random.default_rng([s.seed, fold, 2])
+    if s.name == "grouped":
+        start = int(rng.integers(len(train) - count + 1))
+        chosen = np.arange(start, start + count)
+    else:
+        chosen = rng.permutation(len(train))[:count]
+    val = train[chosen]
+    return Fold(np.sort(np.setdiff1d(train, val)), np.sort(val), np.sort(test).astype(np.int64))

@@ -1,0 +1,143 @@
+"""From validated world coordinates to `Measurements`: centred in float64, scaled, hashed."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from gsparc.data.errors import Problems
+from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.ops import SphereGrid
+
+FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
+
+
+def bad_positions(position: np.ndarray) -> np.ndarray:
+    """Rows (n,) of `position` (S, 3) [m] that no place on Earth could have."""
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
+    return np.flatnonzero(~good)
+
+
+def check_positions(problems: Problems, where: str, position: np.ndarray, row_names: list[str]) -> None:
+    """Note rows whose position (S, 3) [m] is not finite or not on Earth."""
+    bad = bad_positions(position)
+    problems.add_rows(
+        where,
+        (f"{row_names[i]} = {np.array2string(position[i], separator=', ')}" for i in bad),
+        f"expected three finite coordinates in metres, none beyond {FARTHEST:.0e}",
+    )
+
+
+def one_decibel_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Root mean square of `values` (real or complex), rounded to whole decibels; 0 for silence.
+
+    This is a constant of the site, taken over all its rows: rounding keeps any single row (which may be a
+    test row) from leaving a trace in it. `weight` is a bool mask of measured entries.
+    """
+    magnitude = np.abs(values if weight is None else values[weight]).astype(np.float64)
+    peak = float(magnitude.max(initial=0.0))
+    if peak == 0.0:
+        return 0.0
+    # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
+    rms = peak * float(np.sqrt(np.mean((magnitude / peak) ** 2)))
+    return float(10 ** (round(20 * np.log10(rms)) / 20))
+
+
+def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
+    """SHA-256 of named arrays: type, shape and bytes; the same whatever file they came from."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = arrays[name]
+        if array is None:
+            continue
+        array = np.ascontiguousarray(array)
+        digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
+        digest.update(memoryview(array).cast("B") if array.size else b"")
+    return digest.hexdigest()
+
+
+def assemble(
+    *,
+    name: str,
+    kind: Kind,
+    static_end: Literal["rx", "tx"],
+    tx: np.ndarray,
+    rx: np.ndarray,
+    rx_rotation: np.ndarray,
+    target: np.ndarray,
+    target_scale: float = 1.0,
+    grid: SphereGrid | None = None,
+    array: np.ndarray | None = None,
+    normalisation: str = "none",
+    carrier_hz: float | None = None,
+    subcarriers_hz: np.ndarray | None = None,
+    stand_in: str | None = None,
+    convergence_error: float | None = None,
+    mask: np.ndarray | None = None,
+    noise_variance: np.ndarray | None = None,
+    directions: list[np.ndarray] | None = None,
+    row_names: list[str] | None = None,
+    release_split: tuple[np.ndarray, np.ndarray] | None = None,
+    provenance: Mapping[str, str] | None = None,
+) -> Measurements:
+    """Centre validated world coordinates on the scene box and wrap everything up.
+
+    Args:
+        tx, rx: (S, 3) [m], world coordinates, float64.
+        rx_rotation: (S, 3, 3), local to world.
+        target: (S, ...) already divided by `target_scale`.
+        target_scale: stored target = physical target / target_scale.
+        noise_variance: (S,) in units of the stored target.
+        release_split: (train, test) rows that the data themselves name.
+
+    Other arguments are as in `Site` and `Measurements`.
+    """
+    ends = np.concatenate([tx, rx])
+    lower, upper = ends.min(axis=0), ends.max(axis=0)
+    origin = (lower + upper) / 2
+    site = Site(
+        name=name,
+        kind=kind,
+        static_end=static_end,
+        grid=grid,
+        array=array,
+        carrier_hz=carrier_hz,
+        subcarriers_hz=subcarriers_hz,
+        origin=origin,
+        box=np.stack([lower - origin, upper - origin]),
+        sha256=content_hash(
+            {
+                "tx": tx,
+                "rx": rx,
+                "rx_rotation": rx_rotation,
+                "target": target,
+                "target_scale": np.float64(target_scale),
+                "array": array,
+                "carrier_hz": None if carrier_hz is None else np.float64(carrier_hz),
+                "subcarriers_hz": subcarriers_hz,
+                "mask": mask,
+                "noise_variance": noise_variance,
+            }
+        ),
+        normalisation=normalisation,
+        target_scale=target_scale,
+        stand_in=stand_in,
+        convergence_error=convergence_error,
+    )
+    return Measurements(
+        site=site,
+        tx=tx - origin,
+        rx_position=rx - origin,
+        rx_rotation=rx_rotation,
+        target=target,
+        mask=mask,
+        noise_variance=noise_variance,
+        directions=directions,
+        row_names=row_names or [f"row {i}" for i in range(len(target))],
+        release_split=release_split,
+        provenance=dict(provenance or {}),
+    )

@@ -1,0 +1,46 @@
+"""Refusing bad input in words: where it is, what was found, what was expected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+
+class DataError(ValueError):
+    """Input that was refused at load; nothing half-loaded exists when it is raised.
+
+    Attributes:
+        problems: everything that was found wrong, one line each; `str(error)` is the first of them.
+    """
+
+    def __init__(self, problems: str | Iterable[str], source: str | Path | None = None) -> None:
+        self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
+        more = len(self.problems) - 1
+        hint = f" (and {more} more: python -m gsparc.check {source or 'FILE'} lists them)" if more > 0 else ""
+        super().__init__(self.problems[0] + hint)
+
+
+class Problems(list[str]):
+    """Collects what is wrong with one file or folder, so that a user sees all of it at once."""
+
+    LIMIT = 20  # of one sort: a file with 6,000 bad rows needs no 6,000 lines
+
+    def __init__(self, source: str | Path) -> None:
+        super().__init__()
+        self.source = source
+
+    def add(self, where: str | Path, what: str) -> None:
+        """Note that at `where` (file, array, row) something is wrong: `what`, and what was expected."""
+        self.append(f"{where}: {what}")
+
+    def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> None:
+        """Note `what` for each of `rows` (as a user names them), shortened when there are many."""
+        names = list(rows)
+        self.extend(f"{where}, {name}: {what}" for name in names[: self.LIMIT])
+        if len(names) > self.LIMIT:
+            self.append(f"{where}: {what}; the same in {len(names) - self.LIMIT} more rows")
+
+    def raise_if_any(self) -> None:
+        """Raise `DataError` when anything was noted."""
+        if self:
+            raise DataError(self, self.source)

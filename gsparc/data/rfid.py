@@ -1,0 +1,294 @@
+"""The RFID release's layout (NeRF2, set s23): one spectrum image per tag position, static gateway.
+
+gateway_info.yml     dataset_name, then per gateway: position [m], orientation (x, y, z, w)
+tx_pos.csv           header x,y,z; row i (from 1) belongs to spectrum/%05d.png of i [m]
+spectrum/00001.png   8-bit grey, 360 wide (azimuth, degrees) x 90 high (elevation, row 0 = 0 degrees)
+train_index.txt, test_index.txt   optional, both or none: one number per line
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import yaml
+from PIL import Image
+
+from gsparc.data.assemble import assemble, check_positions
+from gsparc.data.errors import DataError, Problems
+from gsparc.data.rotation import quaternion_to_matrix
+from gsparc.data.schema import Measurements
+from gsparc.ops import SphereGrid
+
+HEIGHT, WIDTH = 90, 360
+WAVELENGTH = 0.3259  # [m], 920 MHz; measured on the release, COHERENT notes 0.3258 to 0.3260
+LIGHT = 299_792_458.0  # [m/s]
+STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
+
+
+def planar_array(rows: int = 4, columns: int = 4, spacing_m: float = 0.16) -> np.ndarray:
+    """Element positions (rows * columns, 3) [m] of a grid centred in the receiver's xy plane."""
+    x = (np.arange(columns) - (columns - 1) / 2) * spacing_m
+    y = (np.arange(rows) - (rows - 1) / 2) * spacing_m
+    grid_x, grid_y = np.meshgrid(x, y)
+    return np.stack([grid_x, grid_y, np.zeros_like(grid_x)], axis=-1).reshape(-1, 3)
+
+
+def load_rfid(
+    root: str | Path,
+    *,
+    gateway: str | None = None,
+    wavelength_m: float = WAVELENGTH,
+    array: np.ndarray | None = None,
+    normalisation: str = "max",
+) -> Measurements:
+    """Read a folder in the release's layout; spectra stay uint8 (S, 90, 360).
+
+    Args:
+        root: the folder.
+        gateway: which receiver of gateway_info.yml; None takes the first.
+        wavelength_m: carrier wavelength [m].
+        array: (M, 3) [m] element positions, receiver frame; None for the release's 4 x 4 array.
+        normalisation: how the published images were scaled.
+
+    Raises:
+        DataError: anything is missing or wrong; all problems are listed with file and row.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise DataError(f"{root}: no such folder; expected gateway_info.yml, tx_pos.csv and spectrum/ in it")
+    problems = Problems(root)
+    info = _read_gateway(root / "gateway_info.yml", gateway, problems)
+    positions = _read_positions(root / "tx_pos.csv", problems)
+    spectra = _read_spectra(root / "spectrum", None if positions is None else len(positions), problems)
+    release_split = _read_split(root, None if positions is None else len(positions), problems)
+    problems.raise_if_any()
+    assert info is not None and positions is not None and spectra is not None
+    count = len(positions)
+    simulated = info.dataset == STAND_IN
+    return assemble(
+        name=STAND_IN if simulated else "rfid",
+        stand_in="rfid" if simulated else None,
+        kind="spectrum",
+        static_end="rx",
+        tx=positions,
+        rx=np.repeat(info.position[None], count, axis=0),
+        rx_rotation=np.repeat(info.rotation[None], count, axis=0),
+        target=spectra,
+        grid=SphereGrid.hemisphere(HEIGHT, WIDTH),
+        array=planar_array() if array is None else np.asarray(array, dtype=np.float64),
+        normalisation=normalisation,
+        carrier_hz=LIGHT / wavelength_m,
+        row_names=[f"spectrum/{i:05d}.png" for i in range(1, count + 1)],
+        release_split=release_split,
+        provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
+    )
+
+
+class _Gateway:
+    """One receiver of gateway_info.yml: name, position (3,) [m], rotation (3, 3) local to world."""
+
+    def __init__(self, dataset: str, name: str, position: np.ndarray, rotation: np.ndarray) -> None:
+        self.dataset, self.name, self.position, self.rotation = dataset, name, position, rotation
+
+
+def _numbers(value: object, count: int) -> np.ndarray | None:
+    """`value` as (count,) float64, or None when it is anything else than that many finite numbers."""
+    if not isinstance(value, list) or len(value) != count:
+        return None
+    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in value):
+        return None
+    numbers = np.array(value, dtype=np.float64)
+    return numbers if np.isfinite(numbers).all() else None
+
+
+def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gateway | None:
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        problems.add(path, "missing; expected the gateway's position and orientation")
+        return None
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        problems.add(path, f"not readable as YAML ({' '.join(str(error).split())})")
+        return None
+    if not isinstance(content, Mapping):
+        problems.add(
+            path, "expected entries like `gateway1: {position: [x, y, z], orientation: [x, y, z, w]}`"
+        )
+        return None
+    dataset = str(content.get("dataset_name", "unnamed"))
+    gateways = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
+    if not gateways:
+        problems.add(path, "no gateway in it; expected e.g. `gateway1:` with position and orientation")
+        return None
+    name = next(iter(gateways)) if wanted is None else wanted
+    if name not in gateways:
+        problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
+        return None
+    position = _numbers(gateways[name].get("position"), 3)
+    orientation = _numbers(gateways[name].get("orientation"), 4)
+    if position is None:
+        problems.add(
+            path, f"{name}: position is {gateways[name].get('position')}; expected three finite numbers [m]"
+        )
+    else:
+        check_positions(problems, str(path), position[None], [f"{name}: position"])
+    if orientation is None:
+        problems.add(
+            path,
+            f"{name}: orientation is {gateways[name].get('orientation')}; "
+            "expected a quaternion of four finite numbers (x, y, z, w)",
+        )
+        return None
+    try:
+        rotation = quaternion_to_matrix(orientation, scalar_first=False)
+    except ValueError as error:
+        problems.add(path, f"{name}: orientation: {error}")
+        return None
+    return None if position is None else _Gateway(dataset, name, position, rotation)
+
+
+def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
+    """Tag positions (S, 3) float64 [m]."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except FileNotFoundError:
+        problems.add(path, "missing; expected a header x,y,z and one row per spectrum")
+        return None
+    except (UnicodeDecodeError, csv.Error, OSError) as error:
+        problems.add(path, f"not readable as CSV text ({error})")
+        return None
+    while rows and not any(cell.strip() for cell in rows[-1]):
+        rows.pop()
+    if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
+        found = ",".join(rows[0]) if rows else "an empty file"
+        problems.add(f"{path}, line 1", f"expected the header x,y,z, found {found}")
+        return None
+    if len(rows) == 1:
+        problems.add(path, "no rows; expected one position per spectrum")
+        return None
+    positions = np.full((len(rows) - 1, 3), np.nan)
+    readable: list[int] = []
+    for i, row in enumerate(rows[1:]):
+        try:
+            values = [float(cell) for cell in row]
+        except ValueError:
+            values = []
+        if len(values) != 3:
+            problems.add(f"{path}, line {i + 2}", f"expected three numbers x,y,z, found {','.join(row)!r}")
+            continue
+        positions[i] = values
+        readable.append(i)
+    check_positions(problems, str(path), positions[readable], [f"line {i + 2}" for i in readable])
+    return positions
+
+
+def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.ndarray | None:
+    """Images (S, 90, 360) uint8, in the order of their numbers."""
+    if not folder.is_dir():
+        problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
+        return None
+    files = {path.name for path in folder.glob("*.png")}
+    if count is None:
+        return None
+    expected = [f"{i:05d}.png" for i in range(1, count + 1)]
+    if not files:
+        problems.add(folder, f"no PNG images in it; tx_pos.csv has {count} rows")
+        return None
+    missing = [name for name in expected if name not in files]
+    extra = sorted(files - set(expected))
+    problems.add_rows(folder, missing, f"missing, but tx_pos.csv has {count} rows")
+    problems.add_rows(folder, extra, f"no row for it in tx_pos.csv, which has {count} rows")
+    if missing:
+        return None
+    spectra = np.empty((count, HEIGHT, WIDTH), dtype=np.uint8)
+    for i, name in enumerate(expected):
+        fault = _read_image(folder / name, spectra[i])
+        if fault:
+            problems.add(folder / name, fault)
+    return spectra
+
+
+def _read_image(path: Path, into: np.ndarray) -> str | None:
+    """Read one PNG into (90, 360) uint8; returns what is wrong with it."""
+    expected = f"expected an 8-bit grey PNG of {WIDTH} x {HEIGHT} pixels"
+    try:
+        with Image.open(path, formats=["PNG"]) as image:
+            if image.mode != "L":
+                return f"{expected}, found mode {image.mode}"
+            if image.size != (WIDTH, HEIGHT):
+                return f"{expected}, found {image.size[0]} x {image.size[1]}"
+            into[:] = np.asarray(image)
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        return f"{expected}, not readable ({error})"
+    return None
+
+
+def _read_split(root: Path, count: int | None, problems: Problems) -> tuple[np.ndarray, np.ndarray] | None:
+    """Zero-based (train, test) rows, or None when the folder names none."""
+    paths = [root / "train_index.txt", root / "test_index.txt"]
+    present = [path for path in paths if path.exists()]
+    if not present:
+        return None
+    if len(present) == 1:
+        absent = next(path for path in paths if path not in present)
+        problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
+        return None
+    train, test = (_read_index(path, count, problems) for path in paths)
+    if train is None or test is None:
+        return None
+    both = np.intersect1d(train, test)
+    problems.add_rows(paths[1], (f"index {i + 1:05d}" for i in both), "also in train_index.txt")
+    return train, test
+
+
+def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray | None:
+    try:
+        lines = path.read_text(encoding="utf-8-sig").split("\n")
+    except (UnicodeDecodeError, OSError) as error:
+        problems.add(path, f"not readable as text ({error})")
+        return None
+    rows: list[int] = []
+    first_line: dict[int, int] = {}
+    for number, line in enumerate(lines, start=1):
+        text = line.strip().removesuffix(".png")
+        if not text:
+            continue
+        where = f"{path}, line {number}"
+        if not (text.isascii() and text.isdigit()):
+            problems.add(where, f"expected the number of a spectrum like 00001, found {line.strip()!r}")
+            continue
+        index = int(text)
+        if count is not None and not 1 <= index <= count:
+            problems.add(where, f"index {text} is out of range; tx_pos.csv has rows 1 to {count}")
+        elif index in first_line:
+            problems.add(where, f"index {text} appears twice, first in line {first_line[index]}")
+        else:
+            first_line[index] = number
+            rows.append(index - 1)
+    if not rows:
+        problems.add(path, "no usable index in it; expected one number of a spectrum per line")
+        return None
+    return np.sort(np.array(rows, dtype=np.int64))
+
+
+def describe_missing(root: str | Path | None) -> str:
+    """What to tell a user whose release is not on disk, and how to get it."""
+    wanted = "dataset.root is not set" if root is None else f"dataset.root={root} does not exist"
+    return (
+        f"{wanted}: the RFID release is NOT on disk. Get it from the NeRF2 project "
+        "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
+        "then say dataset.root=DIR."
+    )
+
+
+def boresight_degrees(data: Measurements) -> tuple[np.ndarray, np.ndarray]:
+    """Elevation and azimuth (S,), (S,) [degrees] of the transmitters seen from the receiver."""
+    local = np.einsum("sji,sj->si", data.rx_rotation, data.tx - data.rx_position)
+    elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
+    azimuth = np.arctan2(local[:, 1], local[:, 0])
+    return np.degrees(elevation), np.degrees(azimuth) % math.degrees(2 * math.pi)
