@@ -24,7 +24,7 @@ from gsparc.data.schema import Measurements
 from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
-WAVELENGTH = 0.3259  # [m], 920 MHz; measured on the release, COHERENT notes 0.3258 to 0.3260
+WAVELENGTH = 0.3259  # [m], 920 MHz; the release's spectra themselves say 0.3258 to 0.3260
 LIGHT = 299_792_458.0  # [m/s]
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 

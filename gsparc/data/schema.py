@@ -91,17 +91,6 @@ class Batch:
         return self.index.shape[0]
 
     def to(self, device: torch.device | str) -> Batch:
-        """The same batch on another device."""
-        return Batch(
-            index=self.index.to(device),
-            tx=self.tx.to(device),
-            rx=self.rx.to(device),
-            target=self.target.to(device),
-            mask=None if self.mask is None else self.mask.to(device),
-            noise_variance=None if self.noise_variance is None else self.noise_variance.to(device),
-        )
-
-    def to(self, device: torch.device | str) -> Batch:
         """The same samples on another device."""
         moved = {
             name: value.to(device) if isinstance(value, (Tensor, Pose)) else value

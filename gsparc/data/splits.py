@@ -92,9 +92,7 @@ class SplitSettings:
             if not 0 < getattr(self, key) < 1:
                 raise DataError(f"split.{key}={getattr(self, key)}: expected a share between 0 and 1")
         if not 0 <= self.val_fraction < 1:
-            raise DataError(
-                f"split.val_fraction={self.val_fraction}: expected a share of at least 0, below 1"
-            )
+            raise DataError(f"split.val_fraction={self.val_fraction}: expected a share from 0 to below 1")
         if not 0 < self.thin <= 1:
             raise DataError(f"split.thin={self.thin}: expected a share above 0, at most 1")
         if self.train_count is not None and self.train_count < 1:
@@ -159,7 +157,7 @@ def path_order(positions: np.ndarray) -> np.ndarray:
 def far_from(
     positions: np.ndarray, candidates: np.ndarray, others: np.ndarray, distance: float
 ) -> np.ndarray:
-    """Those of `candidates` (rows) that are more than `distance` [m] away from each of `others` (rows)."""
+    """Those `candidates` (rows) that are more than `distance` [m] away from all `others` (rows)."""
     if len(candidates) == 0 or len(others) == 0:
         return candidates
     return candidates[cKDTree(positions[others]).query(positions[candidates])[0] > distance]
