@@ -1,0 +1,251 @@
+"""The figures of merit every method is judged by; accumulated per sample so that differences can be paired.
+
+Undefined values (the signal-to-noise ratio of a silent channel, the SSIM of an image smaller than its window)
+are NaN in the per-sample arrays, never enter a mean, are counted, and come out of `summary` as None.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+import torch
+from skimage.metrics import structural_similarity
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+from gsparc.data.schema import Kind
+
+log = logging.getLogger(__name__)
+
+DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
+SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
+SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
+
+#: Larger is better for these; everything else is an error.
+HIGHER_IS_BETTER = frozenset({"ssim", "ssim_median", "ssim_gauss", "psnr_db", "snr_db", "skill"})
+
+
+class SampleMetric(Metric):
+    """Base: one float64 per sample and quantity, kept in the order of the updates.
+
+    `compute()` gives the arrays, `summary()` the flat figures.
+    """
+
+    full_state_update = False
+    quantities: tuple[str, ...] = ()
+
+    def __init__(self) -> None:
+        super().__init__()
+        for name in self.quantities:
+            self.add_state(name, default=[], dist_reduce_fx="cat")
+
+    def update(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
+        """Add B samples; shapes and types of the kind's targets, mask like them (True where measured)."""
+        if prediction.shape != target.shape:
+            raise ValueError(
+                f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)} must have one shape"
+            )
+        if not torch.isfinite(
+            torch.view_as_real(prediction) if prediction.is_complex() else prediction
+        ).all():
+            raise ValueError("a prediction holds NaN or Inf; it is not scored")
+        for name, value in self._score(prediction.detach().cpu(), target.detach().cpu(), mask).items():
+            getattr(self, name).append(torch.as_tensor(value, dtype=torch.float64))
+
+    def compute(self) -> dict[str, np.ndarray]:
+        """Per-sample quantities, each (S,) float64."""
+        if not getattr(self, self.quantities[0]):
+            raise ValueError("no sample was scored: the chosen subset is empty")
+        return {name: dim_zero_cat(getattr(self, name)).numpy() for name in self.quantities}
+
+    def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
+        raise NotImplementedError
+
+    @staticmethod
+    def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
+        """Flat figures from per-sample arrays (pooled over folds by concatenation)."""
+        raise NotImplementedError
+
+
+class SpectrumMetrics(SampleMetric):
+    """Spectra (B, H, W) in [0, 1]: SSIM in both windows, PSNR, MSE, MAE, NMSE."""
+
+    quantities = ("ssim", "ssim_gauss", "psnr_db", "mse", "mae", "target_power")
+
+    def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
+        p, t = prediction.double().numpy(), target.double().numpy()
+        m = np.ones(t.shape, bool) if mask is None else mask.numpy()
+        p = np.where(m, p, t)  # an unmeasured pixel can be neither right nor wrong
+        count = np.maximum(m.sum((1, 2)), 1)
+        mse = ((p - t) ** 2).sum((1, 2)) / count
+        return {
+            "ssim": [_ssim(a, b, w, SSIM_WINDOW) for a, b, w in zip(p, t, m, strict=True)],
+            "ssim_gauss": [_ssim(a, b, w, SSIM_GAUSS_WINDOW) for a, b, w in zip(p, t, m, strict=True)],
+            "psnr_db": _db(np.ones_like(mse), mse),
+            "mse": mse,
+            "mae": np.abs(p - t).sum((1, 2)) / count,
+            "target_power": (np.where(m, t, 0.0) ** 2).sum((1, 2)) / count,
+        }
+
+    @staticmethod
+    def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
+        """See the base class."""
+        return {
+            "ssim": _mean(samples["ssim"]),
+            "ssim_median": _median(samples["ssim"]),
+            "ssim_gauss": _mean(samples["ssim_gauss"]),
+            "psnr_db": _mean(samples["psnr_db"]),
+            "mse": _mean(samples["mse"]),
+            "mae": _mean(samples["mae"]),
+            "nmse": _ratio(samples["mse"], samples["target_power"]),
+            "samples": len(samples["mse"]),
+        }
+
+
+class ChannelMetrics(SampleMetric):
+    """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR, NMSE after one complex scalar each.
+
+    Args:
+        scale: physical channel = stored channel * scale.
+    """
+
+    quantities = ("error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae")
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__()
+        self.scale = scale
+
+    def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
+        p, t = (x.to(torch.complex128).flatten(1).numpy() * self.scale for x in (prediction, target))
+        m = np.ones(t.shape, bool) if mask is None else mask.flatten(1).numpy()
+        p, t, count = np.where(m, p, 0), np.where(m, t, 0), np.maximum(m.sum(1), 1)
+        error, power = (np.abs(p - t) ** 2).sum(1), (np.abs(t) ** 2).sum(1)
+        own, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
+        explained = np.divide(cross, own, out=np.zeros_like(own), where=own > 0)
+        return {
+            "error_power": error,
+            "target_power": power,
+            "scalar_error_power": np.maximum(power - explained, 0.0),
+            "snr_db": _db(power, error),
+            "mse": error / count,
+            "mae": np.abs(p - t).sum(1) / count,
+        }
+
+    @staticmethod
+    def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
+        """See the base class."""
+        silent = int((samples["target_power"] == 0).sum())
+        if silent:
+            log.warning("%d of %d channels are silent: left out of snr_db", silent, len(samples["mse"]))
+        return {
+            "nmse": _ratio(samples["error_power"], samples["target_power"]),
+            "nmse_scalar": _ratio(samples["scalar_error_power"], samples["target_power"]),
+            "snr_db": _mean(samples["snr_db"]),
+            "mse": _mean(samples["mse"]),
+            "mae": _mean(samples["mae"]),
+            "silent_samples": silent,
+            "samples": len(samples["mse"]),
+        }
+
+
+class PowerMetrics(SampleMetric):
+    """RSSI (B, 1), linear power, denormalised: errors in dB and the linear NMSE.
+
+    A prediction at or below zero is read as the weakest power measured in the scored set, and counted; a
+    target at or below zero has no decibels and is left out of the dB figures.
+    """
+
+    quantities = ("prediction", "target")
+
+    def __init__(self, scale: float = 1.0) -> None:
+        super().__init__()
+        self.scale = scale
+
+    def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
+        p, t = (x.double().flatten() * self.scale for x in (prediction, target))
+        return {"prediction": p, "target": t if mask is None else t.masked_fill(~mask.flatten(), torch.nan)}
+
+    def compute(self) -> dict[str, np.ndarray]:
+        """Adds `error_db`, `error_power`, `target_power`, `mse`, each (S,)."""
+        raw = super().compute()
+        p, t = raw["prediction"], raw["target"]
+        loud = t > 0
+        floor = t[loud].min() if loud.any() else np.finfo(np.float64).tiny
+        error_db = np.where(loud, _db(np.maximum(p, floor), np.where(loud, t, 1.0)), np.nan)
+        error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
+        return {**raw, "error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
+
+    @staticmethod
+    def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
+        """See the base class."""
+        floored, silent = int((samples["prediction"] <= 0).sum()), int((samples["target"] <= 0).sum())
+        if floored or silent:
+            log.warning("%d predictions and %d targets without power (no decibels there)", floored, silent)
+        squared = _mean(samples["error_db"] ** 2)
+        return {
+            "rmse_db": None if squared is None else float(np.sqrt(squared)),
+            "mae_db": _mean(np.abs(samples["error_db"])),
+            "nmse": _ratio(samples["error_power"], samples["target_power"]),
+            "mse": _mean(samples["mse"]),
+            "silent_samples": silent,
+            "samples": len(samples["target"]),
+        }
+
+
+def metrics_for(kind: Kind, scale: float = 1.0) -> SampleMetric:
+    """The metrics of a dataset kind; `scale` is `Site.target_scale`."""
+    if kind == "spectrum":
+        return SpectrumMetrics()
+    return ChannelMetrics(scale) if kind == "csi" else PowerMetrics(scale)
+
+
+def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Per-sample values whose means are the flat figures, so that their differences can be paired.
+
+    `nmse` is each sample's share, |e|^2 / mean |h|^2: its mean is the global NMSE.
+    """
+    values = {k: samples[k] for k in ("ssim", "ssim_gauss", "psnr_db", "snr_db", "mse") if k in samples}
+    if "error_db" in samples:
+        values["mae_db"] = np.abs(samples["error_db"])
+    error, power = samples.get("error_power", samples["mse"]), samples["target_power"]
+    if np.nansum(power) > 0:
+        values["nmse"] = error / np.nanmean(power)
+    return values
+
+
+def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, window: int) -> float:
+    """Mean structural similarity of two float64 images over measured pixels; NaN below the window's size."""
+    if min(target.shape) < window:
+        return float("nan")
+    if window == SSIM_WINDOW:
+        options: dict[str, Any] = {"win_size": window}
+    else:
+        options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
+    if measured.all():
+        return float(structural_similarity(prediction, target, data_range=1.0, **options))
+    _, local = structural_similarity(prediction, target, data_range=1.0, full=True, **options)
+    inner = (slice(window // 2, -(window // 2)),) * 2  # full windows only, as in the plain mean
+    return float(local[inner][measured[inner]].mean()) if measured[inner].any() else float("nan")
+
+
+def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """10 log10(signal / noise) within +-DB_CAP; NaN where there is no signal."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = 10 * (np.log10(signal) - np.log10(noise))
+    return np.where(signal > 0, np.clip(np.where(noise > 0, ratio, np.inf), -DB_CAP, DB_CAP), np.nan)
+
+
+def _mean(values: np.ndarray) -> float | None:
+    return None if np.isnan(values).all() else float(np.nanmean(values))
+
+
+def _median(values: np.ndarray) -> float | None:
+    return None if np.isnan(values).all() else float(np.nanmedian(values))
+
+
+def _ratio(error: np.ndarray, power: np.ndarray) -> float | None:
+    total = float(np.nansum(power))
+    return float(np.nansum(error)) / total if total > 0 else None

@@ -1,0 +1,61 @@
+"""Targets as real rows in the units interpolation is fair in, and back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Kind, Measurements
+
+TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
+
+
+def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Targets of `rows` in stored type and units; an entry not measured gets the mean of the rows where it was.
+
+    Returns:
+        (n, ...) like `data.target`; an entry measured in no row is 0.
+    """
+    target = data.target[rows]
+    if data.mask is None or data.mask[rows].all():
+        return target
+    measured = data.mask[rows]
+    total = np.where(measured, target, 0).sum(0) / np.maximum(measured.sum(0), 1)
+    return np.where(measured, target, total.astype(target.dtype))
+
+
+def to_real(target: np.ndarray, kind: Kind) -> np.ndarray:
+    """Stored targets (n, ...) as float32 rows (n, D).
+
+    Spectra are rows of pixels in [0, 1], channels real and imaginary parts in linear units, powers decibels.
+    """
+    if kind == "csi":
+        # ascontiguousarray: a view as pairs needs the last axis dense.
+        return np.ascontiguousarray(target, dtype=np.complex64).reshape(len(target), -1).view(np.float32)
+    rows = target.reshape(len(target), -1).astype(np.float32)
+    if kind == "rssi":
+        return 10 * np.log10(np.maximum(rows, TINY_POWER, dtype=np.float32))
+    return rows / np.float32(255) if target.dtype == np.uint8 else rows
+
+
+def from_real(rows: Tensor, kind: Kind, shape: tuple[int, ...]) -> Tensor:
+    """Float32 rows (B, D) as targets (B, *shape) in stored units; spectra are clamped to [0, 1]."""
+    if kind == "csi":
+        return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
+    rows = rows.reshape(len(rows), *shape)
+    return (10 ** (rows / 10)) if kind == "rssi" else rows.clamp(0.0, 1.0)
+
+
+def entry_variance(variance: Tensor, mean: Tensor, kind: Kind) -> Tensor:
+    """Variance (B,) per real number of `to_real` as expected squared error (B,) per entry of the target.
+
+    Complex entries hold two real numbers; decibels are carried to linear power to first order.
+    """
+    if kind == "csi":
+        return 2 * variance
+    if kind == "rssi":
+        return variance * (math.log(10) / 10 * mean.flatten(1).mean(1)) ** 2
+    return variance

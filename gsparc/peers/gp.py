@@ -1,0 +1,199 @@
+"""A Gaussian process on whole targets: one kernel shared by all entries, set by leave-one-out likelihood."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
+from scipy.optimize import minimize
+from sklearn.gaussian_process.kernels import Matern
+
+from gsparc.data.schema import Kind
+from gsparc.method import Prediction
+from gsparc.peers.encoding import entry_variance, to_real
+from gsparc.peers.interpolation import Interpolator
+
+
+@dataclass(frozen=True)
+class Components:
+    """Principal components of n centred targets of D real numbers.
+
+    Attributes:
+        mean: (D,) float32, the mean target.
+        axes: (P, D) float32, orthonormal rows.
+        scores: (n, P) float64.
+        lost: mean square per real number that the P components leave out.
+    """
+
+    mean: np.ndarray
+    axes: np.ndarray
+    scores: np.ndarray
+    lost: float
+
+
+def principal_components(targets: np.ndarray, kind: Kind, limit: int, block: int = 2048) -> Components:
+    """All components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
+
+    Works through blocks of `block` entries, so that thousands of byte images never become floats at once.
+    """
+    n = len(targets)
+    flat = targets.reshape(n, -1)
+    blocks = [flat[:, i : i + block] for i in range(0, flat.shape[1], block)]
+    means, gram, energy = [], np.zeros((n, n)), 0.0
+    for part in blocks:
+        rows = to_real(part, kind).astype(np.float64)
+        means.append(rows.mean(0))
+        rows -= means[-1]
+        gram += rows @ rows.T
+        energy += float((rows**2).sum())
+    keep = max(1, min(limit, n - 1, sum(len(m) for m in means)))
+    values, vectors = eigh(gram, subset_by_index=[n - keep, n - 1])
+    solid = values > 1e-10 * max(values[-1], np.finfo(float).tiny)  # rounding noise has no axis
+    if not solid.any():  # one sample, or all alike
+        solid[-1] = True
+    values, vectors = values[solid], vectors[:, solid]
+    length = np.sqrt(np.maximum(values, np.finfo(float).tiny))
+    axes = [(vectors / length).T @ (to_real(p, kind) - m) for p, m in zip(blocks, means, strict=True)]
+    mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
+    lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
+    return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
+
+
+@dataclass(frozen=True)
+class Kernel:
+    """`amplitude * (Matern-3/2(distance / length) + noise * identity)`.
+
+    Attributes:
+        length: [m].
+        noise: variance relative to `amplitude`.
+        amplitude: variance per real number of a target.
+    """
+
+    length: float
+    noise: float
+    amplitude: float = 1.0
+
+    def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Correlations (A, B) without noise between positions (A, 3) and (B, 3) [m]."""
+        return Matern(self.length, nu=1.5)(a, b)
+
+    def gram(self, a: np.ndarray) -> np.ndarray:
+        """Correlations (A, A) with noise."""
+        matrix = self.cross(a, a)
+        matrix[np.diag_indices_from(matrix)] += self.noise
+        return matrix
+
+
+def leave_one_out(gram: np.ndarray, scores: np.ndarray, entries: int) -> tuple[float, float]:
+    """Negative leave-one-out log density per real number, and the amplitude that minimises it.
+
+    With R = K^-1 Y and d = diag(K^-1) the left-out error of row i is R_i / d_i and its variance
+    amplitude / d_i (Rasmussen and Williams 2006, eqs. 5.10 to 5.12, summed over outputs that share K).
+
+    Args:
+        gram: (n, n) correlations with noise.
+        scores: (n, P) centred targets in an orthonormal basis.
+        entries: real numbers per target, P or more.
+    """
+    factor = cho_factor(gram, lower=True)
+    inverse_diagonal = np.diag(cho_solve(factor, np.eye(len(gram))))
+    squared = (cho_solve(factor, scores) ** 2).sum(1)
+    amplitude = float((squared / inverse_diagonal).sum()) / (len(gram) * entries)
+    amplitude = max(amplitude, np.finfo(float).tiny)
+    return 0.5 * (np.log(amplitude) - float(np.log(inverse_diagonal).mean())), amplitude
+
+
+def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Kernel:
+    """Length and noise of largest leave-one-out likelihood, from three starting lengths.
+
+    Args:
+        positions: (n, 3) [m].
+        scores, entries: as in `leave_one_out`.
+    """
+    spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
+    if len(positions) < 3 or not scores.any():
+        return Kernel(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), 1e-12))
+
+    def objective(log_parameters: np.ndarray) -> float:
+        length, noise = np.exp(log_parameters)
+        try:
+            return leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[0]
+        except LinAlgError:  # not positive definite in float64: as bad as it gets
+            return 1e12
+
+    bounds = [(np.log(spread * 1e-4), np.log(spread * 1e2)), (np.log(1e-8), np.log(1e2))]
+    # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
+    starts = [np.log([spread * share, 0.01]) for share in (0.01, 0.05, 0.25)]
+    best = minimize(objective, min(starts, key=objective), method="L-BFGS-B", bounds=bounds)
+    length, noise = np.exp(best.x)
+    return Kernel(length, noise, leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[1])
+
+
+class GaussianProcess(Interpolator):
+    """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
+
+    Args:
+        components: largest number of principal components kept; all of them when the training set is smaller.
+    """
+
+    name = "gp"
+
+    def __init__(self, components: int = 512) -> None:
+        super().__init__()
+        if components < 1:
+            raise ValueError(f"gp: components must be at least 1, got {components}")
+        self.limit = components
+
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        assert self.site is not None
+        parts = principal_components(targets, self.site.kind, self.limit)
+        entries = len(parts.mean)
+        self.kernel = choose_kernel(positions, parts.scores, entries)
+        self.lost, self.positions = parts.lost, positions
+        self.factor = cho_factor(self.kernel.gram(positions), lower=True)
+        weights = torch.from_numpy(cho_solve(self.factor, parts.scores))
+        self.mean, self.axes, self.weights = (
+            torch.from_numpy(parts.mean),
+            torch.from_numpy(parts.axes),
+            weights,
+        )
+        notes = [
+            f"gp: length {self.kernel.length:.4g} m, noise {self.kernel.noise:.3g} of the signal's variance"
+        ]
+        if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
+            notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
+        return tuple(notes)
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        assert self.site is not None
+        cross = self.kernel.cross(queries, self.positions)
+        scores = (torch.from_numpy(cross) @ self.weights).float()
+        mean = self._decode(torch.addmm(self.mean, scores, self.axes))
+        explained = (cross * cho_solve(self.factor, cross.T).T).sum(1)
+        prior = 1 + self.kernel.noise
+        left = np.clip(prior - explained, 0.0, prior)
+        variance = torch.from_numpy(self.kernel.amplitude * left + self.lost).float()
+        return Prediction(
+            mean,
+            confidence=torch.from_numpy(1 - left / prior).float(),
+            variance=entry_variance(variance, mean, self.site.kind),
+        )
+
+    def _learned(self) -> dict[str, Any]:
+        return {
+            "positions": torch.from_numpy(self.positions),
+            "mean": self.mean,
+            "axes": self.axes,
+            "weights": self.weights,
+            "kernel": [self.kernel.length, self.kernel.noise, self.kernel.amplitude],
+            "lost": self.lost,
+        }
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        self.kernel = Kernel(*(float(v) for v in state["kernel"]))
+        self.positions, self.lost = state["positions"].numpy(), float(state["lost"])
+        self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
+        self.factor = cho_factor(self.kernel.gram(self.positions), lower=True)

@@ -1,0 +1,114 @@
+"""What all interpolating baselines share: rows, query axis, encoding, state."""
+
+from __future__ import annotations
+
+import time
+from abc import abstractmethod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.method import FitReport, Method, Prediction
+from gsparc.ops import Pose
+from gsparc.peers.encoding import from_real, training_targets
+
+
+class Interpolator(Method):
+    """Learns from `fold.train` and `fold.val` together (nothing is chosen on `val`) and looks up positions.
+
+    The query is the position of the moving end; orientations are not used.
+    """
+
+    def __init__(self) -> None:
+        self.site: Site | None = None
+        self.shape: tuple[int, ...] = ()
+        self.seen = 0
+
+    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+        """Fit on train and val rows; `ValueError` when there are none."""
+        rows = np.concatenate([fold.train, fold.val])
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        start = time.perf_counter()
+        self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
+        notes = self._learn(data.moving[rows], training_targets(data, rows))
+        return FitReport(time.perf_counter() - start, notes)
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; `ValueError` before `fit` or `restore`."""
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        queries = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        return self._look_up(queries.detach().cpu().double().numpy())
+
+    def state(self) -> dict[str, Any]:
+        """Target shape, number of rows, and what the subclass learned."""
+        return {"shape": list(self.shape), "seen": self.seen, **self._learned()}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.shape, self.seen = site, tuple(state["shape"]), int(state["seen"])
+        self._relearn(state)
+
+    def size(self) -> int:
+        """Number of stored training samples."""
+        return self.seen
+
+    def _decode(self, rows: Tensor) -> Tensor:
+        assert self.site is not None
+        return from_real(rows, self.site.kind, self.shape)
+
+    @abstractmethod
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
+
+    @abstractmethod
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        """Predict at (B, 3) float64 [m]."""
+
+    @abstractmethod
+    def _learned(self) -> dict[str, Any]: ...
+
+    @abstractmethod
+    def _relearn(self, state: dict[str, Any]) -> None: ...
+
+
+class Neighbours:
+    """Stored samples with a search tree; targets keep their stored type (bytes stay bytes)."""
+
+    def __init__(self, positions: np.ndarray, targets: np.ndarray) -> None:
+        self.positions, self.targets = positions, targets
+        self.tree = cKDTree(positions)
+        self.reach = _typical_spacing(self.tree, positions)
+
+    def find(self, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Distances [m] and rows of the `count` nearest samples, both (B, count), nearest first."""
+        return self.tree.query(queries, k=np.arange(1, min(count, len(self.positions)) + 1))
+
+    def confidence(self, nearest: np.ndarray) -> Tensor:
+        """exp(-distance / typical spacing of the training set), (B,) in [0, 1]."""
+        return torch.from_numpy(np.exp(-nearest / self.reach)).float()
+
+    def state(self) -> dict[str, Tensor]:
+        """Plain tensors."""
+        return {"positions": torch.from_numpy(self.positions), "targets": torch.from_numpy(self.targets)}
+
+    @staticmethod
+    def from_state(state: dict[str, Any]) -> Neighbours:
+        """Inverse of `state`."""
+        return Neighbours(state["positions"].numpy(), state["targets"].numpy())
+
+
+def _typical_spacing(tree: cKDTree, positions: np.ndarray) -> float:
+    """Median distance of a sample to its nearest *other* place [m]; 1 when there is only one place."""
+    if len(positions) < 2:
+        return 1.0
+    nearest = tree.query(positions, k=[2])[0][:, 0]
+    apart = nearest[nearest > 0]
+    return float(np.median(apart)) if len(apart) else 1.0

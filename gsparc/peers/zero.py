@@ -1,0 +1,31 @@
+"""Black: the prediction that says nothing, and the floor every error is read against."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.method import Prediction
+from gsparc.peers.interpolation import Interpolator
+
+
+class Zero(Interpolator):
+    """Predicts zeros."""
+
+    name = "zero"
+
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        return ()
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        assert self.site is not None
+        dtype = torch.complex64 if self.site.kind == "csi" else torch.float32
+        return Prediction(torch.zeros(len(queries), *self.shape, dtype=dtype))
+
+    def _learned(self) -> dict[str, Any]:
+        return {}
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        pass
