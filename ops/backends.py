@@ -1,0 +1,32 @@
+"""Which backend does the work, and why one cannot."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import torch
+
+from gsparc.ops import dense
+
+
+class BackendUnavailable(RuntimeError):
+    """A backend was asked for that is not here; the message says why."""
+
+
+def choose(name: str | None, device: torch.device) -> ModuleType:
+    """The backend called `name`, or the one of `device`."""
+    if name is None:
+        name = "reference" if device.type == "cpu" else device.type
+    backend = named(name)
+    if name in ("cpu", "cuda") and device.type != name:
+        raise BackendUnavailable(f"backend {name!r} needs tensors on {name}, these are on {device}")
+    return backend
+
+
+def named(name: str) -> ModuleType:
+    """The backend called `name` (BackendUnavailable, ValueError)."""
+    if name == "reference":
+        return dense
+    if name == "cuda":
+        raise BackendUnavailable("there are no CUDA kernels in this version; move the tensors to the CPU")
+    raise ValueError(f"backend is 'reference', 'cpu' or 'cuda', got {name!r}")

@@ -1,0 +1,98 @@
+"""The `reference` backend behind the public face: plans and composites with dense tensors and autograd."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import reference
+from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.plan import Plan
+from gsparc.ops.settings import Optics
+
+
+def make_plan(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    strongest: Tensor,
+    ids: Tensor | None,
+    pose: Pose,
+    grid: SphereGrid,
+    optics: Optics,
+) -> Plan:
+    """Order and radii; the footprints themselves are formed again, differentiably, when compositing."""
+    orders, centers, reaches, seen_at_all = [], [], [], []
+    for index in range(len(pose)):
+        seen = reference.project(means, quats, scales, pose[index], grid, optics)
+        shapes = reference.footprints(seen, grid, optics, torch.zeros_like(means[:, :2]))
+        alpha, _ = reference.layers(seen, shapes, strongest, strongest, optics)
+        orders.append(reference.depth_order(seen, ids))
+        centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
+        seen_at_all.append((alpha > 0).any(1))
+        reaches.append(torch.where(seen_at_all[-1], reference.radii(seen, strongest, optics), 0.0))
+    return Plan(
+        *(pose, grid, optics, "reference"),
+        means2d=torch.stack(centers),
+        radii=torch.stack(reaches),
+        visible=torch.stack(seen_at_all),
+        buffers=(torch.stack(orders),),
+    )
+
+
+def composite(
+    plan: Plan,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+    features: Tensor,
+    means2d: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
+    per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
+    images, behinds = [], []
+    for index, values in enumerate(per_pose):
+        weights, _, behind = _weights(plan, index, means, quats, scales, opacities, extinctions, means2d)
+        order = plan.buffers[0][index]
+        images.append(torch.einsum("nu,bnc->bcu", weights, values[:, order]))
+        behinds.append(behind)
+    size = (plan.grid.height, plan.grid.width)
+    return torch.cat(images).unflatten(-1, size), torch.stack(behinds).unflatten(-1, size)
+
+
+def mean_weights(
+    plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
+    averages, shares = [], []
+    still = torch.zeros_like(plan.means2d)
+    for index in range(plan.num_poses):
+        weights, alpha, _ = _weights(plan, index, means, quats, scales, opacities, extinctions, still)
+        back = torch.argsort(plan.buffers[0][index])
+        total = alpha.sum(1)
+        share = torch.where(total > 0, weights.sum(1) / torch.where(total > 0, total, 1.0), 0.0)
+        averages.append(weights.mean(1)[back])
+        shares.append(share[back])
+    return torch.stack(averages), torch.stack(shares)
+
+
+def pixel_weights(
+    plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
+) -> list[Tensor]:
+    """For each pose the matrix alpha T, pixels x Gaussians (H W, N)."""
+    still, matrices = torch.zeros_like(plan.means2d), []
+    for index in range(plan.num_poses):
+        weights, _, _ = _weights(plan, index, means, quats, scales, opacities, extinctions, still)
+        matrices.append(weights[torch.argsort(plan.buffers[0][index])].mT)
+    return matrices
+
+
+def _weights(plan, index, means, quats, scales, opacities, extinctions, means2d):
+    hides = opacities if extinctions is None else extinctions
+    shift = means2d[index] - means2d[index].detach()
+    order = plan.buffers[0][index]
+    return reference.composite_weights(
+        *(means, quats, scales, opacities, hides, order, shift, plan.pose[index], plan.grid, plan.optics)
+    )

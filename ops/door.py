@@ -1,0 +1,84 @@
+"""What comes in is checked once, here; an error is one line saying what to change."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsparc.ops.geometry import Pose
+
+
+def gaussians(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+    ids: Tensor | None,
+) -> None:
+    """Refuse Gaussians whose shapes, dtypes or devices disagree (ValueError, TypeError)."""
+    n = means.shape[0] if means.dim() else 0
+    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
+    if extinctions is not None:
+        expected["extinctions"], given["extinctions"] = (n,), extinctions
+    for name, tensor in given.items():
+        if tuple(tensor.shape) != expected[name]:
+            raise ValueError(f"{name} must be {expected[name]} for {n} means, got {tuple(tensor.shape)}")
+        _same_kind(name, tensor, means)
+    if means.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"the rasterizer computes in float32 or float64, got means in {means.dtype}")
+    if ids is not None and (
+        tuple(ids.shape) != (n,) or ids.dtype != torch.int64 or ids.device != means.device
+    ):
+        raise ValueError(f"ids must be ({n},) int64 on {means.device}, got {tuple(ids.shape)} {ids.dtype}")
+
+
+def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor) -> None:
+    """Refuse NaN, infinities, negative scales and opacities outside [0, 1], naming the first Gaussian."""
+    sound = {
+        "means": torch.isfinite(means).all(-1),
+        "quats": torch.isfinite(quats).all(-1),
+        "scales": (torch.isfinite(scales) & (scales >= 0)).all(-1),
+        "opacities": (strongest >= 0) & (strongest <= 1),
+    }
+    for name, ok in sound.items():
+        if not bool(ok.all()):
+            raise_for(name, int(torch.argmin(ok.to(torch.int8))))
+
+
+def raise_for(name: str, index: int) -> None:
+    """The error for Gaussian `index` whose `name` no footprint can be made of (ValueError)."""
+    wanted = {"scales": "finite and >= 0", "opacities": "in [0, 1]"}.get(name, "finite")
+    raise ValueError(f"Gaussian {index} has {name} that are not {wanted}; find where they come from")
+
+
+def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
+    """Features (N, C) or (B, N, C) as (B, N, C), checked against the Gaussians and the poses (ValueError)."""
+    _same_kind("features", values, means)
+    if values.dim() not in (2, 3) or values.shape[-2] != means.shape[0]:
+        raise ValueError(
+            f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
+        )
+    poses = len(pose)
+    if values.dim() == 2:
+        return values.expand(poses, *values.shape)
+    if poses not in (1, values.shape[0]):
+        raise ValueError(f"{values.shape[0]} samples need one pose or as many, got {poses} poses")
+    return values
+
+
+def poses(pose: Pose, means: Tensor) -> Pose:
+    """Poses (P,) in the Gaussians' dtype and on their device, always batched; ValueError if not finite."""
+    position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
+    rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
+    if not bool(torch.isfinite(position).all()) or not bool(torch.isfinite(rotation).all()):
+        raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
+    return Pose(position, rotation)
+
+
+def _same_kind(name: str, tensor: Tensor, means: Tensor) -> None:
+    if tensor.dtype != means.dtype:
+        raise TypeError(f"{name} is {tensor.dtype} but means is {means.dtype}; convert one of them")
+    if tensor.device != means.device:
+        raise ValueError(f"{name} is on {tensor.device} but means is on {means.device}; move one of them")

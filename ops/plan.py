@@ -1,0 +1,46 @@
+"""What is known about a view before any emission: who is seen where, in which order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.settings import Optics
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Footprints of N Gaussians for P poses, ordered and binned; bookkeeping without gradients.
+
+    Valid for the geometry and opacities it was made from, and for nothing else.
+
+    Attributes:
+        pose: P poses; one without a leading axis is shared by a whole batch.
+        grid, optics: what was asked for.
+        backend: name of the backend that made it and that must composite it.
+        means2d: (P, N, 2) (column, row) [px].
+        radii: (P, N) [px], 0 where culled.
+        visible: (P, N) bool.
+        buffers: the backend's own tensors.
+    """
+
+    pose: Pose
+    grid: SphereGrid
+    optics: Optics
+    backend: str
+    means2d: Tensor
+    radii: Tensor
+    visible: Tensor
+    buffers: tuple[Tensor, ...]
+
+    @property
+    def num_gaussians(self) -> int:
+        """N."""
+        return self.means2d.shape[1]
+
+    @property
+    def num_poses(self) -> int:
+        """P."""
+        return self.means2d.shape[0]

@@ -1,0 +1,158 @@
+"""The public face: plan, composite, weights, freeze, whichever backend does the work."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import backends, door
+from gsparc.ops.frozen import FrozenPlan
+from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.plan import Plan
+from gsparc.ops.results import Raster, Weights
+from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, Projection
+
+
+def make_plan(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    pose: Pose,
+    grid: SphereGrid,
+    *,
+    projection: Projection = "tangent",
+    low_pass: float = 0.3,
+    compensate: bool = True,
+    near: float = 0.01,
+    cutoff: Cutoff = IMAGE_CUTOFF,
+    extinctions: Tensor | None = None,
+    ids: Tensor | None = None,
+    backend: str | None = None,
+) -> Plan:
+    """Project N Gaussians for P poses, cull, order by (distance, id) and bin. No gradients.
+
+    Args:
+        means: (N, 3) [m], in the frame of the pose's position.
+        quats: (N, 4) w x y z, any length; the zero quaternion means no rotation.
+        scales: (N, 3) standard deviations [m].
+        opacities: (N,) in [0, 1].
+        pose: one pose for a whole batch, or P of them.
+        grid: directions of the pixels.
+        projection, low_pass, compensate, near, cutoff: see `Optics`.
+        extinctions: (N,) in [0, 1], what hides, where it differs from what emits (`opacities`).
+        ids: (N,) int64, permanent names that decide between equal distances; the row number by default.
+        backend: "reference", "cpu" or "cuda"; by default the one of the tensors' device.
+
+    Raises:
+        ValueError, TypeError: for inputs that no footprint can be made of.
+        BackendUnavailable: if the backend was not built or does not serve this device.
+    """
+    door.gaussians(means, quats, scales, opacities, extinctions, ids)
+    with torch.no_grad():
+        strongest = opacities if extinctions is None else torch.maximum(opacities, extinctions)
+        chosen = backends.choose(backend, means.device)
+        optics = Optics(projection, low_pass, compensate, near, cutoff)
+        return chosen.make_plan(means, quats, scales, strongest, ids, door.poses(pose, means), grid, optics)
+
+
+def composite(
+    plan: Plan,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    *,
+    extinctions: Tensor | None = None,
+) -> Raster:
+    """Blend features front to back over a plan made from the same Gaussians; differentiable in every tensor.
+
+    `features` is (N, C) or (B, N, C). With one pose the weights are formed once for all B C channels.
+    """
+    door.gaussians(means, quats, scales, opacities, extinctions, None)
+    values = door.features(features, means, plan.pose)
+    if plan.num_gaussians != means.shape[0]:
+        raise ValueError(f"this plan holds {plan.num_gaussians} Gaussians, got {means.shape[0]}; plan again")
+    trained = (means, quats, scales, opacities, features, *([] if extinctions is None else [extinctions]))
+    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in trained)
+    means2d = plan.means2d.detach().clone().requires_grad_(wanted)
+    image, transmittance = backends.named(plan.backend).composite(
+        plan, means, quats, scales, opacities, extinctions, values, means2d
+    )
+    return Raster(image, transmittance, plan.radii, plan.visible, means2d)
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    pose: Pose,
+    grid: SphereGrid,
+    *,
+    projection: Projection = "tangent",
+    low_pass: float = 0.3,
+    compensate: bool = True,
+    near: float = 0.01,
+    cutoff: Cutoff = IMAGE_CUTOFF,
+    extinctions: Tensor | None = None,
+    ids: Tensor | None = None,
+    backend: str | None = None,
+) -> Raster:
+    """`make_plan`, then `composite`: see there. `features` (N, C) or (B, N, C) holds real channels."""
+    plan = make_plan(
+        *(means, quats, scales, opacities, pose, grid),
+        projection=projection,
+        low_pass=low_pass,
+        compensate=compensate,
+        near=near,
+        cutoff=cutoff,
+        extinctions=extinctions,
+        ids=ids,
+        backend=backend,
+    )
+    return composite(plan, means, quats, scales, opacities, features, extinctions=extinctions)
+
+
+def mean_weights(
+    plan: Plan,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    *,
+    extinctions: Tensor | None = None,
+) -> Weights:
+    """How much of each Gaussian every pose sees, over a plan made from the same Gaussians; differentiable."""
+    door.gaussians(means, quats, scales, opacities, extinctions, None)
+    if plan.num_gaussians != means.shape[0]:
+        raise ValueError(f"this plan holds {plan.num_gaussians} Gaussians, got {means.shape[0]}; plan again")
+    return Weights(
+        *backends.named(plan.backend).mean_weights(plan, means, quats, scales, opacities, extinctions)
+    )
+
+
+@torch.no_grad()
+def freeze(
+    plan: Plan,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    *,
+    version: int,
+    extinctions: Tensor | None = None,
+) -> FrozenPlan:
+    """The view of one static receiver as a sparse pixel x Gaussian matrix, for the parameters of `version`.
+
+    `version` is the field's own counter, raised whenever its geometry or opacity changes; a tensor's hidden
+    counter misses writes through `.data`.
+    """
+    if plan.num_poses != 1:
+        raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
+    weights = backends.named(plan.backend).pixel_weights(plan, means, quats, scales, opacities, extinctions)[
+        0
+    ]
+    return FrozenPlan(weights, plan.grid, version)

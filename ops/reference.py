@@ -1,0 +1,229 @@
+"""The rasterizer in plain PyTorch: the definition of truth. Dense, so for small scenes only.
+
+Everything is differentiable by autograd, in float32 and float64. Notation: mu mean, n unit direction from
+the receiver, r distance, M = R^T R_q diag(s) / r the angular square root of the covariance, K2 the covariance
+of the footprint [px^2].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.settings import ALPHA_MAX, HORIZON_COSINE, Optics
+
+
+@dataclass(frozen=True)
+class Projected:
+    """N Gaussians as one receiver sees them.
+
+    Attributes:
+        present: (N,) bool, farther than `near`, with a footprint that is not degenerate.
+        distance: (N,) [m].
+        direction, east, north: (N, 3) unit vectors, receiver frame; east and north span the tangent plane.
+        center: (N, 2) (column, row) [px].
+        covariance: (N, 3) [px^2], entries 11, 12, 22 with the low-pass; 1 is east or column.
+        determinant: (N,) [px^4] of the same, formed without subtracting.
+        gain: (N,) what multiplies an opacity: near fade times energy compensation.
+    """
+
+    present: Tensor
+    distance: Tensor
+    direction: Tensor
+    east: Tensor
+    north: Tensor
+    center: Tensor
+    covariance: Tensor
+    determinant: Tensor
+    gain: Tensor
+
+
+def rotation_matrices(quats: Tensor) -> Tensor:
+    """Rotations (N, 3, 3) of quaternions (N, 4) w x y z of any length; the zero quaternion does not turn."""
+    square = (quats * quats).sum(-1, keepdim=True)
+    usable = square > torch.finfo(quats.dtype).tiny
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
+    w, x, y, z = torch.where(usable, quats / torch.where(usable, square, 1.0).sqrt(), identity).unbind(-1)
+    rows = [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    ]
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def _norm(vectors: Tensor) -> Tensor:
+    """Length along the last axis, with gradient 0 where it is 0."""
+    square = (vectors * vectors).sum(-1)
+    return torch.where(square > 0, torch.where(square > 0, square, 1.0).sqrt(), 0.0)
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, pose: Pose, grid: SphereGrid, optics: Optics
+) -> Projected:
+    """Footprints of N Gaussians for one pose (position (3,), rotation (3, 3))."""
+    local = pose.local(means)
+    with torch.no_grad():
+        distance = _norm(local)
+        present = distance > optics.near
+    # Absent Gaussians are moved to a harmless place: no NaN in forward or backward, and no gradient.
+    local = torch.where(present[:, None], local, torch.ones_like(local))
+    distance = _norm(local)
+    n = local / distance[:, None]
+    horizontal = _norm(n[:, :2])
+    on_axis = (horizontal == 0)[:, None]
+    forward = torch.tensor([1.0, 0.0], dtype=means.dtype, device=means.device)
+    cos_sin = torch.where(on_axis, forward, n[:, :2] / torch.where(on_axis, 1.0, horizontal[:, None]))
+    zero = torch.zeros_like(horizontal)
+    east = torch.stack([-cos_sin[:, 1], cos_sin[:, 0], zero], -1)
+    north = torch.stack([-n[:, 2] * cos_sin[:, 0], -n[:, 2] * cos_sin[:, 1], horizontal], -1)
+    elevation = torch.atan2(n[:, 2], horizontal)
+    azimuth = torch.where(on_axis[:, 0], 0.0, torch.atan2(n[:, 1], torch.where(on_axis[:, 0], 1.0, n[:, 0])))
+
+    if optics.projection == "tangent":
+        to_column = torch.full_like(distance, 1 / grid.elevation_step)
+    else:
+        to_column = 1 / ((horizontal**2 + grid.elevation_step**2).sqrt() * grid.azimuth_step)
+    to_row = 1 / grid.elevation_step
+
+    axes = pose.rotation.mT @ rotation_matrices(quats)
+    angular = scales / distance[:, None]
+    columns = axes * angular[:, None, :]
+    v1 = to_column[:, None] * torch.einsum("nk,nki->ni", east, columns)
+    v2 = to_row * torch.einsum("nk,nki->ni", north, columns)
+    k11, k12, k22 = (v1 * v1).sum(-1), (v1 * v2).sum(-1), (v2 * v2).sum(-1)
+    # det(P M M^T P) = |cof(M)^T n|^2: exact for needles and pancakes, where k11 k22 - k12^2 cancels.
+    cofactors = torch.stack(
+        [angular[:, 1] * angular[:, 2], angular[:, 0] * angular[:, 2], angular[:, 0] * angular[:, 1]], -1
+    )
+    area = to_column * to_row * _norm(cofactors * torch.einsum("nki,nk->ni", axes, n))
+    eps = optics.low_pass
+    determinant = area**2 + eps * (k11 + k22) + eps**2
+    sharp = determinant > torch.finfo(means.dtype).tiny
+    determinant = torch.where(sharp, determinant, 1.0)
+
+    fade = ((distance - optics.near) / optics.near).clamp(0, 1)
+    gain = fade**2 * (3 - 2 * fade)
+    if optics.compensate:
+        gain = gain * area / determinant.sqrt()
+    return Projected(
+        present=present & sharp & (k22 + eps > torch.finfo(means.dtype).tiny),
+        distance=distance,
+        direction=n,
+        east=east,
+        north=north,
+        center=torch.stack(
+            [
+                (azimuth - grid.first_azimuth) / grid.azimuth_step,
+                (elevation - grid.first_elevation) / grid.elevation_step,
+            ],
+            -1,
+        ),
+        covariance=torch.stack([k11 + eps, k12, k22 + eps], -1),
+        determinant=determinant,
+        gain=gain,
+    )
+
+
+def _offsets(
+    seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Offsets (N, H W) of every pixel from every centre in columns and rows [px], and whether it faces it.
+
+    `shift` (N, 2) [px] moves the footprints; it is zero and carries the screen-space gradient.
+    """
+    dtype, device = seen.distance.dtype, seen.distance.device
+    if optics.projection == "equirect":
+        center = seen.center + shift
+        column = torch.arange(grid.width, dtype=dtype, device=device) - center[:, :1]
+        row = torch.arange(grid.height, dtype=dtype, device=device) - center[:, 1:]
+        turn = 2 * torch.pi / grid.azimuth_step
+        column = column - turn * torch.round(column.detach() / turn)
+        size = (-1, grid.height, grid.width)
+        p, q = column[:, None, :].expand(size).flatten(1), row[:, :, None].expand(size).flatten(1)
+        return p, q, torch.ones_like(p, dtype=torch.bool)
+    u = grid.directions(dtype).to(device).flatten(0, 1)
+    cosine = seen.direction @ u.mT
+    facing = cosine > HORIZON_COSINE
+    cosine = torch.where(facing, cosine, 1.0)
+    p, q = (seen.east @ u.mT) / cosine, (seen.north @ u.mT) / cosine
+    # Moving the centre by d along the sphere moves the offset by -(d + q (q . d)) (gnomonic projection).
+    d = shift * grid.elevation_step
+    along = d[:, :1] * p + d[:, 1:] * q
+    p, q = p - (d[:, :1] + p * along), q - (d[:, 1:] + q * along)
+    return p / grid.elevation_step, q / grid.elevation_step, facing
+
+
+def footprints(seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor) -> Tensor:
+    """The Gaussians' shapes G (N, H W), 1 at their centres, 0 where a pixel does not face them."""
+    p, q, facing = _offsets(seen, grid, optics, shift)
+    _, k12, k22 = (entry[:, None] for entry in seen.covariance.unbind(-1))
+    # The quadratic form completed to squares: no cancellation along a needle.
+    form = k22 / seen.determinant[:, None] * (p - k12 / k22 * q) ** 2 + q**2 / k22
+    return torch.where(facing & seen.present[:, None], torch.exp(-0.5 * form), 0.0)
+
+
+def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
+    """Indices (N,) from near to far, equal distances by id."""
+    by_id = (
+        torch.arange(len(seen.distance), device=seen.distance.device) if ids is None else torch.argsort(ids)
+    )
+    return by_id[torch.argsort(seen.distance.detach()[by_id], stable=True)]
+
+
+def layers(
+    seen: Projected, shapes: Tensor, opacities: Tensor, extinctions: Tensor, optics: Optics
+) -> tuple[Tensor, Tensor]:
+    """What each layer emits and hides at each pixel, alpha and gamma (N, H W), before occlusion."""
+    emits, hides = (seen.gain * opacities)[:, None] * shapes, (seen.gain * extinctions)[:, None] * shapes
+    strength = shapes if optics.cutoff.relative else torch.maximum(emits, hides)
+    counts = (strength >= optics.cutoff.alpha).detach()
+    return (
+        torch.where(counts, emits, 0.0).clamp(max=ALPHA_MAX),
+        torch.where(counts, hides, 0.0).clamp(max=ALPHA_MAX),
+    )
+
+
+def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+    """Light before each ordered layer, (N, H W), zero once below the floor, and behind all, (H W,)."""
+    with torch.no_grad():
+        before = torch.cumprod(torch.cat([torch.ones_like(gamma[:1]), 1 - gamma[:-1]]), 0)
+        lit = before >= floor
+    after = torch.cumprod(1 - torch.where(lit, gamma, 0.0), 0)
+    before = torch.cat([torch.ones_like(gamma[:1]), after[:-1]])
+    return torch.where(lit, before, 0.0), after[-1]
+
+
+def composite_weights(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor,
+    order: Tensor,
+    shift: Tensor,
+    pose: Pose,
+    grid: SphereGrid,
+    optics: Optics,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """For one pose and the Gaussians in `order`: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
+    if len(means) == 0:
+        empty = means.new_zeros(0, grid.height * grid.width)
+        return empty, empty, means.new_ones(grid.height * grid.width)
+    seen = project(means[order], quats[order], scales[order], pose, grid, optics)
+    shapes = footprints(seen, grid, optics, shift[order])
+    alpha, gamma = layers(seen, shapes, opacities[order], extinctions[order], optics)
+    before, behind = transmittances(gamma, optics.cutoff.transmittance)
+    return alpha * before, alpha, behind
+
+
+def radii(seen: Projected, strongest: Tensor, optics: Optics) -> Tensor:
+    """Long half axes (N,) [px] of the footprints at the cut-off of opacities (or extinctions) `strongest`."""
+    k11, k12, k22 = seen.covariance.unbind(-1)
+    largest = (k11 + k22) / 2 + torch.hypot((k11 - k22) / 2, k12)
+    peak = torch.ones_like(strongest) if optics.cutoff.relative else seen.gain * strongest
+    reach = 2 * torch.log(torch.where(seen.present, peak, 0.0) / optics.cutoff.alpha)
+    return (reach.clamp(min=0) * largest).sqrt()

@@ -1,0 +1,69 @@
+"""Every threshold of the rasterizer, defined once and handed to each backend as an argument."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Projection = Literal["equirect", "tangent"]
+
+ALPHA_MAX = 0.99
+"""Largest opacity of one layer at one pixel; a clamped layer passes no gradient to geometry or opacity."""
+
+HORIZON_COSINE = 0.01
+"""`tangent` only: pixels more than 89.4 degrees from a Gaussian's direction never see it (the tangent plane
+ends at 90 degrees, and float32 has lost two digits of the offset before that)."""
+
+
+@dataclass(frozen=True)
+class Cutoff:
+    """When a Gaussian stops counting at a pixel.
+
+    Attributes:
+        alpha: it counts where its layer opacity is at least this; 1/255 is right for images.
+        transmittance: it counts where the light that reaches it is at least this.
+        relative: compare `alpha` with the footprint itself, whose peak is 1, instead of with the opacity
+            times the footprint. Right for CSI, where an absolute threshold would cut 39 % off a footprint
+            of opacity 0.01.
+    """
+
+    alpha: float = 1.0 / 255.0
+    transmittance: float = 1e-4
+    relative: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.alpha < 1.0 or not 0.0 <= self.transmittance < 1.0:
+            raise ValueError(
+                f"cut-offs lie in (0, 1), got alpha {self.alpha}, transmittance {self.transmittance}"
+            )
+
+
+IMAGE_CUTOFF = Cutoff()
+"""The paper's thresholds, for images."""
+
+
+@dataclass(frozen=True)
+class Optics:
+    """How Gaussians become footprints.
+
+    Attributes:
+        projection: `tangent` evaluates the footprint on the plane touching the sphere at the Gaussian's own
+            direction (no pole); `equirect` linearises azimuth and elevation there (the paper; inexact near
+            the pole, where it replaces cos(elevation) by sqrt(cos^2 + step^2)).
+        low_pass: variance added to every footprint [px^2]; a pixel of `tangent` is one elevation step.
+        compensate: scale the opacity by sqrt(det before / det after the low-pass), which keeps the energy.
+        near: Gaussians nearer than this are absent; they fade in up to twice this distance [m].
+        cutoff: when a Gaussian stops counting.
+    """
+
+    projection: Projection = "tangent"
+    low_pass: float = 0.3
+    compensate: bool = True
+    near: float = 0.01
+    cutoff: Cutoff = IMAGE_CUTOFF
+
+    def __post_init__(self) -> None:
+        if self.projection not in ("equirect", "tangent"):
+            raise ValueError(f"projection is 'equirect' or 'tangent', got {self.projection!r}")
+        if not self.low_pass >= 0.0 or not self.near > 0.0:
+            raise ValueError(f"low_pass >= 0 and near > 0 are needed, got {self.low_pass} and {self.near}")
