@@ -127,6 +127,8 @@ def assemble(
         target_scale=target_scale,
         stand_in=stand_in,
         convergence_error=convergence_error,
+        static_position=(rx if static_end == "rx" else tx)[0] - origin,
+        rx_rotation=np.array(rx_rotation[0], dtype=np.float64),
     )
     return Measurements(
         site=site,

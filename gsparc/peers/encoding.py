@@ -14,7 +14,7 @@ TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Targets of `rows` in stored type and units; an entry not measured gets the mean of the rows where it was.
+    """Targets of `rows` in stored type and units; unmeasured entries get the mean over the other rows.
 
     Returns:
         (n, ...) like `data.target`; an entry measured in no row is 0.
