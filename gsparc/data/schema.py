@@ -34,8 +34,8 @@ class Site:
         sha256: content hash of what was loaded.
         stand_in: for a simulated replacement, the name of the release it stands in for; else None.
         convergence_error: NMSE between two solver seeds for simulated data; else None.
-        static_position: (3,) float64 [m], where the static end stands, *local* coordinates; None when unknown.
-        rx_rotation: (3, 3) float64, local to world: how the first row's receiver is turned; None when unknown.
+        static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown.
+        rx_rotation: (3, 3) float64, how the first row's receiver is turned; None when unknown.
     """
 
     name: str

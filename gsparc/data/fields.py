@@ -1,0 +1,61 @@
+"""The names of the schema for measurements of one's own; docs/own-data.md is the same table for people."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Field:
+    """One array of a file.
+
+    Attributes:
+        name: of the array.
+        shape: allowed shapes; S samples, K frequencies, A antennas, H x W pixels, P paths, I sources.
+        unit: what `units` must say if it says anything.
+        required: `yes`, `one of`, or when.
+        meaning: in words.
+    """
+
+    name: str
+    shape: str
+    unit: str
+    required: str
+    meaning: str
+
+
+FIELDS: dict[str, Field] = {
+    field.name: field
+    for field in [
+        Field("rx_position", "(3,) or (S, 3)", "m", "yes", "where the receiver stood"),
+        Field("tx_position", "(3,) or (S, 3)", "m", "yes", "where the transmitter stood"),
+        Field("spectrum", "(S, H, W)", "1", "one of", "power by direction, linear; or uint8 with 255 = 1"),
+        Field("csi", "(S,), (S, K) or (S, A, K)", "1", "one of", "complex channel"),
+        Field("rssi", "(S,)", "W", "one of", "received power, linear"),
+        Field("rssi_db", "(S,)", "dB", "one of", "received power in dB or dBm"),
+        Field("frequency_hz", "() or (K,)", "Hz", "with csi", "frequency of each subcarrier"),
+        Field("carrier_hz", "()", "Hz", "no", "carrier; else the mean of frequency_hz"),
+        Field("rx_orientation", "(4,) or (S, 4)", "1", "no", "quaternion (w, x, y, z), receiver to world"),
+        Field("rx_rotation", "(3, 3) or (S, 3, 3)", "1", "no", "the same as a matrix; give one of the two"),
+        Field("array_position", "(A, 3)", "m", "no", "receive antennas in the receiver's frame"),
+        Field("grid_deg", "(4,)", "deg", "no", "first elevation, first azimuth, their steps"),
+        Field("mask", "as the measurement", "1", "no", "True where measured; the rest may hold anything"),
+        Field("noise_variance", "() or (S,)", "unit of the measurement squared", "no", "noise power"),
+        Field("path_offsets", "(S + 1,)", "1", "no", "paths of sample i are path_offsets[i]:[i + 1]"),
+        Field("path_direction", "(P, 3)", "1", "no", "direction of arrival, receiver's frame"),
+        Field("path_last_point", "(P, 3)", "m", "no", "last interaction point; instead of path_direction"),
+        Field("path_gain", "(P,) or (P, K)", "1", "no", "complex gain of each path"),
+        Field("path_order", "(P,)", "1", "no", "number of interactions of each path"),
+        Field("line_of_sight", "(S,)", "1", "no", "True where nothing stood between"),
+        Field("source_position", "(I, 3)", "m", "no", "truth of a simulation: where each source is"),
+        Field("source_gain", "(I,)", "1", "no", "truth of a simulation: complex amplitude at 1 m"),
+        Field("source_order", "(I,)", "1", "no", "truth of a simulation: reflections of each source"),
+        Field("source_visible", "(S, I)", "1", "no", "truth of a simulation: who sees which source"),
+        Field("split_train", "(n,)", "1", "no", "rows to train on, from 0; together with split_test"),
+        Field("split_test", "(n,)", "1", "no", "rows to test on, from 0"),
+        Field("row_name", "(S,)", "1", "no", "what you call each row; used in messages"),
+    ]
+}
+
+MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
+NORMALISATIONS = ("max", "minmax", "power", "none")

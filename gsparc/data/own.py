@@ -1,0 +1,328 @@
+"""Measurements of one's own, and what our simulators write: one documented schema, npz or HDF5.
+
+docs/own-data.md is this schema for people; `fields.py` is its table. `read` says what a file means or
+everything that is wrong with it, `load_own` is its strict form, `write_own` refuses what `load_own` would.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from gsparc.data.assemble import assemble, one_decibel_rms
+from gsparc.data.errors import DataError
+from gsparc.data.fields import FIELDS, NORMALISATIONS
+from gsparc.data.own_checks import Checker
+from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.data.schema import Kind, Measurements
+
+log = logging.getLogger(__name__)
+
+OWN_ATTRIBUTES = ("name", "normalisation", "stand_in", "convergence_error")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What was understood of a file.
+
+    Attributes:
+        data: the measurements.
+        notes: what a user should know although nothing is wrong, one line each.
+    """
+
+    data: Measurements
+    notes: tuple[str, ...]
+
+
+def load_own(path: str | Path) -> Measurements:
+    """Read a file of the schema; notes are logged.
+
+    Raises:
+        DataError: anything is missing or wrong; all problems are listed with array and row.
+    """
+    reading = interpret(read_raw(path), path)
+    for note in reading.notes:
+        log.warning("%s: %s", path, note)
+    return reading.data
+
+
+def write_own(
+    path: str | Path, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any] | None = None
+) -> Measurements:
+    """Write arrays named as in the schema (validated first, whole or not at all) and return their meaning.
+
+    Args:
+        path: *.npz, *.h5 or *.hdf5.
+        arrays: by name, in the schema's units.
+        attributes: `name`, `normalisation`, `stand_in`, `convergence_error`, and provenance as you like.
+
+    Raises:
+        DataError: what `load_own` would refuse.
+    """
+    known = {name: np.asarray(array) for name, array in arrays.items()}
+    units = {name: FIELDS[name].unit for name in known if name in FIELDS and FIELDS[name].unit != "1"}
+    raw = Raw(known, dict(attributes or {}), units)
+    data = interpret(raw, path).data
+    write_raw(path, raw)
+    return data
+
+
+def from_arrays(
+    arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any] | None = None
+) -> Measurements:
+    """The same without a file.
+
+    Raises:
+        DataError: what `load_own` would refuse.
+    """
+    raw = Raw({name: np.asarray(array) for name, array in arrays.items()}, dict(attributes or {}))
+    return interpret(raw, "arrays").data
+
+
+def interpret(raw: Raw, source: str | Path) -> Reading:
+    """Validate `raw` and centre, scale and hash it.
+
+    CSI is divided by its root mean square over all measured entries, RSSI by its mean power; spectra of
+    floating point are divided by their largest value unless it lies between 0.1 and 1. The constant is
+    one per site, rounded to whole decibels, and kept as `site.target_scale`: metrics multiply it back.
+
+    Raises:
+        DataError: all problems, with array and row.
+    """
+    check = Checker(raw, str(source))
+    check.names()
+    measured = check.measurement()
+    about = _attributes(check, Path(source).stem)
+    if measured is None:
+        check.problems.raise_if_any()
+    assert measured is not None
+    values, kind = _measured(check, measured)
+    if values is None:
+        for name in ("rx_position", "tx_position"):
+            check.position(name, None, [])
+        check.problems.raise_if_any()
+    assert values is not None
+    rows = len(values)
+    row_names = _row_names(check, rows)
+    ends = {end: check.position(f"{end}_position", rows, row_names) for end in ("rx", "tx")}
+    rotation = check.rotation(rows, row_names)
+    given_mask = check.mask(raw.arrays[measured].shape, row_names)
+    mask = None if given_mask is None else given_mask.reshape(values.shape)
+    frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
+    grid = check.grid(*values.shape[1:]) if kind == "spectrum" else None
+    array = _array(check, values.shape[1] if kind == "csi" else None)
+    noise = _noise(check, measured, rows, row_names)
+    offsets = check.ragged(rows)
+    release_split = check.release_split(rows)
+    check.finite(measured, values, mask, row_names)
+    _in_range(check, measured, values, mask, row_names)
+    static_end = _static_end(check, ends["rx"], ends["tx"], rotation)
+    check.problems.raise_if_any()
+    assert static_end is not None and rotation is not None
+    rx, tx = (np.broadcast_to(ends[end], (rows, 3)).astype(np.float64) for end in ("rx", "tx"))
+    directions = _directions(check, offsets, rx, rotation)
+    target, scale = _scaled(measured, values, mask)
+    if not (np.isfinite(scale) and scale > 0):
+        check.problems.add(check.where(measured), "every measured value is zero; expected some signal")
+    check.problems.raise_if_any()
+    data = assemble(
+        kind=kind,
+        static_end=static_end,
+        tx=tx,
+        rx=rx,
+        rx_rotation=rotation,
+        target=target,
+        target_scale=scale,
+        grid=grid,
+        array=array,
+        carrier_hz=carrier,
+        subcarriers_hz=frequency if kind == "csi" else None,
+        mask=mask,
+        noise_variance=None if noise is None else (noise / scale**2).astype(np.float32),
+        directions=directions,
+        row_names=row_names,
+        release_split=release_split,
+        **about,
+    )
+    return Reading(data, tuple(check.notes))
+
+
+def _attributes(check: Checker, stem: str) -> dict[str, Any]:
+    """Arguments of `assemble` that come from the file's attributes."""
+    given = check.raw.attributes
+    normalisation = str(given.get("normalisation", "none"))
+    if normalisation not in NORMALISATIONS:
+        check.problems.add(
+            check.where("normalisation"), f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}"
+        )
+    error = given.get("convergence_error")
+    if error is not None and not (isinstance(error, int | float) and np.isfinite(error) and error >= 0):
+        check.problems.add(
+            check.where("convergence_error"), f"{error!r}; expected a finite number, at least 0"
+        )
+        error = None
+    stand_in = given.get("stand_in")
+    return {
+        "name": str(given.get("name") or stem),
+        "normalisation": normalisation,
+        "stand_in": None if stand_in is None else str(stand_in),
+        "convergence_error": None if error is None else float(error),
+        "provenance": {str(k): str(v) for k, v in given.items() if k not in OWN_ATTRIBUTES},
+    }
+
+
+def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
+    """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
+    array = check.raw.arrays[name]
+    kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
+    if kind == "csi":
+        if array.dtype.kind != "c":
+            check.problems.add(check.where(name), f"expected complex numbers, found dtype {array.dtype}")
+            return None, kind
+        if not check.fits(name, array, (None,), (None, None), (None, None, None)):
+            return None, kind
+        array = (
+            array.reshape(*array.shape[:1], -1, array.shape[-1] if array.ndim > 1 else 1)
+            if array.size
+            else array
+        )
+    else:
+        if array.dtype.kind not in "iuf" or (
+            kind == "spectrum" and array.dtype.kind in "iu" and array.dtype != np.uint8
+        ):
+            wanted = "uint8 or floating point" if kind == "spectrum" else "real"
+            check.problems.add(check.where(name), f"expected {wanted} numbers, found dtype {array.dtype}")
+            return None, kind
+        if not check.fits(name, array, (None, None, None) if kind == "spectrum" else (None,)):
+            return None, kind
+        if array.dtype != np.uint8 or kind == "rssi":
+            array = array.astype(np.float64)
+        array = array if kind == "spectrum" else array[:, None]
+    if len(array) < 2 or array.size == 0:
+        check.problems.add(
+            check.where(name), f"shape {array.shape} holds too little; expected two rows or more"
+        )
+        return None, kind
+    return array, kind
+
+
+def _row_names(check: Checker, rows: int) -> list[str]:
+    names = check.raw.arrays.get("row_name")
+    if names is None:
+        return [f"row {i}" for i in range(rows)]
+    if not check.fits("row_name", names, (rows,)):
+        return [f"row {i}" for i in range(rows)]
+    return [str(name) for name in names]
+
+
+def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
+    array = check.real("array_position", (antennas if antennas and antennas > 1 else None, 3))
+    if array is not None and not np.isfinite(array).all():
+        check.problems.add(check.where("array_position"), "not finite; expected coordinates in metres")
+        return None
+    return array
+
+
+def _noise(check: Checker, measured: str, rows: int, row_names: list[str]) -> np.ndarray | None:
+    noise = check.real("noise_variance", (), (rows,))
+    if noise is None:
+        return None
+    if measured == "rssi_db":
+        check.problems.add(check.where("noise_variance"), "cannot go with rssi_db; expected rssi (linear)")
+        return None
+    noise = np.broadcast_to(noise, (rows,))
+    bad = np.flatnonzero(~(np.isfinite(noise) & (noise >= 0)))
+    check.problems.add_rows(
+        check.where("noise_variance"), (row_names[i] for i in bad), "expected a finite number, at least 0"
+    )
+    return noise
+
+
+def _in_range(
+    check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None, row_names: list[str]
+) -> None:
+    """Powers are not negative; decibels are decibels."""
+    if name == "csi":
+        return
+    with np.errstate(invalid="ignore"):
+        bad = np.abs(values) > 400 if name == "rssi_db" else values < 0
+    if mask is not None:
+        bad &= mask
+    rows = np.flatnonzero(bad.reshape(len(values), -1).any(axis=1))
+    wanted = "dB between -400 and 400" if name == "rssi_db" else "linear power, at least 0 (is it in dB?)"
+    check.problems.add_rows(
+        check.where(name), (row_names[i] for i in rows), f"out of range; expected {wanted}"
+    )
+
+
+def _static_end(
+    check: Checker, rx: np.ndarray | None, tx: np.ndarray | None, rotation: np.ndarray | None
+) -> Literal["rx", "tx"] | None:
+    """Which end stays put; one must, and the other must move."""
+    if rx is None or tx is None or rotation is None:
+        return None
+    still = {
+        name: bool((np.atleast_2d(p) == np.atleast_2d(p)[0]).all()) for name, p in (("rx", rx), ("tx", tx))
+    }
+    turns = not bool((rotation == rotation[0]).all())
+    if still["rx"] and still["tx"]:
+        fault = "neither end moves; expected (S, 3) positions for one of them"
+    elif not still["rx"] and not still["tx"]:
+        fault = "both ends move; expected one of rx_position and tx_position to be the same in all rows"
+    elif still["rx"] and turns:
+        fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
+    else:
+        return "rx" if still["rx"] else "tx"
+    check.problems.add(check.source, fault)
+    return None
+
+
+def _directions(
+    check: Checker, offsets: np.ndarray | None, rx: np.ndarray, rotation: np.ndarray
+) -> list[np.ndarray] | None:
+    """Unit vectors (paths, 3) of each sample in the receiver's frame."""
+    name = next((n for n in ("path_direction", "path_last_point") if n in check.raw.arrays), None)
+    if offsets is None or name is None:
+        return None
+    vectors = check.real(name, (int(offsets[-1]), 3))
+    if vectors is None:
+        return None
+    owner = np.repeat(np.arange(len(rx)), np.diff(offsets))
+    if name == "path_last_point":
+        vectors = np.einsum("pji,pj->pi", rotation[owner], vectors - rx[owner])
+    length = np.linalg.norm(vectors, axis=-1)
+    bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
+    check.problems.add_rows(
+        check.where(name), (f"path {i}" for i in bad), "expected a direction that is not zero"
+    )
+    if len(bad):
+        return None
+    return np.split((vectors / length[:, None]).astype(np.float32), offsets[1:-1])
+
+
+def _scaled(name: str, values: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """The target as stored and the constant it was divided by (0 for silence)."""
+    if mask is not None:
+        values = np.where(mask, values, np.zeros((), values.dtype))
+    if values.dtype == np.uint8:
+        return values, 1.0 if values.any() else 0.0
+    if name == "rssi_db":
+        values = 10 ** (values / 10) * (1 if mask is None else mask)
+    if name == "spectrum":
+        largest = float(values.max())
+        scale = 1.0 if 0.1 <= largest <= 1 else largest
+    elif name == "csi":
+        scale = one_decibel_rms(values, mask)
+    else:
+        scale = one_decibel_rms(np.sqrt(values), mask) ** 2
+    if scale <= 0:
+        return values, 0.0
+    return (values / scale).astype(np.complex64 if name == "csi" else np.float32), scale
+
+
+__all__ = ["DataError", "Reading", "from_arrays", "interpret", "load_own", "write_own"]

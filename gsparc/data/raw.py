@@ -1,0 +1,153 @@
+"""Named arrays with attributes and units, from and to npz and HDF5; nothing is interpreted here."""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from gsparc.data.errors import DataError
+
+HDF5_SUFFIXES = (".h5", ".hdf5")
+
+
+@dataclass(frozen=True)
+class Raw:
+    """What a file holds.
+
+    Attributes:
+        arrays: by name.
+        attributes: numbers and strings about the whole file.
+        units: unit of an array where the file says one.
+    """
+
+    arrays: dict[str, np.ndarray]
+    attributes: dict[str, Any] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+
+
+def read_raw(path: str | Path) -> Raw:
+    """Read every array of an npz or HDF5 file.
+
+    Raises:
+        DataError: no such file, another format, damaged, or Python objects inside.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected *.npz, *.h5 or *.hdf5")
+    if path.suffix.lower() == ".npz":
+        return _read_npz(path)
+    if path.suffix.lower() in HDF5_SUFFIXES:
+        return _read_hdf5(path)
+    raise DataError(
+        f"{path}: expected a name ending in .npz, .h5 or .hdf5, found {path.suffix or 'no ending'}"
+    )
+
+
+def write_raw(path: str | Path, raw: Raw) -> None:
+    """Write `raw`, whole or not at all: to a partial file that is renamed when complete."""
+    path = Path(path)
+    partial = path.with_name(f".{path.name}.partial")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.suffix.lower() == ".npz":
+        about = json.dumps({**raw.attributes, "units": raw.units}, ensure_ascii=False)
+        with partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, attributes=np.array(about), **raw.arrays)
+    elif path.suffix.lower() in HDF5_SUFFIXES:
+        with h5py.File(partial, "w") as file:
+            for name, array in raw.arrays.items():
+                text = array.dtype.kind in "US"
+                data = array.astype(h5py.string_dtype()) if text else array
+                stored = file.create_dataset(name, data=data)
+                if name in raw.units:
+                    stored.attrs["units"] = raw.units[name]
+            for name, value in raw.attributes.items():
+                file.attrs[name] = value
+    else:
+        raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5")
+    os.replace(partial, path)
+
+
+def _read_npz(path: Path) -> Raw:
+    arrays: dict[str, np.ndarray] = {}
+    name = "the archive"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if not isinstance(file, np.lib.npyio.NpzFile):
+                raise DataError(f"{path}: not an npz archive (a single array?); save with numpy.savez")
+            for name in file.files:
+                arrays[name] = file[name]
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        OSError,
+        EOFError,
+        ValueError,
+        KeyError,
+        NotImplementedError,
+    ) as error:
+        if isinstance(error, DataError):
+            raise
+        if "allow_pickle" in str(error):
+            raise DataError(
+                f"{path}, {name}: holds Python objects; expected plain arrays of numbers"
+            ) from None
+        raise DataError(f"{path}, {name}: damaged or not an npz file ({_one_line(error)})") from None
+    return _with_attributes(path, arrays)
+
+
+def _with_attributes(path: Path, arrays: dict[str, np.ndarray]) -> Raw:
+    """An npz has no attributes; ours keeps them as JSON text in an entry of that name."""
+    text = arrays.pop("attributes", None)
+    if text is None:
+        return Raw(arrays)
+    try:
+        attributes = json.loads(str(text))
+        units = attributes.pop("units", {})
+        if not isinstance(units, dict):
+            raise TypeError("units is not a table")
+    except (ValueError, TypeError, AttributeError) as error:
+        raise DataError(f"{path}, attributes: expected a JSON table as text ({_one_line(error)})") from None
+    return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
+
+
+def _read_hdf5(path: Path) -> Raw:
+    arrays: dict[str, np.ndarray] = {}
+    units: dict[str, str] = {}
+    name = "the file"
+    try:
+        with h5py.File(path, "r") as file:
+            for name, item in file.items():
+                if isinstance(item, h5py.Dataset):
+                    arrays[name] = np.asarray(
+                        item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
+                    )
+                    if "units" in item.attrs:
+                        units[name] = _plain(item.attrs["units"])
+            attributes = {key: _plain(value) for key, value in file.attrs.items()}
+    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({_one_line(error)})") from None
+    return Raw({k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}, attributes, units)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", errors="replace")
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
+
+
+def renamed(raw: Raw, names: Mapping[str, str]) -> Raw:
+    """The same content with arrays renamed from the keys to the values of `names`."""
+    return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)
