@@ -1,0 +1,135 @@
+"""`rfid-sim`: a stand-in for the RFID release, in its layout, from image sources and a 4 x 4 array.
+
+Loudly not real data: it exists so that everything runs on a machine without the release, and as ground
+truth for tests. A tag is moved by hand about 5 m from a gateway in a room with reflecting walls; each
+image is `|A^H h|` over the hemisphere divided by its maximum, in 8 bits.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from gsparc.data.rfid import HEIGHT, LIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
+from gsparc.ops import SphereGrid
+from gsparc.simulate.shoebox import Room, trace
+
+GATEWAY = np.array([5.0, 0.26, 0.0])  # [m], as in the release
+ORIENTATION = np.array([0.51291602, -0.48674136, -0.48674136, 0.51291602])  # (x, y, z, w), as in the release
+HAND_BOX = np.array([[-0.34, -0.86, 0.86], [0.19, 0.14, 1.07]])  # [m], where the release's tags were
+STEP = 0.011  # [m], median distance of consecutive tags of the release
+SMOOTHING = 12  # [samples], how slowly a hand turns
+RUN_LENGTH = 60  # [samples] between lifting the tag and putting it elsewhere
+SNR_DB = 25.0
+MAX_ORDER = 4
+ROOM = Room(
+    lower=np.array([-1.5, -2.0, -0.9]),
+    upper=np.array([5.6, 2.2, 1.8]),
+    # Narrow and bright: images then differ with the distance of two tags about as the release's do
+    # (root mean square 0.04 below 1 cm, 0.13 at 5 cm, 0.24 beyond 20 cm; mean pixel 0.42).
+    reflection=np.full(6, -0.9),
+)
+
+
+def hand_moved(count: int, seed: int) -> np.ndarray:
+    """Tag positions (count, 3) [m] along smooth curves in the release's box, about 1.1 cm apart."""
+    rng = np.random.default_rng(seed)
+    center, half = HAND_BOX.mean(axis=0), np.ptp(HAND_BOX, axis=0) / 2
+    pieces = []
+    for _ in range(-(-count // RUN_LENGTH)):
+        velocity = gaussian_filter1d(rng.normal(size=(RUN_LENGTH, 3)), SMOOTHING, axis=0, mode="wrap")
+        velocity *= half / half.max()  # flatter in z than in y, as the box is
+        velocity *= STEP / np.median(np.linalg.norm(velocity, axis=1))
+        walk = rng.uniform(-half, half) + np.cumsum(velocity, axis=0)
+        # A triangle wave folds what left the box back into it without a jump.
+        pieces.append(center + half * (2 / np.pi) * np.arcsin(np.sin(np.pi / 2 * walk / half)))
+    return np.concatenate(pieces)[:count].round(3)  # the release has millimetres
+
+
+def steering(array: np.ndarray, grid: SphereGrid, wavelength: float) -> np.ndarray:
+    """Steering matrix A (M, H * W) complex64: `exp(+j k u.a_m)` for each element and direction.
+
+    Args:
+        array: (M, 3) [m], receiver frame.
+        grid: directions u.
+        wavelength: [m].
+    """
+    directions = grid.directions(torch.float64).numpy().reshape(-1, 3)
+    return np.exp(2j * np.pi / wavelength * array @ directions.T).astype(np.complex64)
+
+
+def bartlett(h: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Beamformer output `|A^H h|` (..., H * W) of array vectors h (..., M) and steering matrix A."""
+    return np.abs(h.astype(np.complex64) @ matrix.conj())
+
+
+def simulate_rfid(positions: np.ndarray, seed: int = 0, max_order: int = MAX_ORDER) -> np.ndarray:
+    """Array vectors (S, 16) complex of tags at `positions` (S, 3) [m], world."""
+    rotation = Rotation.from_quat(ORIENTATION).as_matrix()
+    traced = trace(
+        ROOM,
+        positions,
+        GATEWAY,
+        LIGHT / WAVELENGTH,
+        max_order=max_order,
+        array=planar_array() @ rotation.T,
+        snr_db=SNR_DB,
+        seed=seed,
+    )
+    return traced.csi[:, :, 0]
+
+
+def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
+    """Write `count` spectra in the release's layout; the folder must not exist."""
+    positions = hand_moved(count, seed)
+    vectors = simulate_rfid(positions, seed)
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    (partial / "spectrum").mkdir(parents=True)
+    matrix = steering(planar_array(), SphereGrid.hemisphere(HEIGHT, WIDTH), WAVELENGTH)
+    for i, vector in enumerate(vectors):
+        image = bartlett(vector, matrix).reshape(HEIGHT, WIDTH)
+        grey = np.round(255 * image / image.max()).astype(np.uint8)
+        Image.fromarray(grey).save(partial / "spectrum" / f"{i + 1:05d}.png", compress_level=1)
+    lines = ["x,y,z", *(",".join(f"{v:.4f}" for v in p) for p in positions)]
+    (partial / "tx_pos.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (partial / "gateway_info.yml").write_text(
+        f"dataset_name: {STAND_IN}\n"
+        "gateway1:\n"
+        f"  position: {GATEWAY.tolist()}\n"
+        f"  orientation: {ORIENTATION.tolist()}  # quaternion, scalar last\n",
+        encoding="utf-8",
+    )
+    order = np.random.default_rng(seed).permutation(count)
+    test = max(round(0.2 * count), 1)
+    for name, rows in (("test", order[:test]), ("train", order[test:])):
+        text = "".join(f"{i + 1:05d}\n" for i in np.sort(rows))
+        (partial / f"{name}_index.txt").write_text(text, encoding="utf-8")
+    try:
+        os.rename(partial, folder)
+    except OSError:
+        # Another run made the same folder meanwhile; the content is the same by construction.
+        shutil.rmtree(partial)
+        if not folder.is_dir():
+            raise
+
+
+def ensure_rfid_sim(parent: Path, count: int = 640, seed: int = 0) -> Path:
+    """The folder of this stand-in under `parent`, made when it is not there yet.
+
+    Raises:
+        ValueError: fewer than two positions.
+    """
+    if count < 2:
+        raise ValueError(f"dataset.count={count}: expected at least 2 tag positions")
+    folder = Path(parent) / f"{STAND_IN}-{count}-{seed}"
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        write_rfid_sim(folder, count, seed)
+    return folder

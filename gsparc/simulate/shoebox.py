@@ -1,0 +1,251 @@
+"""Exact image sources in a shoebox room with absorbing boxes: ground truth whose every path is known.
+
+Source: J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics",
+J. Acoust. Soc. Am. 65 (1979). A path of one transmitter and one receiver is the straight line to an
+image of the transmitter; the amplitude law is wavelength / (4 pi d), the phase exp(-j 2 pi f d / c).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import product
+
+import numpy as np
+
+LIGHT = 299_792_458.0  # [m/s]
+WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
+
+
+@dataclass(frozen=True)
+class Room:
+    """A box of six plane walls with absorbing boxes inside.
+
+    Attributes:
+        lower, upper: (3,) [m] opposite corners.
+        reflection: (6,) real or complex amplitude reflection coefficients, ordered as `WALLS`.
+        occluders: (n, 2, 3) [m] lower and upper corners of boxes that absorb what hits them.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    reflection: np.ndarray
+    occluders: np.ndarray = field(default_factory=lambda: np.zeros((0, 2, 3)))
+
+    def __post_init__(self) -> None:
+        for name, shape in (("lower", (3,)), ("upper", (3,)), ("reflection", (6,))):
+            if np.shape(getattr(self, name)) != shape:
+                raise ValueError(f"room.{name}: expected shape {shape}, got {np.shape(getattr(self, name))}")
+        if not (np.asarray(self.upper) > np.asarray(self.lower)).all():
+            raise ValueError(f"room: upper {self.upper} must lie above lower {self.lower} on every axis")
+        if np.asarray(self.occluders).shape[1:] != (2, 3):
+            raise ValueError(f"room.occluders: expected (n, 2, 3), got {np.shape(self.occluders)}")
+
+    @staticmethod
+    def uniform(size: tuple[float, float, float], reflection: complex = -0.7, **kwargs) -> Room:
+        """A room from the origin to `size` [m] whose walls are alike."""
+        return Room(np.zeros(3), np.array(size, dtype=float), np.full(6, reflection), **kwargs)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Whether points (..., 3) [m] are inside the room and outside every occluder: (...) bool."""
+        inside = ((points > self.lower) & (points < self.upper)).all(axis=-1)
+        for low, high in self.occluders:
+            inside &= ~((points >= low) & (points <= high)).all(axis=-1)
+        return inside
+
+
+@dataclass(frozen=True)
+class Images:
+    """The mirror images of a room up to some order: the image of p is `signs * p + offsets`.
+
+    Attributes:
+        cell: (I, 3) int, which mirrored copy of the room the image lies in; |cell| counts reflections.
+        signs: (I, 3) of +-1, the diagonal of the orthogonal matrix Q.
+        offsets: (I, 3) [m].
+        gain: (I,) complex product of the reflection coefficients on the way.
+    """
+
+    cell: np.ndarray
+    signs: np.ndarray
+    offsets: np.ndarray
+    gain: np.ndarray
+
+    @property
+    def order(self) -> np.ndarray:
+        """Number of reflections (I,)."""
+        return np.abs(self.cell).sum(axis=1)
+
+    def of(self, points: np.ndarray) -> np.ndarray:
+        """Images (..., I, 3) [m] of points (..., 3) [m]."""
+        return points[..., None, :] * self.signs + self.offsets
+
+
+def images(room: Room, max_order: int) -> Images:
+    """All images of order <= `max_order`, sorted by order; the first is the point itself."""
+    reach = range(-max_order, max_order + 1)
+    cells = [c for c in product(reach, repeat=3) if sum(map(abs, c)) <= max_order]
+    cell = np.array(sorted(cells, key=lambda c: (sum(map(abs, c)), c)), dtype=np.int64)
+    signs, offsets = _mirror(room, cell)
+    steps = np.abs(cell)
+    # Towards the high side the high wall comes first: cell 3 is high, low, high.
+    high = np.where(cell > 0, (steps + 1) // 2, steps // 2)
+    walls = np.stack([steps - high, high], axis=-1).reshape(-1, 6)
+    gain = np.prod(np.asarray(room.reflection, dtype=np.complex128) ** walls, axis=1)
+    return Images(cell, signs, offsets, gain)
+
+
+def _mirror(room: Room, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The map p -> signs * p + offsets into cells (I, 3)."""
+    size = np.asarray(room.upper) - room.lower
+    even = cell % 2 == 0
+    return np.where(even, 1.0, -1.0), np.where(even, 0.0, 2.0 * room.lower + size) + cell * size
+
+
+def visible(room: Room, images: Images, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
+    """Whether each observer sees each image of a source, exactly: (S, I) bool.
+
+    The straight line from the observer to the image runs through mirrored copies of the room; it is
+    blocked when it meets a copy of an occluder in one of them (unfolding).
+
+    Args:
+        source, observer: (S, 3) [m] inside the room, broadcast against each other.
+    """
+    source, observer = np.broadcast_arrays(np.atleast_2d(source), np.atleast_2d(observer))
+    seen = np.ones((len(observer), len(images.cell)), dtype=bool)
+    if len(room.occluders) == 0:
+        return seen
+    places = images.of(source)
+    for i, cell in enumerate(images.cell):
+        crossed = product(*(range(min(0, c), max(0, c) + 1) for c in cell))
+        signs, offsets = _mirror(room, np.array(list(crossed), dtype=np.int64))
+        for low, high in room.occluders:
+            corner, other = signs * low + offsets, signs * high + offsets
+            for box_low, box_high in zip(np.minimum(corner, other), np.maximum(corner, other), strict=True):
+                seen[:, i] &= ~_meets(observer, places[:, i], box_low, box_high)
+    return seen
+
+
+def _meets(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Whether segments start -> end (S, 3) meet the box from low to high (3,): (S,) bool; slab test."""
+    along = end - start
+    parallel = along == 0
+    step = np.where(parallel, 1.0, along)
+    near, far = (low - start) / step, (high - start) / step
+    near, far = np.minimum(near, far), np.maximum(near, far)
+    outside = parallel & ((start < low) | (start > high))
+    near, far = np.where(parallel, -np.inf, near), np.where(parallel, np.inf, far)
+    return (np.maximum(near.max(axis=1), 0.0) <= np.minimum(far.min(axis=1), 1.0)) & ~outside.any(axis=1)
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A simulated campaign and its truth.
+
+    Attributes:
+        csi: (S, A, K) complex128, noise included.
+        tx, rx: (S, 3) [m].
+        frequency_hz: (K,) [Hz].
+        array: (A, 3) [m], receive elements relative to `rx`, world axes.
+        images: the mirror images; sources of a static transmitter are `images.of(tx[0])`.
+        visible: (S, I) bool, seen from the array's centre.
+        noise_variance: per entry of `csi`; 0 without noise.
+    """
+
+    csi: np.ndarray
+    tx: np.ndarray
+    rx: np.ndarray
+    frequency_hz: np.ndarray
+    array: np.ndarray
+    images: Images
+    visible: np.ndarray
+    noise_variance: float
+
+    def as_arrays(self) -> dict[str, np.ndarray]:
+        """The schema of one's own measurements, ready for `write_own` or `from_arrays`.
+
+        With a static transmitter the truth is its images (`source_*`), with a static receiver the
+        images of the array's centre; `source_gain` is the amplitude at 1 m without the wavelength.
+        """
+        still = self.tx if (self.tx == self.tx[0]).all() else self.rx
+        arrays = {
+            "rx_position": _compact(self.rx),
+            "tx_position": _compact(self.tx),
+            "csi": self.csi,
+            "frequency_hz": self.frequency_hz,
+            "source_position": self.images.of(still[0]),
+            "source_gain": self.images.gain,
+            "source_order": self.images.order,
+            "source_visible": self.visible,
+        }
+        if len(self.array) > 1:
+            arrays["array_position"] = self.array
+        if self.noise_variance > 0:
+            arrays["noise_variance"] = np.float64(self.noise_variance)
+        return arrays
+
+
+def _compact(position: np.ndarray) -> np.ndarray:
+    """(3,) when all rows are the same, else (S, 3)."""
+    return position[0] if (position == position[0]).all() else position
+
+
+def trace(
+    room: Room,
+    tx: np.ndarray,
+    rx: np.ndarray,
+    frequency_hz: np.ndarray | float,
+    *,
+    max_order: int = 2,
+    array: np.ndarray | None = None,
+    snr_db: float | None = None,
+    seed: int = 0,
+) -> Trace:
+    """Channels between every pair of rows: `sum_i v_i g_i exp(-j 2 pi f d_i / c) wavelength / (4 pi d_i)`.
+
+    Args:
+        tx, rx: (S, 3) or (3,) [m] inside the room, broadcast against each other.
+        frequency_hz: (K,) or a number [Hz].
+        array: (A, 3) [m] receive elements relative to `rx`, world axes; None for one element at `rx`.
+        snr_db: complex white noise is added this far below the mean power; None for none.
+        seed: of the noise.
+
+    Raises:
+        ValueError: a position lies outside the room or inside an occluder.
+    """
+    tx, rx = (p.astype(np.float64) for p in np.broadcast_arrays(np.atleast_2d(tx), np.atleast_2d(rx)))
+    for name, position in (("tx", tx), ("rx", rx)):
+        outside = np.flatnonzero(~room.contains(position))
+        if len(outside):
+            raise ValueError(
+                f"{name}, row {outside[0]} = {position[outside[0]]}: outside the room or inside an occluder"
+            )
+    frequency = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
+    elements = np.zeros((1, 3)) if array is None else np.asarray(array, dtype=np.float64)
+    mirrored = images(room, max_order)
+    seen = visible(room, mirrored, tx, rx)
+    amplitude = mirrored.gain * seen
+    csi = np.empty((len(tx), len(elements), len(frequency)), dtype=np.complex128)
+    sources = mirrored.of(tx)
+    for a, element in enumerate(elements):
+        distance = np.linalg.norm(sources - (rx + element)[:, None], axis=-1)
+        for k, f in enumerate(frequency):
+            # float64 and cycles, not radians: 10 km at 60 GHz keeps 9 digits of a cycle
+            cycles = np.mod(f / LIGHT * distance, 1.0)
+            wave = np.exp(-2j * np.pi * cycles) * (LIGHT / f / (4 * np.pi)) / distance
+            csi[:, a, k] = (amplitude * wave).sum(axis=1)
+    variance = 0.0
+    if snr_db is not None:
+        variance = float(np.mean(np.abs(csi) ** 2) / 10 ** (snr_db / 10))
+        rng = np.random.default_rng(seed)
+        csi += np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))
+    return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
+
+
+def scatter(room: Room, count: int, seed: int, margin: float = 0.2) -> np.ndarray:
+    """`count` positions (S, 3) [m] drawn uniformly in the room, `margin` [m] from walls, off occluders."""
+    rng = np.random.default_rng(seed)
+    low, high = np.asarray(room.lower) + margin, np.asarray(room.upper) - margin
+    points = np.empty((0, 3))
+    while len(points) < count:
+        drawn = rng.uniform(low, high, size=(2 * count, 3))
+        points = np.concatenate([points, drawn[room.contains(drawn)]])
+    return points[:count]
