@@ -1,0 +1,117 @@
+"""Baselines fitted once per dataset, split and settings: sweeps find their results on disk."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsparc import checkpoint
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
+from gsparc.method import Method
+from gsparc.registry import method_class
+from gsparc.scoring import Scores, score
+
+log = logging.getLogger(__name__)
+
+BASELINES = ("zero", "mean", "nearest", "idw", "gp")
+CACHE_VERSION = 1  # raise it when a baseline or a metric changes its answers
+STORE_ABOVE_S = 1.0  # a faster fit is repeated rather than stored
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A baseline on every fold of a split.
+
+    Attributes:
+        methods: one fitted method per fold.
+        scores: pooled results.
+        train_s: seconds of each fold's fit, as measured when it was first made [s].
+    """
+
+    methods: tuple[Method, ...]
+    scores: Scores
+    train_s: tuple[float, ...]
+
+
+def platform_cache() -> Path:
+    """Where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "gsparc"
+
+
+def baseline(
+    name: str, data: Measurements, split: Split, eval_on: str = "test", cache: Path | None = None
+) -> Fitted:
+    """Fit (or find) the baseline `name` with its default settings on each fold, and score it.
+
+    Args:
+        name: as in `gsparc.registry.METHODS`.
+        data: the dataset.
+        split: folds; baselines learn from train and val rows.
+        eval_on: `train`, `val` or `test`.
+        cache: folder of earlier results; None keeps nothing.
+    """
+    key = hashlib.sha256(f"{data.site.sha256} {split.sha256}".encode()).hexdigest()[:24]
+    room = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key / name
+    methods, seconds = [], []
+    for number, fold in enumerate(split.folds):
+        found = None if room is None else _stored_fit(room / f"fold{number}.ckpt")
+        if found is None:
+            method = method_class(name)()
+            report = method.fit(data, fold, room or Path())
+            for note in report.notes:
+                log.info("fold %d: %s", number, note)
+            found = (method, report.seconds)
+            if room is not None and report.seconds > STORE_ABOVE_S:
+                checkpoint.save(room / f"fold{number}.ckpt", method, extra={"train_s": report.seconds})
+        methods.append(found[0])
+        seconds.append(found[1])
+    scores = None if room is None else _stored_scores(room / f"{eval_on}.npz")
+    if scores is None:
+        scores = score(methods, data, split, eval_on)
+        if room is not None:
+            _store_scores(room / f"{eval_on}.npz", scores)
+    return Fitted(tuple(methods), scores, tuple(seconds))
+
+
+def _stored_fit(path: Path) -> tuple[Method, float] | None:
+    if not path.exists():
+        return None
+    try:
+        method, stored = checkpoint.load(path)
+        return method, float(stored.extra["train_s"])
+    except (checkpoint.CheckpointError, KeyError, ValueError) as error:
+        log.warning("a stored baseline is not usable and is made anew: %s", error)
+        return None
+
+
+def _stored_scores(path: Path) -> Scores | None:
+    if not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return Scores.from_arrays(dict(file))
+    except Exception as error:  # whatever a damaged archive raises: it is only a cache
+        log.warning("stored results are not usable and are made anew: %s (%s)", path, error)
+        return None
+
+
+def _store_scores(path: Path, scores: Scores) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial = tempfile.mkstemp(suffix=".npz", dir=path.parent)
+    with os.fdopen(handle, "wb") as file:
+        np.savez(file, **scores.arrays())
+    os.replace(partial, path)
+
+
+def mean_seconds(seconds: Sequence[float]) -> float:
+    """Seconds to train one model: the mean over folds [s]."""
+    return float(np.mean(seconds))

@@ -1,0 +1,216 @@
+"""One file per trained method: everything needed to predict again, written atomically, read without code."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+from gsparc.data.schema import Site
+from gsparc.method import Method
+from gsparc.ops import SphereGrid
+from gsparc.registry import METHODS, build, method_class
+
+SCHEMA_VERSION = 1
+FORMAT = "gsparc-checkpoint"
+
+
+class CheckpointError(ValueError):
+    """A file that is no readable checkpoint, or a state that cannot be written; one line, with the file."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """What a checkpoint file holds.
+
+    Attributes:
+        method: the method's name in tables.
+        target: its class, as an import path.
+        config: the run's configuration, YAML text ("" when there was none).
+        site: the dataset's fixed facts (normalisation, grid, origin, box, array, carrier).
+        state: what `Method.restore` needs.
+        extra: what a trainer or harness added (optimizer, random states, position in the data order, split).
+        path: the file.
+    """
+
+    method: str
+    target: str
+    config: str
+    site: Site
+    state: dict[str, Any]
+    extra: dict[str, Any] = field(default_factory=dict)
+    path: Path = Path()
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        """The configuration as plain containers; empty when there was none."""
+        try:
+            loaded = yaml.safe_load(self.config) or {}
+        except yaml.YAMLError:
+            raise CheckpointError(
+                f"{self.path}: its configuration is not YAML; the file is damaged"
+            ) from None
+        return loaded if isinstance(loaded, dict) else {}
+
+
+def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None) -> None:
+    """Write `method` and its site; the file appears whole or not at all, also under a kill or a full disk.
+
+    Args:
+        path: file to write or replace.
+        method: fitted.
+        config: YAML text of the run's configuration, interpolations resolved.
+        extra: tensors, numbers, strings, None, nested dicts and lists.
+
+    Raises:
+        CheckpointError: something in the state is of another type; its place is named.
+    """
+    site = getattr(method, "site", None)
+    if site is None:
+        raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
+    content = {
+        "format": FORMAT,
+        "schema_version": SCHEMA_VERSION,
+        "method": method.name,
+        "target": f"{type(method).__module__}.{type(method).__qualname__}",
+        "config": config,
+        "site": _plain(_site_facts(site), "site"),
+        "state": _plain(method.state(), "state"),
+        "extra": _plain(dict(extra or {}), "extra"),
+    }
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException:
+        Path(partial).unlink(missing_ok=True)
+        raise
+
+
+def read(path: str | Path) -> Stored:
+    """Read a checkpoint onto the CPU; runs no code from the file.
+
+    Raises:
+        CheckpointError: missing, not a checkpoint, damaged, hostile, or of a newer gsparc.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such checkpoint")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError:
+        raise CheckpointError(
+            f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could run code"
+        ) from None
+    except Exception as error:  # whatever a damaged archive raises
+        reason = str(error).strip().splitlines()
+        raise CheckpointError(
+            f"{path}: cannot be read ({reason[0] if reason else type(error).__name__})"
+        ) from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
+    version = content.get("schema_version")
+    if not isinstance(version, int) or version > SCHEMA_VERSION:
+        raise CheckpointError(
+            f"{path}: written in schema {version}, this gsparc reads up to {SCHEMA_VERSION}; update gsparc"
+        )
+    try:
+        return Stored(
+            method=str(content["method"]),
+            target=str(content["target"]),
+            config=str(content["config"]),
+            site=_site_from(content["site"]),
+            state=dict(content["state"]),
+            extra=dict(content["extra"]),
+            path=path,
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
+
+
+def restore(stored: Stored) -> Method:
+    """The fitted method a checkpoint holds; only classes of gsparc are built.
+
+    Raises:
+        CheckpointError: unknown method, or a state that does not fit it.
+    """
+    model = stored.configuration.get("model")
+    try:
+        if isinstance(model, dict) and model.get("_target_") == stored.target:
+            method = build(model, trusted=False)
+        else:
+            method = method_class(_registered(stored))()
+        method.restore(stored.site, stored.state)
+    except CheckpointError:
+        raise
+    except Exception as error:  # the state comes from a file: anything may be wrong with it
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise CheckpointError(f"{stored.path}: {stored.method} cannot be restored ({reason})") from error
+    return method
+
+
+def load(path: str | Path) -> tuple[Method, Stored]:
+    """`restore(read(path))`, with what else the file holds."""
+    stored = read(path)
+    return restore(stored), stored
+
+
+def _registered(stored: Stored) -> str:
+    for name, target in METHODS.items():
+        if target == stored.target:
+            return name
+    raise CheckpointError(f"{stored.path}: made by {stored.target!r}, which this gsparc does not know")
+
+
+def _site_facts(site: Site) -> dict[str, Any]:
+    facts = {f.name: getattr(site, f.name) for f in fields(site)}
+    facts["grid"] = None if site.grid is None else dict(vars(site.grid))
+    return facts
+
+
+def _site_from(facts: Mapping[str, Any]) -> Site:
+    known = {f.name for f in fields(Site)}
+    values = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in facts.items() if k in known}
+    if values.get("grid") is not None:
+        values["grid"] = SphereGrid(**values["grid"])
+    return Site(**values)
+
+
+def _plain(value: Any, where: str) -> Any:
+    """The same value in types that weights-only unpickling accepts; views do not drag their storage along."""
+    if value is None or type(value) in (bool, int, float, str, bytes):
+        return value
+    if isinstance(value, Tensor):
+        tensor = value.detach().contiguous()
+        return tensor.clone() if tensor.untyped_storage().nbytes() > tensor.nbytes else tensor
+    if isinstance(value, np.ndarray):
+        return _plain(torch.from_numpy(np.ascontiguousarray(value)), where)
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {_plain(k, where): _plain(v, f"{where}.{k}") for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        items = [_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
+        return items if isinstance(value, list) else tuple(items)
+    if isinstance(value, Path):
+        return str(value)
+    for base in (bool, int, float, str):  # enums and other named subclasses
+        if isinstance(value, base):
+            return base(value)
+    raise CheckpointError(
+        f"{where} is a {type(value).__name__}; a checkpoint holds tensors, numbers, strings"
+    )

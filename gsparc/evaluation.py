@@ -1,0 +1,215 @@
+"""The harness: one method and the baselines under the same data, metrics and clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gsparc.baselines import BASELINES, Fitted, baseline, mean_seconds
+from gsparc.clock import COPY, ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
+from gsparc.method import Method
+from gsparc.metrics import paired_values
+from gsparc.ops import Pose
+from gsparc.scoring import Scores, rows_of, score
+
+REFERENCE = "gp"  # differences are paired with it
+BATCH = 64
+OWN = "self"  # the evaluated method's name on the clock; baselines may carry the same name as it
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What an evaluation found.
+
+    Attributes:
+        facts: flat keys as in `summary.json`.
+        columns: per-sample columns of `per_sample.csv`.
+    """
+
+    facts: dict[str, Any]
+    columns: dict[str, Any]
+
+
+def evaluate(
+    methods: Method | Sequence[Method],
+    train_s: float | Sequence[float] | None,
+    data: Measurements,
+    split: Split,
+    *,
+    eval_on: str = "test",
+    baselines: Sequence[str] = BASELINES,
+    cache: Path | None = None,
+    clock: ClockSettings | None = None,
+) -> Evaluation:
+    """Score and time a method beside the baselines.
+
+    Args:
+        methods: one fitted method per fold (or the only one).
+        train_s: seconds of each fold's training [s]; None when unknown.
+        data: the dataset.
+        split: as the methods were fitted with; test results are pooled over its folds.
+        eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
+        baselines: names in `gsparc.registry.METHODS`.
+        cache: folder where baselines are kept between runs; None keeps nothing.
+        clock: how long to measure latencies.
+
+    Returns:
+        `test/*`, `baseline/<name>/*`, `paired/gp/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
+        `dataset/*`, `split/*`.
+
+    Raises:
+        ValueError: as in `score`.
+    """
+    methods = (methods,) if isinstance(methods, Method) else tuple(methods)
+    seconds = _per_fold(train_s, len(methods))
+    scores = score(methods, data, split, eval_on)
+    others = {name: baseline(name, data, split, eval_on, cache) for name in baselines}
+    facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
+    facts[f"{eval_on}/skill"] = _skill(scores, others)
+    for name, other in others.items():
+        facts |= {f"baseline/{name}/{k}": v for k, v in other.scores.figures().items()}
+        facts[f"baseline/{name}/skill"] = _skill(other.scores, others)
+        facts[f"baseline/{name}/train_s"] = mean_seconds(other.train_s)
+    if REFERENCE in others:
+        facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
+    facts |= {
+        "time/train_s": None if seconds is None else mean_seconds(seconds),
+        "time/train_total_s": None if seconds is None else float(sum(seconds)),
+    }
+    contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
+    facts |= machine_facts()
+    facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock)
+    facts |= {
+        "model/name": methods[0].name,
+        "model/num_gaussians": methods[0].size(),
+        "model/effects": getattr(methods[0], "effects", None),
+    }
+    facts |= dataset_facts(data) | split_facts(split) | peak_memory()
+    return Evaluation(facts, _columns(scores, others, data))
+
+
+def paired_differences(scores: Scores, reference: Scores, name: str) -> dict[str, float | None]:
+    """Mean per-sample differences to `reference` and their standard errors: `paired/<name>/<figure>[_se]`.
+
+    The standard error takes samples as independent; under `grouped` neighbours are not: it is a lower bound.
+
+    Raises:
+        ValueError: the two speak of different rows.
+    """
+    if not (np.array_equal(scores.row, reference.row) and np.array_equal(scores.fold, reference.fold)):
+        raise ValueError(f"results cannot be paired with {name}: they are on different rows")
+    facts: dict[str, float | None] = {}
+    own, other = paired_values(scores.samples), paired_values(reference.samples)
+    for figure in own:
+        difference = own[figure] - other[figure]
+        difference = difference[~np.isnan(difference)]
+        n = len(difference)
+        facts[f"paired/{name}/{figure}"] = float(difference.mean()) if n else None
+        facts[f"paired/{name}/{figure}_se"] = float(difference.std(ddof=1) / np.sqrt(n)) if n > 1 else None
+    return facts
+
+
+def latencies(
+    methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings | None = None
+) -> dict[str, float | int | str]:
+    """`time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others, timed in turns."""
+    clock = clock or ClockSettings()
+    singles = _calls(methods, _queries(data, rows, 1))
+    one = interleaved({**singles, COPY: reference_copy()}, clock)
+    fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
+    many = interleaved(_calls(methods, _queries(data, rows, BATCH)), fewer)
+    copy_ms = float(np.median(one[COPY]))
+    shape = " x ".join(str(n) for n in data.target.shape[1:])
+    facts: dict[str, float | int | str] = {
+        "time/copy_ms": copy_ms,
+        "time/rounds": len(one[COPY]),
+        "time/includes": (
+            f"one query end to end, a position in host memory in, a {shape} {data.site.kind} in host memory "
+            "out; warm, plans made before; no file, no picture"
+        ),
+    }
+    for name in methods:
+        room = "time" if name == OWN else f"baseline/{name}"
+        facts[f"{room}/render_ms_p50"] = float(np.median(one[name]))
+        facts[f"{room}/render_ms_p95"] = float(np.quantile(one[name], 0.95))
+        facts[f"{room}/render_ms_batch{BATCH}"] = float(np.median(many[name])) / BATCH
+        facts[f"{room}/ratio_to_copy"] = float(np.median(one[name])) / copy_ms
+    return facts
+
+
+def dataset_facts(data: Measurements) -> dict[str, Any]:
+    """`dataset/*`."""
+    site = data.site
+    return {
+        "dataset/name": site.name,
+        "dataset/kind": site.kind,
+        "dataset/sha256": site.sha256,
+        "dataset/stand_in": site.stand_in,
+        "dataset/convergence_error": site.convergence_error,
+        "dataset/rows": len(data),
+    }
+
+
+def split_facts(split: Split) -> dict[str, Any]:
+    """`split/*`; counts are sums over folds."""
+    counts = {f"split/{k}": sum(len(getattr(f, k)) for f in split.folds) for k in ("train", "val", "test")}
+    return {"split/name": split.name, "split/sha256": split.sha256, "split/folds": len(split.folds), **counts}
+
+
+def _queries(data: Measurements, rows: np.ndarray, size: int) -> list[tuple[Tensor, Pose]]:
+    """Positions of `size` of the `rows`, another set each time."""
+    picks = [np.take(rows, np.arange(turn, turn + size), mode="wrap") for turn in range(min(len(rows), 64))]
+    batches = (data.batch(pick) for pick in picks)
+    return [(batch.tx, batch.rx) for batch in batches]  # without targets: 64 batches of images are 500 MB
+
+
+def _calls(
+    methods: Mapping[str, Method], queries: Sequence[tuple[Tensor, Pose]]
+) -> dict[str, Callable[[int], object]]:
+    def call(method: Method) -> Callable[[int], object]:
+        return lambda turn: method.predict(*queries[turn % len(queries)])
+
+    return {name: call(method) for name, method in methods.items()}
+
+
+def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:
+    """1 - MSE / MSE(nearest); None without a nearest neighbour or when that one makes no error."""
+    if "nearest" not in others:
+        return None
+    bar = float(np.nanmean(others["nearest"].scores.samples["mse"]))
+    return 1 - float(np.nanmean(scores.samples["mse"])) / bar if bar > 0 else None
+
+
+def _per_fold(train_s: float | Sequence[float] | None, count: int) -> tuple[float, ...] | None:
+    if train_s is None:
+        return None
+    seconds = (float(train_s),) if isinstance(train_s, (int, float)) else tuple(float(s) for s in train_s)
+    if len(seconds) != count:
+        raise ValueError(f"{len(seconds)} training times for {count} methods")
+    return seconds
+
+
+def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -> dict[str, Any]:
+    world = data.moving[scores.row] + data.site.origin
+    names = data.row_names or [f"row {i}" for i in range(len(data))]
+    columns: dict[str, Any] = {
+        "fold": scores.fold,
+        "row": scores.row,
+        "name": [names[i] for i in scores.row],
+        "x_m": world[:, 0],
+        "y_m": world[:, 1],
+        "z_m": world[:, 2],
+        "confidence": scores.confidence,
+        "variance": scores.variance,
+        **scores.samples,
+    }
+    for name, other in others.items():
+        columns |= {f"baseline/{name}/{k}": v for k, v in paired_values(other.scores.samples).items()}
+    return columns

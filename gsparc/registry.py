@@ -1,0 +1,84 @@
+"""Methods by name, imported when asked for, and methods built from `conf/model/*.yaml`."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.method import Method
+
+METHODS = {
+    "zero": "gsparc.peers.zero.Zero",
+    "mean": "gsparc.peers.mean.Mean",
+    "nearest": "gsparc.peers.nearest.Nearest",
+    "idw": "gsparc.peers.idw.InverseDistance",
+    "gp": "gsparc.peers.gp.GaussianProcess",
+    "gsparc": "gsparc.learned.LearnedField",
+}
+
+
+def suggest(name: str, known: Mapping[str, Any] | list[str]) -> str:
+    """`; did you mean 'gp'?`, or what there is when nothing is close."""
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
+    return f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(sorted(known))}"
+
+
+def method_class(name: str) -> type[Method]:
+    """The class called `name`; `ValueError` with the nearest right name when there is none."""
+    if name not in METHODS:
+        raise ValueError(f"no method is called {name!r}{suggest(name, METHODS)}")
+    module, _, attribute = METHODS[name].rpartition(".")
+    return getattr(import_module(module), attribute)
+
+
+def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
+    """The method that a config of the group `model` describes (unfitted).
+
+    Args:
+        config: `_target_` and its arguments.
+        trusted: False for text out of a file: then every `_target_` must be a class of gsparc.
+
+    Raises:
+        ValueError: no or wrong `_target_`, or arguments it does not take.
+    """
+    node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
+    target = node.get("_target_")
+    if target is None:
+        raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
+    if not trusted:
+        for path in _targets(OmegaConf.to_container(node, resolve=False)):
+            _refuse_foreign(path)
+    method = instantiate(node)
+    if not isinstance(method, Method):
+        raise ValueError(f"model: {target} is not a gsparc.method.Method")
+    return method
+
+
+def _targets(node: Any) -> Iterator[Any]:
+    if isinstance(node, dict):
+        for key, value in node.items():
+            if key == "_target_":
+                yield value
+            else:
+                yield from _targets(value)
+    elif isinstance(node, list):
+        for value in node:
+            yield from _targets(value)
+
+
+def _refuse_foreign(path: Any) -> None:
+    """`gsparc.x.os.system` starts with gsparc too: what counts is where the class was defined."""
+    found = None
+    if isinstance(path, str) and path.startswith("gsparc."):
+        module, _, attribute = path.rpartition(".")
+        try:
+            found = getattr(import_module(module), attribute, None)
+        except ImportError:
+            found = None
+    if not (isinstance(found, type) and found.__module__.startswith("gsparc.")):
+        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")

@@ -1,0 +1,106 @@
+"""Predictions on the chosen rows, turned into per-sample results pooled over folds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.data.schema import Kind, Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.method import Method
+from gsparc.metrics import metrics_for
+
+SUBSETS = ("train", "val", "test")
+CHUNK = 64  # rows predicted at a time
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Results of one method, sample by sample, in the order of the folds.
+
+    Attributes:
+        kind: of the dataset.
+        fold, row: (S,) int64.
+        samples: quantities of the metrics of `kind`, (S,) float64 each.
+        confidence, variance: (S,) float64, NaN where the method gives none.
+    """
+
+    kind: Kind
+    fold: np.ndarray
+    row: np.ndarray
+    samples: dict[str, np.ndarray]
+    confidence: np.ndarray
+    variance: np.ndarray
+
+    def figures(self) -> dict[str, float | None]:
+        """Flat figures over all folds together."""
+        return type(metrics_for(self.kind)).summary(self.samples)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Everything as arrays, for a file."""
+        own = {"fold": self.fold, "row": self.row, "confidence": self.confidence, "variance": self.variance}
+        return {"kind": np.array(self.kind), **own, **{f"samples/{k}": v for k, v in self.samples.items()}}
+
+    @staticmethod
+    def from_arrays(arrays: dict[str, np.ndarray]) -> Scores:
+        """Inverse of `arrays`; `KeyError` when something is missing."""
+        own = {k: arrays[k] for k in ("fold", "row", "confidence", "variance")}
+        samples = {k.removeprefix("samples/"): v for k, v in arrays.items() if k.startswith("samples/")}
+        return Scores(kind=str(arrays["kind"]), samples=samples, **own)  # type: ignore[arg-type]
+
+
+def rows_of(fold: Fold, eval_on: str) -> np.ndarray:
+    """Rows of the subset `train`, `val` or `test`.
+
+    Raises:
+        ValueError: another name, or an empty subset.
+    """
+    if eval_on not in SUBSETS:
+        raise ValueError(f"eval_on={eval_on!r} is none of {', '.join(SUBSETS)}")
+    rows = getattr(fold, eval_on)
+    if not len(rows):
+        raise ValueError(f"eval_on={eval_on}: the split has no {eval_on} rows")
+    return rows
+
+
+def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test") -> Scores:
+    """Predict the chosen rows of every fold with that fold's method.
+
+    Args:
+        methods: one fitted method per fold.
+        data: the dataset.
+        split: as the methods were fitted with.
+        eval_on: `train`, `val` or `test`.
+
+    Raises:
+        ValueError: another number of methods than folds, an empty subset, a prediction with NaN.
+    """
+    if len(methods) != len(split.folds):
+        raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
+    parts = []
+    for number, (method, fold) in enumerate(zip(methods, split.folds, strict=True)):
+        rows = rows_of(fold, eval_on)
+        metric = metrics_for(data.site.kind, data.site.target_scale)
+        confidence, variance = [], []
+        for start in range(0, len(rows), CHUNK):
+            batch = data.batch(rows[start : start + CHUNK])
+            prediction = method.predict(batch.tx, batch.rx)
+            metric.update(prediction.mean, batch.target, batch.mask)
+            for values, given in ((confidence, prediction.confidence), (variance, prediction.variance)):
+                none = np.full(len(batch), np.nan)
+                values.append(none if given is None else given.detach().cpu().double().numpy())
+        samples = metric.compute()
+        parts.append(
+            (np.full(len(rows), number), rows, samples, np.concatenate(confidence), np.concatenate(variance))
+        )
+    folds, rows, samples, confidence, variance = zip(*parts, strict=True)
+    return Scores(
+        kind=data.site.kind,
+        fold=np.concatenate(folds),
+        row=np.concatenate(rows),
+        samples={name: np.concatenate([s[name] for s in samples]) for name in samples[0]},
+        confidence=np.concatenate(confidence),
+        variance=np.concatenate(variance),
+    )

@@ -1,0 +1,150 @@
+"""What a run leaves behind: `summary.json` for scripts, `per_sample.csv` for plots, a table for people."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import os
+import platform
+import subprocess
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
+
+
+def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
+    """Write flat `facts` as JSON, atomically; keys sorted.
+
+    Raises:
+        ValueError: a value is not a number, a string or None, or is NaN or infinite; the key is named.
+    """
+    text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
+    _replace(Path(path), text + "\n")
+
+
+def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
+    """Write equally long columns as CSV, atomically; NaN becomes an empty cell."""
+    lengths = {name: len(values) for name, values in columns.items()}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"columns of different lengths: {lengths}")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows([_cell(v) for v in row] for row in zip(*columns.values(), strict=True))
+    os.replace(partial, path)
+
+
+def provenance() -> dict[str, str | None]:
+    """`git`: commit of the source tree (`-dirty` when edited, None outside one); `versions`: what matters."""
+    return {"git": _git(), "versions": _versions()}
+
+
+def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str = "test") -> Table:
+    """Every method a row, accuracy beside its seconds and milliseconds.
+
+    Args:
+        facts: flat facts as in `summary.json`.
+        method: name of the row that `facts[prefix/...]` speaks of.
+        title: what was measured.
+        prefix: `test`, `train` or `val`.
+    """
+    spectra = f"{prefix}/ssim" in facts
+    power = f"{prefix}/rmse_db" in facts
+    if spectra:
+        wanted = (("ssim", ".4f"), ("ssim_gauss", ".4f"), ("psnr_db", ".2f"), ("skill", ".3f"))
+    elif power:
+        wanted = (("rmse_db", ".2f"), ("mae_db", ".2f"), ("nmse", ".4f"), ("skill", ".3f"))
+    else:
+        wanted = (("nmse", ".4f"), ("nmse_scalar", ".4f"), ("snr_db", ".2f"), ("skill", ".3f"))
+    table = Table(title=title)
+    table.add_column("method")
+    for name in (*(name for name, _ in wanted), "train s", "query ms p50"):
+        table.add_column(name, justify="right")
+    baselines = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")}, key=_rank)
+    rows = [(name, f"baseline/{name}", f"baseline/{name}") for name in baselines] + [(method, prefix, "time")]
+    for name, figures, times in rows:
+        cells = [_shown(facts.get(f"{figures}/{figure}"), form) for figure, form in wanted]
+        cells += [_shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
+        table.add_row(name, *cells, style="bold" if name == method and figures == prefix else None)
+    return table
+
+
+def _rank(name: str) -> tuple[int, str]:
+    order = ("zero", "mean", "nearest", "idw", "gp")
+    return (order.index(name) if name in order else len(order), name)
+
+
+def _shown(value: Any, form: str) -> str:
+    return "-" if value is None else format(value, form)
+
+
+def _value(key: str, value: Any) -> int | float | str | None:
+    if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:  # NumPy and torch scalars
+        value = value.item()
+    if isinstance(value, bool):
+        value = int(value)
+    if value is None or isinstance(value, (int, str)):
+        return value
+    if not isinstance(value, float):
+        raise ValueError(
+            f"summary: {key} is a {type(value).__name__}; only numbers, strings and null are kept"
+        )
+    if not math.isfinite(value):
+        raise ValueError(f"summary: {key} is {value}; a summary holds finite numbers (null when undefined)")
+    return value
+
+
+def _cell(value: Any) -> Any:
+    return "" if isinstance(value, (float, np.floating)) and math.isnan(value) else value
+
+
+def _replace(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
+def _git() -> str | None:
+    here = Path(__file__).resolve()
+
+    def ask(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", "-C", str(here.parent), *arguments], capture_output=True, text=True, timeout=10
+            )
+        except (OSError, subprocess.TimeoutExpired):
+            return None
+        return done.stdout.strip() if done.returncode == 0 else None
+
+    if ask("ls-files", "--error-unmatch", here.name) is None:  # an installed copy inside someone else's tree
+        return None
+    commit = ask("rev-parse", "HEAD")
+    return (
+        commit
+        if not commit or not ask("status", "--porcelain", "--untracked-files=no")
+        else f"{commit}-dirty"
+    )
+
+
+def _versions() -> str:
+    found = [f"python {platform.python_version()}"]
+    for package in PACKAGES:
+        try:
+            found.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            continue
+    return ", ".join(found)
