@@ -1,0 +1,112 @@
+"""Say in words what was understood of measurements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.data.errors import DataError
+from gsparc.data.newrf import is_newrf, read_newrf
+from gsparc.data.own import Reading, interpret
+from gsparc.data.raw import read_raw
+from gsparc.data.rfid import load_rfid
+from gsparc.data.schema import Measurements
+from gsparc.ops import SphereGrid
+
+ENDS = {"rx": "receiver", "tx": "transmitter"}
+
+
+def read_any(path: str | Path) -> Reading:
+    """Read a folder in the RFID release's layout, a NeWRF room, or a file of one's own.
+
+    Raises:
+        DataError: it is none of them, or something in it is wrong.
+    """
+    path = Path(path)
+    if path.is_dir():
+        if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
+            raise DataError(
+                f"{path}: a folder without gateway_info.yml, tx_pos.csv and spectrum/ (the RFID release's "
+                "layout); for measurements of your own give the npz or HDF5 file"
+            )
+        return Reading(load_rfid(path), ())
+    raw = read_raw(path)
+    return read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+
+
+def describe(data: Measurements) -> list[tuple[str, str]]:
+    """(topic, sentence) pairs about a dataset."""
+    site = data.site
+    moving, extent = data.moving, np.ptp(data.moving, axis=0)
+    # Local coordinates are centred in float64; the world is where the user put it.
+    still = (data.rx_position if site.static_end == "rx" else data.tx)[0] + site.origin
+    lines = [
+        ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
+        ("kind", f"{site.kind}: {_targets(data)}"),
+        ("stays", f"the {ENDS[site.static_end]}, at {_vector(still)} m"),
+        ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
+        ("neighbours", _neighbours(moving, site.wavelength)),
+    ]
+    if site.carrier_hz is not None:
+        lines.append(("carrier", f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"))
+    else:
+        lines.append(
+            ("carrier", "unknown; give frequency_hz, and effects that need the phase become available")
+        )
+    if site.subcarriers_hz is not None and len(site.subcarriers_hz) > 1:
+        span = np.ptp(site.subcarriers_hz) / 1e6
+        lines.append(("band", f"{len(site.subcarriers_hz)} subcarriers over {span:.6g} MHz"))
+    if site.grid is not None:
+        lines.append(("grid", _grid(site.grid)))
+    if site.array is not None:
+        lines.append(("array", f"{len(site.array)} receive antennas"))
+    if site.target_scale != 1:
+        lines.append(("scale", f"stored targets are the measurements divided by {site.target_scale:.4g}"))
+    if data.mask is not None:
+        lines.append(("mask", f"{data.mask.mean():.1%} of the entries were measured"))
+    if data.directions is not None:
+        lines.append(("directions", f"{sum(map(len, data.directions))} directions of arrival"))
+    if data.release_split is not None:
+        train, test = data.release_split
+        lines.append(("split", f"its own: {len(train)} rows to train, {len(test)} to test"))
+    if site.convergence_error is not None:
+        lines.append(("convergence", f"solver error (NMSE between two seeds) {site.convergence_error:.3g}"))
+    lines.append(("sha256", site.sha256))
+    return lines
+
+
+def _targets(data: Measurements) -> str:
+    count, shape = len(data), data.target.shape[1:]
+    if data.site.kind == "spectrum":
+        return f"{count} images of {shape[0]} x {shape[1]} directions"
+    if data.site.kind == "csi":
+        return f"{count} channels of {shape[0]} antennas x {shape[1]} subcarriers"
+    return f"{count} received powers"
+
+
+def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
+    distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
+    text = f"the nearest one is {np.median(distance):.3g} m away (median)"
+    if wavelength is not None:
+        text += f", {np.median(distance) / wavelength:.2g} wavelengths"
+    same = int((distance == 0).sum())
+    return text + (f"; {same} rows share their place with another" if same else "")
+
+
+def _grid(grid: SphereGrid) -> str:
+    first, step = (
+        np.degrees([grid.first_elevation, grid.first_azimuth]),
+        np.degrees([grid.elevation_step, grid.azimuth_step]),
+    )
+    last = first + step * [grid.height - 1, grid.width - 1]
+    closed = ", closing the circle" if grid.periodic else ""
+    return (
+        f"rows are elevations {first[0]:.4g} to {last[0]:.4g} degrees, "
+        f"columns azimuths {first[1]:.4g} to {last[1]:.4g} degrees{closed}"
+    )
+
+
+def _vector(v: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.3f}" for x in v) + ")"
