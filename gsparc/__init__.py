@@ -1,1 +1,29 @@
 """GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from gsparc.ops import Pose as Pose
+    from gsparc.ops import SphereGrid as SphereGrid
+    from gsparc.predictor import Predictor as Predictor
+    from gsparc.predictor import load as load
+
+# Looked up on first use: `import gsparc` costs nothing.
+_PUBLIC = {
+    "load": "gsparc.predictor",
+    "Predictor": "gsparc.predictor",
+    "Pose": "gsparc.ops",
+    "SphereGrid": "gsparc.ops",
+}
+__all__ = ["Pose", "Predictor", "SphereGrid", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PUBLIC:
+        raise AttributeError(f"module 'gsparc' has no attribute {name!r}")
+    return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})

@@ -1,0 +1,112 @@
+"""Commands: Hydra around a task, an error in one clear line, an exit status that tells the truth."""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+import sys
+from collections.abc import Callable
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import ConfigCompositionException, InstantiationException, MissingConfigException
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from rich.console import Console
+
+from gsparc.registry import suggest
+
+FULL_ERROR = "HYDRA_FULL_ERROR"
+CONFIGS = "pkg://gsparc.conf"
+
+
+class _Failed(BaseException):
+    """Carries an error past Hydra, which would add a line of its own."""
+
+
+def run(task: Callable[[DictConfig], object], config: str) -> None:
+    """Run `task` under Hydra with `conf/<config>.yaml` and the command line's overrides.
+
+    An error is one line on stderr and exit status 1 (130 after an interrupt); with `HYDRA_FULL_ERROR=1` the
+    traceback comes instead.
+
+    Args:
+        task: called with the composed configuration.
+        config: name of the primary configuration.
+    """
+    wanted_full = os.environ.get(FULL_ERROR, "0") == "1"
+    os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
+    main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
+    try:
+        main()
+    except KeyboardInterrupt as error:
+        _say(str(error) or "interrupted")
+        sys.exit(130)
+    except (_Failed, Exception) as failure:
+        error = failure.__cause__ if isinstance(failure, _Failed) else failure
+        assert error is not None
+        if wanted_full:
+            raise error from error.__cause__
+        _say(one_line(error))
+        sys.exit(1)
+    finally:
+        os.environ[FULL_ERROR] = "1" if wanted_full else "0"
+
+
+def one_line(error: BaseException) -> str:
+    """What went wrong and what to do, on one line; a misspelt key or choice gets the nearest right name."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+        group, _, choice = str(error.missing_cfg_file).rpartition("/")
+        return f"{group}={choice}: no such choice{suggest(choice, list(error.options))}"
+    if isinstance(error, ConfigCompositionException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return _override(error, error.__cause__)
+    if isinstance(error, MissingMandatoryValue):
+        key = str(error.full_key or str(error).rpartition(" ")[2])
+        return f"{key} is not set; say {key}=..."
+    if isinstance(error, InstantiationException) and error.__cause__ is not None:
+        return one_line(error.__cause__)
+    if isinstance(error, OmegaConfBaseException) and error.full_key:
+        return f"{error.full_key}: {_first(error)}"
+    text = _first(error)
+    # People's errors are ValueErrors and their like; a bug's type says more than its text.
+    expected = isinstance(error, (ValueError, OSError, RuntimeError)) and text
+    return text if expected else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
+
+
+def _override(error: Exception, cause: OmegaConfBaseException) -> str:
+    named = re.search(r"override '([^']+)'", str(error))
+    full = str(cause.full_key or (named.group(1) if named else ""))
+    if not full or cause.parent_node is None or "not" not in str(cause):
+        return f"{_first(error)} {_first(cause)}"
+    known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
+    prefix, _, key = full.rpartition(".")
+    hint = suggest(key, known).replace(
+        "did you mean '", f"did you mean '{prefix}." if prefix else "did you mean '"
+    )
+    return f"{full}: no such setting{hint}"
+
+
+def _first(error: BaseException) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[0] if lines else ""
+
+
+def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
+    @functools.wraps(task)
+    def wrapped(config: DictConfig) -> object:
+        try:
+            return task(config)
+        except Exception as error:
+            if HydraConfig.get().mode == RunMode.RUN:
+                raise _Failed from error
+            raise  # in a sweep Hydra names the job that failed
+
+    return wrapped
+
+
+def _say(message: str) -> None:
+    Console(stderr=True, soft_wrap=True).print(
+        f"error: {message}", markup=False, highlight=False, style="red"
+    )

@@ -1,0 +1,154 @@
+"""`gsparc.load(FILE)`: ask a trained model about places, in world coordinates."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc import checkpoint
+from gsparc.data.schema import Kind, Site
+from gsparc.method import Method, Prediction
+from gsparc.ops import Pose
+
+SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
+
+
+class Predictor:
+    """A fitted method in world coordinates.
+
+    Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
+    lists) in gives NumPy out, torch in gives torch out. The static end may be left out: the model knows
+    where it stood.
+
+    Args:
+        method: fitted or restored.
+        site: the dataset's fixed facts.
+    """
+
+    def __init__(self, method: Method, site: Site) -> None:
+        self.method, self.site = method, site
+
+    def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
+        """Power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
+
+        Raises:
+            ValueError: the model predicts something else, or a position is missing or not finite.
+        """
+        return self._ask("spectrum", tx, rx)
+
+    def csi(self, tx: Any = None, rx: Any = None) -> Any:
+        """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements."""
+        return self._ask("csi", tx, rx)
+
+    def rssi(self, tx: Any = None, rx: Any = None) -> Any:
+        """Received power (B, 1) float32, linear, in the physical units of the measurements."""
+        return self._ask("rssi", tx, rx)
+
+    def confidence(self, tx: Any = None, rx: Any = None) -> Any:
+        """How sure the model is, (B,) float32 in [0, 1], larger is surer.
+
+        Raises:
+            ValueError: the method has no confidence.
+        """
+        prediction, single, like = self._predict(tx, rx)
+        if prediction.confidence is None:
+            raise ValueError(f"{self.method.name} has no confidence")
+        return _returned(prediction.confidence, single, like)
+
+    def _ask(self, kind: Kind, tx: Any, rx: Any) -> Any:
+        if self.site.kind != kind:
+            raise ValueError(
+                f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
+                f"call .{self.site.kind}(...)"
+            )
+        prediction, single, like = self._predict(tx, rx)
+        return _returned(prediction.mean * self.site.target_scale, single, like)
+
+    def _predict(self, tx: Any, rx: Any) -> tuple[Prediction, bool, bool]:
+        """The prediction, whether one position was asked for, and whether torch was given."""
+        given = rx.position if isinstance(rx, Pose) else rx
+        places = {
+            end: None if value is None else _positions(end, value)
+            for end, value in (("tx", tx), ("rx", given))
+        }
+        moving, static = self.site.moving_end, self.site.static_end
+        if places[moving] is None:
+            raise ValueError(
+                f"{moving}= is needed: it is the end that moved when {self.site.name} was measured"
+            )
+        single = all(p is None or p.ndim == 1 for p in places.values())
+        local = {end: None if p is None else np.atleast_2d(p) - self.site.origin for end, p in places.items()}
+        count = max(len(p) for p in local.values() if p is not None)
+        for end, place in local.items():
+            if place is not None and len(place) not in (1, count):
+                raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
+        ends = {moving: np.broadcast_to(local[moving], (count, 3)), static: self._static(local[static])}
+        rotation = self._rotation(rx, count)
+        if static == "rx" and rotation.ndim == 2:
+            pose = Pose(_float(ends["rx"]), _float(rotation))
+        else:
+            positions = np.broadcast_to(ends["rx"], (count, 3))
+            pose = Pose(_float(positions), _float(np.broadcast_to(rotation, (count, 3, 3))))
+        with torch.no_grad():
+            prediction = self.method.predict(_float(np.broadcast_to(ends["tx"], (count, 3))), pose)
+        return prediction, single, any(isinstance(v, Tensor) for v in (tx, given))
+
+    def _static(self, given: np.ndarray | None) -> np.ndarray:
+        """Local position (3,) of the static end; a given one must be where it was measured."""
+        known, end = self.site.static_position, self.site.static_end
+        if known is None:
+            if given is None:
+                raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
+            return given[0]
+        if given is not None and (np.linalg.norm(given - known, axis=-1) > SAME_PLACE_M).any():
+            stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
+            raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
+        return known
+
+    def _rotation(self, rx: Any, count: int) -> np.ndarray:
+        if isinstance(rx, Pose):
+            rotation = rx.rotation.detach().cpu().double().numpy()
+            if rotation.ndim == 3 and len(rotation) not in (1, count):
+                raise ValueError(f"rx= holds {len(rotation)} rotations for {count} positions")
+            return rotation
+        return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
+
+
+def load(path: str | Path) -> Predictor:
+    """The model in a checkpoint, ready to be asked.
+
+    Raises:
+        gsparc.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
+    """
+    method, stored = checkpoint.load(path)
+    return Predictor(method, stored.site)
+
+
+def _positions(end: str, value: Any) -> np.ndarray:
+    """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
+    try:
+        array = value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
+        array = array.astype(np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{end}= must be numbers [m], got {type(value).__name__}") from None
+    if array.ndim not in (1, 2) or array.shape[-1] != 3 or not array.size:
+        raise ValueError(f"{end}= must be (3,) or (B, 3) [m], got shape {array.shape}")
+    if not np.isfinite(array).all():
+        row = "" if array.ndim == 1 else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
+        raise ValueError(f"{end}= holds NaN or Inf{row}")
+    return array
+
+
+def _float(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.array(array, dtype=np.float32))
+
+
+def _returned(value: Tensor, single: bool, as_torch: bool) -> Any:
+    value = value[0] if single else value
+    if as_torch:
+        return value
+    return value.numpy() if value.ndim else float(value)
