@@ -79,10 +79,11 @@ def write_raw(path: str | Path, raw: Raw) -> None:
 def _read_npz(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     name = "the archive"
+    if not zipfile.is_zipfile(path):
+        # numpy would take anything else for a pickle and speak of that.
+        raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     try:
         with np.load(path, allow_pickle=False) as file:
-            if not isinstance(file, np.lib.npyio.NpzFile):
-                raise DataError(f"{path}: not an npz archive (a single array?); save with numpy.savez")
             for name in file.files:
                 arrays[name] = file[name]
     except (
@@ -94,8 +95,6 @@ def _read_npz(path: Path) -> Raw:
         KeyError,
         NotImplementedError,
     ) as error:
-        if isinstance(error, DataError):
-            raise
         if "allow_pickle" in str(error):
             raise DataError(
                 f"{path}, {name}: holds Python objects; expected plain arrays of numbers"

@@ -1,0 +1,366 @@
+"""Everything a disk can hand us: refused in one clear line that names file, row and expectation."""
+# ruff: noqa: E501 (a case is a row of a table)
+
+import io
+import json
+import shutil
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsparc.data.errors import DataError, Problems
+from gsparc.data.newrf import load_newrf
+from gsparc.data.own import from_arrays, load_own
+from gsparc.data.rfid import load_rfid
+
+
+def _replace(name, old, new):
+    def spoil(root):
+        text = (root / name).read_text(encoding="utf-8")
+        assert old in text
+        (root / name).write_text(text.replace(old, new, 1), encoding="utf-8")
+
+    return spoil
+
+
+def _write(name, content):
+    return lambda root: (root / name).write_bytes(content)
+
+
+def _remove(name):
+    def spoil(root):
+        path = root / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return spoil
+
+
+def _image(array, mode=None, kind="PNG"):
+    buffer = io.BytesIO()
+    Image.fromarray(array, mode).save(buffer, format=kind)
+    return _write("spectrum/00003.png", buffer.getvalue())
+
+
+def _truncated(root):
+    path = root / "spectrum/00003.png"
+    path.write_bytes(path.read_bytes()[:5000])
+
+
+def _flipped(root):
+    path = root / "spectrum/00003.png"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(bytes(content))
+
+
+grey = np.zeros((90, 360), dtype=np.uint8)
+RFID = {
+    "gateway missing": (_remove("gateway_info.yml"), r"gateway_info\.yml: missing"),
+    "gateway not yaml": (_write("gateway_info.yml", b"a: [1, 2"), "not readable as YAML"),
+    "gateway binary": (_write("gateway_info.yml", b"\xff\xfe\x00\x80"), "not readable as YAML"),
+    "gateway empty": (_write("gateway_info.yml", b""), "expected entries like"),
+    "no gateway": (_write("gateway_info.yml", b"dataset_name: s23\n"), "no gateway in it"),
+    "two coordinates": (_replace("gateway_info.yml", "[5.0, 0.26, 0]", "[5.0, 0.26]"), "three finite numbers"),
+    "gateway nan": (_replace("gateway_info.yml", "0.26", ".nan"), "three finite numbers"),
+    "gateway on Mars": (_replace("gateway_info.yml", "0.26", "3.0e+38"), "none beyond 1e[+]07"),
+    "gateway words": (_replace("gateway_info.yml", "0.26", "north"), "three finite numbers"),
+    "no orientation": (_replace("gateway_info.yml", "orientation", "turned"), "four finite numbers"),
+    "zero quaternion": (_replace("gateway_info.yml", "[0.51291602, -0.48674136, -0.48674136, 0.51291602]",
+                                 "[0, 0, 0, 0]"), "length 1"),
+    "csv missing": (_remove("tx_pos.csv"), r"tx_pos\.csv: missing"),
+    "csv empty": (_write("tx_pos.csv", b""), "line 1: expected the header x,y,z, found an empty file"),
+    "csv no header": (_replace("tx_pos.csv", "x,y,z\n", ""), "line 1: expected the header x,y,z"),
+    "csv no rows": (_write("tx_pos.csv", b"x,y,z\n"), "no rows"),
+    "csv binary": (_write("tx_pos.csv", b"x,y,z\n\xff\xfe"), "not readable as CSV"),
+    "csv nan": (_replace("tx_pos.csv", "0.3000", "nan"), "line 5 = .*three finite coordinates"),
+    "csv infinite": (_replace("tx_pos.csv", "0.3000", "-inf"), "line 5 = .*three finite coordinates"),
+    "csv 1e38": (_replace("tx_pos.csv", "0.3000", "1e38"), "line 5 = .*none beyond"),
+    "csv word": (_replace("tx_pos.csv", "0.3000", "three"), "line 5: expected three numbers"),
+    "csv two columns": (_replace("tx_pos.csv", "0.3000,", ""), "line 5: expected three numbers"),
+    "csv blank row": (_replace("tx_pos.csv", "0.3000,0.2000,1.0000", ""), "line 5: expected three numbers"),
+    "csv row missing": (_replace("tx_pos.csv", "0.3000,0.2000,1.0000\n", ""), "00006.png: no row for it in tx_pos"),
+    "spectra missing": (_remove("spectrum"), "spectrum: missing"),
+    "spectrum missing": (_remove("spectrum/00003.png"), "00003.png: missing, but tx_pos.csv has 6 rows"),
+    "spectrum truncated": (_truncated, "00003.png: expected an 8-bit grey PNG.*not readable"),
+    "spectrum bit flipped": (_flipped, "00003.png: expected an 8-bit grey PNG.*not readable"),
+    "spectrum empty": (_write("spectrum/00003.png", b""), "00003.png: .*not readable"),
+    "spectrum is text": (_write("spectrum/00003.png", b"hello"), "00003.png: .*not readable"),
+    "spectrum 16 bit": (_image(grey.astype(np.uint16)), "8-bit grey PNG.*found mode I;16"),
+    "spectrum colour": (_image(np.zeros((90, 360, 3), np.uint8)), "8-bit grey PNG.*found mode RGB"),
+    "spectrum turned": (_image(grey.T.copy()), "360 x 90 pixels, found 90 x 360"),
+    "spectrum is jpeg": (_image(grey, kind="JPEG"), "not readable"),
+    "index out of range": (_replace("train_index.txt", "00006", "00007"), "line 4: index 00007 is out of range"),
+    "index zero": (_replace("train_index.txt", "00001", "00000"), "line 1: index 00000 is out of range"),
+    "index twice": (_replace("train_index.txt", "00006", "00003"), "line 4: index 00003 appears twice.*line 2"),
+    "index word": (_replace("train_index.txt", "00006", "six"), "line 4: expected the number.*'six'"),
+    "index superscript": (_replace("train_index.txt", "00006", "6²"), "line 4: expected the number"),
+    "index in both": (_replace("test_index.txt", "00002", "00003"), "00003: also in train_index.txt"),
+    "index file empty": (_write("train_index.txt", b""), "no usable index"),
+    "index file alone": (_remove("test_index.txt"), "test_index.txt: missing, but train_index.txt is there"),
+}  # fmt: skip
+
+
+def _one_clear_line(error, pattern):
+    import re
+
+    for problem in error.value.problems:
+        assert "\n" not in problem and "Traceback" not in problem and len(problem) < 600
+    assert any(re.search(pattern, problem) for problem in error.value.problems), error.value.problems
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("case", RFID)
+def test_rfid_folder(rfid_folder, case):
+    spoil, pattern = RFID[case]
+    spoil(rfid_folder)
+    with pytest.raises(DataError) as error:
+        load_rfid(rfid_folder)
+    _one_clear_line(error, pattern)
+    assert str(rfid_folder) in str(error.value)
+
+
+def test_rfid_unknown_gateway(rfid_folder):
+    with pytest.raises(DataError, match="no gateway named 'gateway9'; there are gateway1, gateway2"):
+        load_rfid(rfid_folder, gateway="gateway9")
+
+
+def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
+    for case in ("csv nan", "spectrum truncated", "index twice"):
+        RFID[case][0](rfid_folder)
+    with pytest.raises(DataError, match=r"and 2 more: python -m gsparc\.check") as error:
+        load_rfid(rfid_folder)
+    assert len(error.value.problems) == 3
+
+
+def _set(name, value):
+    def spoil(arrays):
+        arrays[name] = value
+
+    return spoil
+
+
+def _entry(name, index, value):
+    def spoil(arrays):
+        arrays[name] = arrays[name].copy()
+        arrays[name][index] = value
+
+    return spoil
+
+
+def _without(name):
+    return lambda arrays: arrays.pop(name)
+
+
+def _rename(old, new):
+    def spoil(arrays):
+        arrays[new] = arrays.pop(old)
+
+    return spoil
+
+
+def _together(*spoils):
+    def spoil(arrays):
+        for one in spoils:
+            one(arrays)
+
+    return spoil
+
+
+half_masked = np.ones((12, 2, 3), dtype=bool)
+half_masked[7] = False
+CSI = {
+    "no measurement": (_without("csi"), "expected exactly one of spectrum, csi, rssi, rssi_db; found none"),
+    "two measurements": (_set("rssi", np.ones(12)), "found csi and rssi"),
+    "no receiver": (_without("rx_position"), r"rx_position: missing"),
+    "no transmitter": (_without("tx_position"), r"tx_position: missing"),
+    "no frequency": (_without("frequency_hz"), "frequency_hz: missing; csi needs the 3 frequencies"),
+    "misspelt": (_rename("tx_position", "tx_positon"), "unknown name; did you mean tx_position"),
+    "NeWRF's name": (_rename("tx_position", "tx_pos"), "unknown name; did you mean tx_position"),
+    "real csi": (_set("csi", np.ones((12, 2, 3))), "csi: expected complex numbers, found dtype float64"),
+    "csi of text": (_set("csi", np.array(["1+1j"] * 12)), "expected complex numbers"),
+    "csi 4-dimensional": (_set("csi", np.ones((12, 1, 1, 1), complex)), r"csi: expected shape \(S,\)"),
+    "csi nan": (_entry("csi", (5, 1, 1), np.nan), "csi, row 5: not finite"),
+    "csi infinite": (_entry("csi", (5, 1, 1), np.inf), "csi, row 5: not finite"),
+    "csi silent": (_set("csi", np.zeros((12, 2, 3), complex)), "every measured value is zero"),
+    "one sample": (_together(_set("csi", np.ones((1, 2, 3), complex)),
+                             _set("rx_position", np.ones((1, 3)))), "two rows or more"),
+    "empty": (_set("csi", np.ones((0, 2, 3), complex)), "two rows or more"),
+    "rows differ": (_set("rx_position", np.ones((11, 3))), r"rx_position: expected shape .*\(12, 3\).*found \(11, 3\)"),
+    "transposed": (_set("rx_position", np.ones((3, 12))), r"found \(3, 12\); transposed"),
+    "two coordinates": (_set("rx_position", np.ones((12, 2))), r"rx_position: expected shape"),
+    "position nan": (_entry("rx_position", (5, 1), np.nan), "rx_position, row 5 = .*three finite coordinates"),
+    "position 1e38": (_entry("rx_position", (5, 1), 1e38), "rx_position, row 5 = .*none beyond"),
+    "position complex": (_set("tx_position", np.ones(3, complex)), "tx_position: expected real numbers"),
+    "nothing moves": (_set("rx_position", np.ones(3)), "neither end moves"),
+    "both move": (_set("tx_position", np.arange(36.0).reshape(12, 3)), "both ends move"),
+    "GHz": (_set("frequency_hz", np.array([2.40, 2.41, 2.42])), r"expected Hz \(not MHz or GHz\)"),
+    "negative frequency": (_set("frequency_hz", -np.array([2.4e9, 2.41e9, 2.42e9])), "expected Hz"),
+    "frequency nan": (_set("frequency_hz", np.array([2.4e9, np.nan, 2.42e9])), "expected Hz"),
+    "frequency twice": (_set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])), "same frequency twice"),
+    "too few frequencies": (_set("frequency_hz", np.array([2.4e9, 2.41e9])), "frequency_hz: expected shape"),
+    "one frequency for three": (_set("frequency_hz", np.array(2.4e9)), "one frequency, but csi has 3 columns"),
+    "carrier zero": (_set("carrier_hz", np.array(0.0)), "carrier_hz: .*expected Hz"),
+    "antennas differ": (_set("array_position", np.ones((3, 3))), "array_position: expected shape"),
+    "antenna nan": (_entry("array_position", (0, 0), np.nan), "array_position: not finite"),
+    "zero quaternion": (_set("rx_orientation", np.zeros(4)), r"rx_orientation, row 0 = .*\(w, x, y, z\) of length 1"),
+    "quaternion nan": (_set("rx_orientation", np.array([1.0, np.nan, 0, 0])), "length 1"),
+    "two orientations": (_set("rx_rotation", np.eye(3)), "both given; expected one"),
+    "a mirror": (_together(_without("rx_orientation"), _set("rx_rotation", np.diag([1.0, 1, -1]))),
+                 "determinant [+]1"),
+    "mask shape": (_set("mask", np.ones(12, bool)), "mask: expected shape"),
+    "mask of numbers": (_set("mask", np.full((12, 2, 3), 2)), "mask: expected True and False"),
+    "row masked out": (_set("mask", half_masked), "mask, row 7: nothing measured"),
+    "negative noise": (_set("noise_variance", np.array(-1.0)), "noise_variance, row 0: expected a finite number"),
+    "paths without offsets": (_set("path_gain", np.ones(4, complex)), "path_offsets: missing, but path_gain"),
+    "offsets fall": (_set("path_offsets", np.array([0, 2, 1] + [4] * 10)), "never decrease"),
+    "offsets too short": (_together(_set("path_offsets", np.arange(13)), _set("path_direction", np.ones((11, 3)))),
+                          "expected 12 paths as path_offsets says, found"),
+    "zero direction": (_together(_set("path_offsets", np.arange(13)), _set("path_direction", np.zeros((12, 3)))),
+                       "path 0: expected a direction that is not zero"),
+    "split alone": (_set("split_train", np.arange(4)), "split_train is given alone"),
+    "split out of range": (_together(_set("split_train", np.arange(4)), _set("split_test", np.array([12]))),
+                           "split_test, row 12: out of range; rows are 0 to 11"),
+    "split overlaps": (_together(_set("split_train", np.arange(4)), _set("split_test", np.array([3]))),
+                       "row 3: also in split_train"),
+    "split twice": (_together(_set("split_train", np.array([1, 1])), _set("split_test", np.array([3]))),
+                    "split_train, row 1: named twice"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CSI)
+def test_own_csi(csi_arrays, case):
+    spoil, pattern = CSI[case]
+    spoil(csi_arrays)
+    with pytest.raises(DataError) as error:
+        from_arrays(csi_arrays)
+    _one_clear_line(error, pattern)
+
+
+SPECTRUM = {
+    "negative power": (_entry("spectrum", (3, 0, 0), -0.1), r"spectrum, row 3: out of range.*is it in dB"),
+    "16 bit": (_set("spectrum", np.ones((10, 9, 36), np.uint16)), "expected uint8 or floating point"),
+    "complex": (_set("spectrum", np.ones((10, 9, 36), complex)), "expected uint8 or floating point"),
+    "flat": (_set("spectrum", np.ones((10, 324))), "spectrum: expected shape"),
+    "nan": (_entry("spectrum", (3, 0, 0), np.nan), "spectrum, row 3: not finite"),
+    "black": (_set("spectrum", np.zeros((10, 9, 36), np.uint8)), "every measured value is zero"),
+    "grid past the zenith": (_set("grid_deg", np.array([20.0, 0, 10, 10])), "elevations run from 20 to 100"),
+    "grid past the circle": (_set("grid_deg", np.array([0.0, 0, 10, 11])), "exceed the circle"),
+    "grid backwards": (_set("grid_deg", np.array([0.0, 0, -10, 10])), "steps positive"),
+    "grid of two": (_set("grid_deg", np.array([0.0, 0])), "grid_deg: expected shape"),
+    "turning receiver": (
+        _set("rx_orientation", np.array([[1.0, 0, 0, 0]] * 9 + [[0, 1.0, 0, 0]])),
+        "but turns",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SPECTRUM)
+def test_own_spectrum(spectrum_arrays, case):
+    spoil, pattern = SPECTRUM[case]
+    spoil(spectrum_arrays)
+    with pytest.raises(DataError) as error:
+        from_arrays(spectrum_arrays)
+    _one_clear_line(error, pattern)
+
+
+def test_attributes(spectrum_arrays):
+    for attributes, pattern in (({"normalisation": "maximum"}, "expected one of max, minmax"),
+                                ({"convergence_error": -1.0}, "at least 0"),
+                                ({"convergence_error": "low"}, "finite number")):  # fmt: skip
+        with pytest.raises(DataError, match=pattern):
+            from_arrays(spectrum_arrays, attributes)
+
+
+def test_decibels_beyond_reason():
+    rows = {"rx_position": np.arange(12.0).reshape(4, 3), "tx_position": np.zeros(3)}
+    with pytest.raises(DataError, match="row 2: out of range; expected dB"):
+        from_arrays({**rows, "rssi_db": np.array([-50, -60, 4000, -70.0])})
+    with pytest.raises(DataError, match="linear power"):
+        from_arrays({**rows, "rssi": np.array([-50, -60, -70, -70.0])})
+    with pytest.raises(DataError, match="cannot go with rssi_db"):
+        from_arrays({**rows, "rssi_db": np.array([-50, -60, -40, -70.0]), "noise_variance": np.array(1.0)})
+
+
+def _npz_file(path, arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def test_files_that_are_no_files(tmp_path, csi_arrays):
+    good = _npz_file(tmp_path / "good.npz", csi_arrays)
+    content = good.read_bytes()
+    cases = {
+        "absent.npz": (None, "no such file"),
+        "noise.npz": (b"not a zip", "damaged or not an npz"),
+        "half.npz": (content[: len(content) // 2], "damaged or not an npz"),
+        "empty.npz": (b"", "damaged or not an npz"),
+        "mine.csv": (b"x", "expected a name ending in .npz, .h5 or .hdf5, found .csv"),
+        "noise.h5": (b"not hdf5", "damaged or not an HDF5"),
+        "empty.hdf5": (b"", "damaged or not an HDF5"),
+    }
+    for name, (data, pattern) in cases.items():
+        if data is not None:
+            (tmp_path / name).write_bytes(data)
+        with pytest.raises(DataError, match=pattern) as error:
+            load_own(tmp_path / name)
+        _one_clear_line(error, pattern)
+
+
+def test_a_flipped_byte_in_an_npz(tmp_path, csi_arrays):
+    path = tmp_path / "flip.npz"
+    np.savez_compressed(path, **csi_arrays)
+    content = bytearray(path.read_bytes())
+    position = content.index(b"csi.npy") + 120
+    content[position] ^= 0xFF
+    path.write_bytes(bytes(content))
+    with pytest.raises(DataError, match=r"csi: damaged"):
+        load_own(path)
+
+
+def test_python_objects_are_refused(tmp_path):
+    path = tmp_path / "objects.npz"
+    np.savez(path, csi=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(DataError, match="holds Python objects"):
+        load_own(path)
+
+
+def test_a_bare_array_is_refused(tmp_path):
+    path = tmp_path / "bare.npz"
+    with path.open("wb") as file:
+        np.save(file, np.ones(3))
+    with pytest.raises(DataError, match=r"not an npz archive"):
+        load_own(path)
+
+
+def test_wrong_units_are_refused(tmp_path, csi_arrays):
+    path = tmp_path / "units.h5"
+    with h5py.File(path, "w") as file:
+        for name, array in csi_arrays.items():
+            file[name] = array
+        file["rx_position"].attrs["units"] = "mm"
+    with pytest.raises(DataError, match="rx_position: units are 'mm'; expected 'm'"):
+        load_own(path)
+    about = json.dumps({"units": {"frequency_hz": "GHz"}})
+    with pytest.raises(DataError, match="frequency_hz: units are 'GHz'; expected 'Hz'"):
+        load_own(_npz_file(tmp_path / "units.npz", {**csi_arrays, "attributes": np.array(about)}))
+    with pytest.raises(DataError, match="expected a JSON table"):
+        load_own(_npz_file(tmp_path / "units.npz", {**csi_arrays, "attributes": np.array("{")}))
+
+
+@pytest.mark.parametrize("name", ["tx_pos", "rx_pos", "csi", "frequency_hz"])
+def test_newrf_without(tmp_path, csi_arrays, name):
+    arrays = {"tx_pos": np.zeros(3), "rx_pos": csi_arrays["rx_position"], "csi": csi_arrays["csi"][:, 0, 0],
+              "frequency_hz": np.array(2.4e9)}  # fmt: skip
+    assert len(load_newrf(_npz_file(tmp_path / "room.npz", arrays))) == 12
+    del arrays[name]
+    with pytest.raises(DataError, match=rf"room\.npz, {name}: missing") as error:
+        load_newrf(_npz_file(tmp_path / "room.npz", arrays))
+    _one_clear_line(error, name)
+
+
+def test_many_bad_rows_stay_readable():
+    problems = Problems("file")
+    problems.add_rows("file, csi", (f"row {i}" for i in range(6000)), "not finite")
+    assert len(problems) == Problems.LIMIT + 1 and "5980 more rows" in problems[-1]

@@ -1,0 +1,138 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from gsparc.data.newrf import load_newrf
+from gsparc.data.own import from_arrays, load_own, write_own
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5"])
+def test_round_trip(tmp_path, csi_arrays, suffix):
+    path = tmp_path / f"mine{suffix}"
+    mask = np.ones((12, 2, 3), dtype=bool)
+    mask[3, 0] = False
+    csi_arrays["csi"][3, 0] = np.nan
+    arrays = {
+        **csi_arrays,
+        "mask": mask,
+        "noise_variance": np.float64(0.02),
+        "row_name": np.array(["ä"] * 12),
+    }
+    written = write_own(path, arrays, {"name": "garage", "operator": "me", "convergence_error": 0.01})
+    read = load_own(path)
+    assert read.site.sha256 == written.site.sha256 and read.site.name == "garage"
+    assert (
+        read.site.static_end == "tx" and read.target.shape == (12, 2, 3) and read.target.dtype == np.complex64
+    )
+    assert read.provenance == {"operator": "me"} and read.site.convergence_error == 0.01
+    assert read.row_names[0] == "ä" and not read.mask[3, 0].any()
+    physical = read.target * read.site.target_scale
+    np.testing.assert_allclose(physical[mask], csi_arrays["csi"][mask], rtol=1e-6)
+    assert 0.85 < np.mean(np.abs(read.target[mask]) ** 2) < 1.2
+    np.testing.assert_allclose(read.noise_variance * read.site.target_scale**2, 0.02, rtol=1e-6)
+
+
+def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_arrays):
+    hashes = {write_own(tmp_path / f"a{s}", spectrum_arrays).site.sha256 for s in (".npz", ".h5", ".hdf5")}
+    hashes |= {load_own(tmp_path / f"a{s}").site.sha256 for s in (".npz", ".h5", ".hdf5")}
+    assert len(hashes) == 1
+    spectrum_arrays["spectrum"][0, 0, 0] += 1e-3
+    assert from_arrays(spectrum_arrays).site.sha256 not in hashes
+
+
+def test_shapes_of_csi(csi_arrays):
+    del csi_arrays["array_position"]
+    one = {**csi_arrays, "csi": csi_arrays["csi"][:, 0, 0], "frequency_hz": 2.4e9}
+    assert from_arrays(one).target.shape == (12, 1, 1)
+    band = {**csi_arrays, "csi": csi_arrays["csi"][:, 0]}
+    assert from_arrays(band).target.shape == (12, 1, 3)
+    antennas = {**csi_arrays, "csi": csi_arrays["csi"][:, :, :1], "frequency_hz": np.array([2.4e9])}
+    assert from_arrays(antennas).target.shape == (12, 2, 1)
+
+
+def test_rssi_in_db_is_linear_inside():
+    rng = np.random.default_rng(0)
+    level = rng.uniform(-90, -40, 8)
+    data = from_arrays(
+        {"rx_position": rng.uniform(0, 9, (8, 3)), "tx_position": np.zeros(3), "rssi_db": level}
+    )
+    assert data.site.kind == "rssi" and data.target.shape == (8, 1) and data.site.carrier_hz is None
+    np.testing.assert_allclose(10 * np.log10(data.target[:, 0] * data.site.target_scale), level, atol=1e-4)
+
+
+def test_spectra_are_brought_to_unit_scale(spectrum_arrays):
+    assert from_arrays(spectrum_arrays).site.target_scale == 1
+    tiny = from_arrays({**spectrum_arrays, "spectrum": spectrum_arrays["spectrum"] * 1e-9})
+    assert tiny.target.max() == 1 and tiny.site.target_scale == spectrum_arrays["spectrum"].max() * 1e-9
+    grey = from_arrays({**spectrum_arrays, "spectrum": (spectrum_arrays["spectrum"] * 255).astype(np.uint8)})
+    assert grey.target.dtype == np.uint8 and grey.site.grid.width == 36 and grey.site.grid.periodic
+
+
+def test_orientation_is_scalar_first_and_local_to_world(csi_arrays):
+    turn = Rotation.from_euler("z", 90, degrees=True)
+    data = from_arrays({**csi_arrays, "rx_orientation": turn.as_quat(scalar_first=True)})
+    np.testing.assert_allclose(data.rx_rotation[5] @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    same = {k: v for k, v in csi_arrays.items() if k != "rx_orientation"}
+    same["rx_rotation"] = turn.as_matrix()
+    np.testing.assert_allclose(from_arrays(same).rx_rotation, data.rx_rotation, atol=1e-12)
+
+
+def test_directions_from_last_points(csi_arrays):
+    offsets = np.arange(13) * 2
+    points = np.repeat(csi_arrays["rx_position"], 2, axis=0) + np.array([0.0, 0, 5.0])
+    data = from_arrays({**csi_arrays, "path_offsets": offsets, "path_last_point": points})
+    assert len(data.directions) == 12 and data.directions[0].shape == (2, 3)
+    np.testing.assert_allclose(np.concatenate(data.directions), np.tile([0, 0, 1], (24, 1)), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["csi", "spectrum"])
+def test_far_from_the_origin_changes_rounding_only(kind, csi_arrays, spectrum_arrays):
+    arrays = csi_arrays if kind == "csi" else spectrum_arrays
+    near = from_arrays(arrays)
+    shift = np.array([1e5, -1e5, 1e3])
+    moved = {n: a + shift if n in ("rx_position", "tx_position") else a for n, a in arrays.items()}
+    far = from_arrays(moved)
+    assert np.abs(far.tx - near.tx).max() < 1e-9 and np.abs(far.rx_position - near.rx_position).max() < 1e-9
+    np.testing.assert_allclose(far.site.origin - near.site.origin, shift)
+    rows = np.arange(4)
+    for a, b in (
+        (far.batch(rows).tx, near.batch(rows).tx),
+        (far.batch(rows).rx.position, near.batch(rows).rx.position),
+    ):
+        np.testing.assert_allclose(a.numpy(), b.numpy(), atol=2.5e-7)
+    np.testing.assert_array_equal(far.target, near.target)
+
+
+def test_a_refused_file_is_not_written(tmp_path, csi_arrays):
+    csi_arrays["csi"][0, 0, 0] = np.inf
+    with pytest.raises(ValueError, match="row 0"):
+        write_own(tmp_path / "bad.h5", csi_arrays)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_single_row_leaves_no_trace_in_the_scale(csi_arrays):
+    first = from_arrays(csi_arrays).site.target_scale
+    csi_arrays["csi"][0] *= 1.01
+    assert from_arrays(csi_arrays).site.target_scale == first
+
+
+def test_extreme_magnitudes_survive(csi_arrays):
+    for factor in (1e-200, 1e200):
+        data = from_arrays({**csi_arrays, "csi": csi_arrays["csi"] * factor})
+        assert np.isfinite(data.target).all() and 0.85 < np.mean(np.abs(data.target) ** 2) < 1.2
+
+
+def test_newrf_conference(real_newrf):
+    data = load_newrf(real_newrf)
+    assert data.site.kind == "csi" and data.site.static_end == "tx" and data.site.grid is None
+    assert data.target.shape == (433, 1, 1) and data.target.dtype == np.complex64
+    assert 0.85 < np.mean(np.abs(data.target) ** 2) < 1.2
+    with np.load(real_newrf) as file:
+        np.testing.assert_allclose(data.target[:, 0, 0] * data.site.target_scale, file["csi"], rtol=1e-5)
+        assert [len(part) for part in data.release_split] == [346, 87]
+        # About 41 % of the path power comes from below the horizon: no hemisphere for this room.
+        down = np.concatenate(data.directions)[:, 2] < 0
+        power = np.abs(file["path_gain"]) ** 2
+    assert power[down].sum() / power.sum() == pytest.approx(0.41, abs=0.02)
+    batch = data.batch(np.arange(5))
+    assert not batch.shared_pose and batch.rx.position.shape == (5, 3)

@@ -1,0 +1,184 @@
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from gsparc.data.errors import DataError
+from gsparc.data.load import split_for
+from gsparc.data.rfid import load_rfid
+from gsparc.data.splits import SplitSettings, make_split, path_order, read_split, write_split
+
+
+def _walk(rows=400, seed=0):
+    """A curve with steps of about 1 cm that stays in a metre."""
+    steps = np.random.default_rng(seed).normal(size=(rows, 3)) * 0.006
+    return np.cumsum(steps, axis=0)
+
+
+def _disjoint(fold, rows):
+    every = np.concatenate([fold.train, fold.val, fold.test])
+    return len(np.unique(every)) == len(every) and every.min() >= 0 and every.max() < rows
+
+
+@pytest.mark.parametrize("name", ["random", "grouped", "block", "sparse"])
+def test_a_split_is_a_pure_function_of_positions_and_settings(name):
+    positions = _walk()
+    first = make_split(positions, SplitSettings(name))
+    again = make_split(positions, SplitSettings(name))
+    assert first.sha256 == again.sha256 and all(_disjoint(f, 400) for f in first.folds)
+    other = make_split(positions, SplitSettings(name, seed=1))
+    assert other.sha256 != first.sha256
+    for fold in first.folds:
+        assert len(fold.val) == pytest.approx(0.1 * (len(fold.train) + len(fold.val)), abs=1)
+        assert all((np.diff(part) > 0).all() for part in (fold.train, fold.val, fold.test))
+
+
+def test_random_uses_the_release_unless_redrawn():
+    release = (np.arange(100), np.arange(100, 130))
+    split = make_split(_walk(), SplitSettings(), release)
+    np.testing.assert_array_equal(split.folds[0].test, release[1])
+    np.testing.assert_array_equal(np.union1d(split.folds[0].train, split.folds[0].val), release[0])
+    drawn = make_split(_walk(), SplitSettings(redraw=True), release)
+    assert len(drawn.folds[0].test) == 80 and drawn.sha256 != split.sha256
+    other = make_split(_walk(), SplitSettings(redraw=True, seed=3), release)
+    assert other.sha256 != drawn.sha256
+
+
+def test_grouped_keeps_whole_stretches_apart():
+    positions = _walk()
+    split = make_split(positions, SplitSettings("grouped"))
+    assert len(split.folds) == 5
+    np.testing.assert_array_equal(np.sort(np.concatenate([f.test for f in split.folds])), np.arange(400))
+    for fold in split.folds:
+        assert fold.test[-1] - fold.test[0] == len(fold.test) - 1
+        kept = np.concatenate([fold.train, fold.val])
+        gap = np.linalg.norm(positions[kept][:, None] - positions[fold.test], axis=-1)
+        assert gap.min() > 0.03
+        # Validation is one stretch: no training row lies between its ends along the path.
+        between = (fold.train > fold.val[0]) & (fold.train < fold.val[-1])
+        assert not between.any()
+
+
+def test_grouped_orders_scattered_rows_into_slabs():
+    positions = np.random.default_rng(0).uniform([0, 0, 0], [9, 3, 2], (300, 3))
+    np.testing.assert_array_equal(path_order(positions), np.argsort(positions[:, 0]))
+    np.testing.assert_array_equal(path_order(_walk()), np.arange(400))
+    shuffled = _walk()[np.random.default_rng(1).permutation(400)]
+    assert (path_order(shuffled) != np.arange(400)).any()
+    folds = make_split(positions, SplitSettings("grouped")).folds
+    spans = sorted((positions[f.test, 0].min(), positions[f.test, 0].max()) for f in folds)
+    assert all(a[1] <= b[0] for a, b in pairwise(spans))
+
+
+@pytest.mark.parametrize("corner", ["--", "-+", "+-", "++"])
+def test_block_is_a_rectangle_in_a_corner(corner):
+    positions = np.random.default_rng(0).uniform(0, 2, (500, 3))
+    fold = make_split(positions, SplitSettings("block", corner=corner)).folds[0]
+    assert len(fold.test) == 100
+    toward = np.array([1 if c == "+" else -1 for c in corner])
+    centre = (positions[fold.test, :2].mean(axis=0) - 1) * toward
+    assert (centre > 0.4).all()
+    rest = np.concatenate([fold.train, fold.val])
+    depth = np.abs(positions[:, :2] - (1 + toward)).max(axis=1)
+    # The rectangle has the site's proportions, which are not exactly square.
+    assert depth[rest].min() > depth[fold.test].max() - 0.01
+
+
+def test_sparse_trains_on_a_tenth():
+    fold = make_split(_walk(), SplitSettings("sparse")).folds[0]
+    assert len(fold.train) + len(fold.val) == 40 and len(fold.test) == 360
+
+
+def test_thinned_training_sets_are_nested_and_share_the_test_set():
+    def train(**kwargs):
+        fold = make_split(_walk(), SplitSettings(**kwargs)).folds[0]
+        return set(fold.train) | set(fold.val), fold.test
+
+    full, test = train()
+    half, test_half = train(thin=0.5)
+    few, test_few = train(train_count=20)
+    assert few < half < full and len(half) == len(full) // 2 and len(few) == 20
+    np.testing.assert_array_equal(test, test_half)
+    np.testing.assert_array_equal(test, test_few)
+
+
+def test_index_file_round_trip(tmp_path):
+    split = make_split(_walk(), SplitSettings("grouped"))
+    path = tmp_path / "run" / "split.json"
+    write_split(path, split, rows=400, dataset_sha256="abc")
+    read = read_split(path, rows=400, dataset_sha256="abc")
+    assert read.sha256 == split.sha256 and read.name == "grouped"
+    for ours, theirs in zip(read.folds, split.folds, strict=True):
+        np.testing.assert_array_equal(ours.train, theirs.train)
+        assert ours.test.dtype == np.int64
+
+
+def test_index_file_for_other_data_warns(tmp_path, caplog):
+    path = tmp_path / "split.json"
+    write_split(path, make_split(_walk(), SplitSettings()), rows=400, dataset_sha256="abc")
+    read_split(path, rows=400, dataset_sha256="xyz")
+    assert "made for other data" in caplog.text
+
+
+def test_bad_index_files_are_refused(tmp_path):
+    path = tmp_path / "split.json"
+    with pytest.raises(DataError, match="no such split file"):
+        read_split(path, 400)
+    path.write_text("[1, 2]")
+    with pytest.raises(DataError, match="not a split file"):
+        read_split(path, 400)
+    write_split(path, make_split(_walk(), SplitSettings()), rows=400)
+    with pytest.raises(DataError, match="made for 400 rows, the dataset has 399"):
+        read_split(path, 399)
+    content = json.loads(path.read_text())
+    edits = {"edited or damaged": ("test", content["folds"][0]["test"][1:]),
+             "names a row twice": ("test", content["folds"][0]["train"]),
+             "outside 0 to 399": ("test", [400])}  # fmt: skip
+    for pattern, (part, rows) in edits.items():
+        spoilt = json.loads(json.dumps(content))
+        spoilt["folds"][0][part] = rows
+        path.write_text(json.dumps(spoilt))
+        with pytest.raises(DataError, match=pattern):
+            read_split(path, 400)
+
+
+@pytest.mark.parametrize(
+    "settings, pattern",
+    [
+        ({"name": "grouped", "folds": 1}, "folds of at least 2"),
+        ({"name": "groupd"}, "did you mean 'grouped'"),
+        ({"val_fraction": 1.0}, "val_fraction=1.0"),
+        ({"test_fraction": 0.0}, "test_fraction=0.0"),
+        ({"thin": 0.0}, "thin=0.0"),
+        ({"train_count": 0}, "train_count=0"),
+        ({"buffer_m": float("nan")}, "buffer_m=nan"),
+        ({"corner": "north"}, "corner='north'"),
+    ],
+)
+def test_impossible_settings_are_refused(settings, pattern):
+    with pytest.raises(DataError, match=pattern):
+        SplitSettings(**settings)
+
+
+def test_impossible_splits_are_refused():
+    with pytest.raises(DataError, match="too few for 5 folds"):
+        make_split(_walk(8), SplitSettings("grouped"))
+    with pytest.raises(DataError, match="fold 0 has 0 training"):
+        make_split(_walk(40), SplitSettings("grouped", buffer_m=10.0))
+
+
+def test_split_for_reads_the_config_group(rfid_folder, tmp_path):
+    data = load_rfid(rfid_folder)
+    split = split_for({"name": "random", "seed": 0}, data)
+    assert split.folds[0].test.tolist() == [1, 4]
+    write_split(tmp_path / "s.json", split, len(data), data.site.sha256)
+    again = split_for({"name": "file", "path": str(tmp_path / "s.json")}, data)
+    assert again.sha256 == split.sha256 and again.name == "random"
+    with pytest.raises(DataError, match=r"split\.sed: no such setting"):
+        split_for({"name": "random", "sed": 0}, data)
+
+
+def test_grouped_on_the_real_path_keeps_most_training_rows(real_rfid):
+    split = split_for({"name": "grouped"}, load_rfid(real_rfid))
+    assert all(len(f.train) + len(f.val) > 100 for f in split.folds)

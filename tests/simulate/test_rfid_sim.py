@@ -1,0 +1,66 @@
+import hashlib
+
+import numpy as np
+import torch
+
+from gsparc.data.rfid import HEIGHT, LIGHT, WAVELENGTH, WIDTH, boresight_degrees, load_rfid, planar_array
+from gsparc.ops import SphereGrid
+from gsparc.simulate.rfid_sim import HAND_BOX, bartlett, ensure_rfid_sim, hand_moved, steering
+
+
+def _digest(folder):
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    return [(p.name, hashlib.sha256(p.read_bytes()).hexdigest()) for p in files]
+
+
+def test_deterministic_by_seed_and_reused(tmp_path):
+    first = ensure_rfid_sim(tmp_path / "a", count=20, seed=3)
+    other = ensure_rfid_sim(tmp_path / "b", count=20, seed=3)
+    assert _digest(first) == _digest(other)
+    assert _digest(first) != _digest(ensure_rfid_sim(tmp_path / "a", count=20, seed=4))
+    stamp = (first / "tx_pos.csv").stat().st_mtime_ns
+    assert ensure_rfid_sim(tmp_path / "a", count=20, seed=3) == first
+    assert (first / "tx_pos.csv").stat().st_mtime_ns == stamp
+    assert [p.name for p in (tmp_path / "b").iterdir()] == ["rfid-sim-20-3"]
+
+
+def test_never_passes_for_the_release(tmp_path):
+    data = load_rfid(ensure_rfid_sim(tmp_path, count=20, seed=0))
+    assert data.site.name == "rfid-sim" and data.site.stand_in == "rfid"
+    assert data.target.max(axis=(1, 2)).min() == 255
+    assert [len(part) for part in data.release_split] == [16, 4]
+
+
+def test_hand_moves_like_the_real_one():
+    positions = hand_moved(600, seed=0)
+    assert (positions >= HAND_BOX[0] - 1e-3).all() and (positions <= HAND_BOX[1] + 1e-3).all()
+    step = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert 0.008 < np.median(step) < 0.015
+    assert (step < 0.04).mean() > 0.97
+
+
+def test_tags_sit_on_bright_pixels_like_the_real_ones(tmp_path):
+    data = load_rfid(ensure_rfid_sim(tmp_path, count=60, seed=0))
+    elevation, azimuth = boresight_degrees(data)
+    assert elevation.min() > 75 and elevation.max() < 81
+    pixel = data.target[np.arange(60), np.round(elevation).astype(int), np.round(azimuth).astype(int) % 360]
+    assert pixel.mean() / 255 > 0.6 and 0.3 < data.target.mean() / 255 < 0.5
+
+
+def test_grid_a_point_source_lands_on_its_pixel():
+    """A far point source at elevation i, azimuth j is brightest in row i, column j."""
+    grid, array = SphereGrid.hemisphere(HEIGHT, WIDTH), planar_array()
+    matrix = steering(array, grid, WAVELENGTH)
+    for row, column in ((60, 37), (45, 200), (70, 359), (80, 0), (50, 90)):
+        elevation, azimuth = np.radians(row), np.radians(column)
+        direction = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+                              np.sin(elevation)])  # fmt: skip
+        distance = np.linalg.norm(1e4 * direction - array, axis=1)
+        h = np.exp(-2j * np.pi * np.mod(distance / WAVELENGTH, 1))
+        image = bartlett(h, matrix).reshape(HEIGHT, WIDTH)
+        assert np.unravel_index(image.argmax(), image.shape) == (row, column)
+        np.testing.assert_allclose(grid.directions(torch.float64)[row, column], direction, atol=1e-12)
+
+
+def test_wavelength_is_920_megahertz():
+    assert abs(LIGHT / WAVELENGTH - 920e6) < 1e6

@@ -1,0 +1,58 @@
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gsparc.check import check, main
+from gsparc.data.own import write_own
+
+
+@pytest.fixture
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "rx_position": np.array([4.0, 1.0, 2.0]),
+        "tx_position": rng.uniform(0, 3, (10, 3)),
+        "spectrum": rng.uniform(0, 1, (10, 9, 36)),
+    }
+
+
+def _said(path):
+    out = io.StringIO()
+    good = check(str(path), Console(file=out, width=40))
+    return good, out.getvalue()
+
+
+def test_good_file_is_described(tmp_path, arrays):
+    write_own(tmp_path / "hall [b].h5", {**arrays, "frequency_hz": np.array(3e9), "junk": np.ones(2)})
+    good, text = _said(tmp_path / "hall [b].h5")
+    assert good
+    for words in ("10 images of 9 x 36", "the receiver, at (4.000, 1.000, 2.000) m", "wavelengths",
+                  "3 GHz", "elevations 0 to 80 degrees", "closing the circle", "junk: not part of the schema",
+                  "hall [b].h5: good"):  # fmt: skip
+        assert words in text, text
+
+
+def test_unknown_carrier_is_said(tmp_path, arrays):
+    write_own(tmp_path / "a.npz", arrays)
+    assert "unknown; give frequency_hz" in _said(tmp_path / "a.npz")[1]
+
+
+def test_each_problem_is_one_line(tmp_path, arrays):
+    arrays["spectrum"][4, 0, 0] = np.nan
+    arrays["tx_position"][7] = np.inf
+    np.savez(tmp_path / "bad.npz", **arrays, maks=np.ones(3))
+    good, text = _said(tmp_path / "bad.npz")
+    lines = text.strip().splitlines()
+    assert not good and len(lines) == 4
+    assert "did you mean mask" in lines[0] and "row 7" in lines[1] and "row 4" in lines[2]
+    assert lines[3].endswith("bad.npz: refused, 3 problems")
+
+
+def test_exit_status(tmp_path, arrays, capsys):
+    write_own(tmp_path / "a.npz", arrays)
+    assert main([str(tmp_path / "a.npz")]) == 0
+    assert main([str(tmp_path / "a.npz"), str(tmp_path / "absent.npz")]) == 1
+    assert main([str(tmp_path)]) == 1
+    assert "a folder without gateway_info.yml" in capsys.readouterr().out
