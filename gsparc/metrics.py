@@ -128,7 +128,8 @@ class ChannelMetrics(SampleMetric):
         return {
             "error_power": error,
             "target_power": power,
-            "scalar_error_power": np.maximum(power - explained, 0.0),
+            # One free number fits one number: for a single-entry channel the figure would say nothing.
+            "scalar_error_power": np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan,
             "snr_db": _db(power, error),
             "mse": error / count,
             "mae": np.abs(p - t).sum(1) / count,
@@ -248,4 +249,4 @@ def _median(values: np.ndarray) -> float | None:
 
 def _ratio(error: np.ndarray, power: np.ndarray) -> float | None:
     total = float(np.nansum(power))
-    return float(np.nansum(error)) / total if total > 0 else None
+    return float(np.nansum(error)) / total if total > 0 and not np.isnan(error).all() else None

@@ -1,0 +1,169 @@
+"""Figures of merit against their definitions and against hard cases."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from gsparc.metrics import ChannelMetrics, PowerMetrics, SpectrumMetrics, metrics_for, paired_values
+
+
+def spectra(count: int = 3, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(count, 20, 30, generator=generator)
+    return (target + 0.1 * torch.randn(target.shape, generator=generator)).clamp(0, 1), target
+
+
+def channels(count: int = 5, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.randn(count, 4, 6, dtype=torch.complex64, generator=generator)
+    return target + 0.3 * torch.randn(target.shape, dtype=torch.complex64, generator=generator), target
+
+
+def summarise(metric, *arguments):
+    metric.update(*arguments)
+    return metric.summary(metric.compute())
+
+
+def test_spectrum_figures_are_the_libraries():
+    prediction, target = spectra()
+    figures = summarise(SpectrumMetrics(), prediction, target)
+    p, t = prediction.double().numpy(), target.double().numpy()
+    plain = [structural_similarity(a, b, win_size=7, data_range=1.0) for a, b in zip(p, t, strict=True)]
+    gauss = [
+        structural_similarity(
+            a, b, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
+        )
+        for a, b in zip(p, t, strict=True)
+    ]
+    mse = ((p - t) ** 2).mean((1, 2))
+    assert figures["ssim"] == pytest.approx(np.mean(plain), abs=1e-12)
+    assert figures["ssim_median"] == pytest.approx(np.median(plain), abs=1e-12)
+    assert figures["ssim_gauss"] == pytest.approx(np.mean(gauss), abs=1e-12)
+    assert figures["psnr_db"] == pytest.approx(np.mean(-10 * np.log10(mse)), abs=1e-9)
+    assert figures["mae"] == pytest.approx(np.abs(p - t).mean(), abs=1e-12)
+    assert figures["nmse"] == pytest.approx(((p - t) ** 2).sum() / (t**2).sum(), abs=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
+def test_batches_change_nothing(kind):
+    if kind == "rssi":
+        prediction, target = torch.rand(5, 1) + 0.1, torch.rand(5, 1) + 0.1
+    else:
+        prediction, target = spectra(5) if kind == "spectrum" else channels(5)
+    once, parts = metrics_for(kind), metrics_for(kind)
+    once.update(prediction, target)
+    for rows in (slice(0, 2), slice(2, 5)):
+        parts.update(prediction[rows], target[rows])
+    assert once.summary(once.compute()) == parts.summary(parts.compute())
+
+
+@pytest.mark.filterwarnings("error")
+def test_hard_case_flat_images():
+    flat = torch.full((2, 90, 360), 0.6)
+    other = torch.stack([flat[0] + 1e-7, torch.zeros(90, 360)])
+    figures = summarise(SpectrumMetrics(), other, flat)
+    assert all(value is not None and math.isfinite(value) for value in figures.values())
+    metric = SpectrumMetrics()
+    metric.update(other, flat)
+    assert ((metric.compute()["ssim"] <= 1) & (metric.compute()["ssim"] >= -1)).all()
+    assert metric.compute()["ssim"][0] == pytest.approx(1, abs=1e-6)
+
+
+def test_perfect_prediction_is_capped_not_infinite():
+    _, target = spectra()
+    assert summarise(SpectrumMetrics(), target, target)["psnr_db"] == 100.0
+    _, channel = channels()
+    assert summarise(ChannelMetrics(), channel, channel)["snr_db"] == 100.0
+
+
+def test_images_below_the_window_have_no_ssim():
+    figures = summarise(SpectrumMetrics(), torch.rand(2, 8, 36), torch.rand(2, 8, 36))
+    assert figures["ssim"] is not None and figures["ssim_gauss"] is None
+    assert summarise(SpectrumMetrics(), torch.rand(2, 4, 36), torch.rand(2, 4, 36))["ssim_median"] is None
+
+
+def test_unmeasured_pixels_count_nowhere():
+    prediction, target = spectra()
+    mask = torch.ones_like(target, dtype=torch.bool)
+    mask[:, :, 25:] = False
+    spoiled = prediction.masked_fill(~mask, 1.0)
+    assert summarise(SpectrumMetrics(), prediction, target, mask) == summarise(
+        SpectrumMetrics(), spoiled, target, mask
+    )
+    everything = torch.ones_like(mask)
+    assert summarise(SpectrumMetrics(), prediction, target, everything) == summarise(
+        SpectrumMetrics(), prediction, target
+    )
+
+
+def test_channel_figures_follow_their_definitions():
+    prediction, target = channels()
+    scale = 3e-5
+    figures = summarise(ChannelMetrics(scale), prediction, target)
+    error = ((prediction - target).abs() ** 2).sum((1, 2)).double()
+    power = (target.abs() ** 2).sum((1, 2)).double()
+    assert figures["nmse"] == pytest.approx(float(error.sum() / power.sum()), rel=1e-6)
+    assert figures["snr_db"] == pytest.approx(float((-10 * (error / power).log10()).mean()), rel=1e-6)
+    assert figures["mse"] == pytest.approx(float(error.mean() / 24 * scale**2), rel=1e-6)
+
+
+def test_one_free_scalar_forgives_gain_and_phase_only():
+    prediction, target = channels()
+    turned = prediction * (2 * torch.exp(1j * torch.arange(5.0)))[:, None, None]
+    plain, free = (summarise(ChannelMetrics(), p, target)["nmse_scalar"] for p in (prediction, turned))
+    assert free == pytest.approx(plain, rel=1e-5)
+    assert 0.01 < plain <= summarise(ChannelMetrics(), prediction, target)["nmse"]
+    # For a single entry the free scalar is the answer itself.
+    assert summarise(ChannelMetrics(), prediction[:, :1, :1], target[:, :1, :1])["nmse_scalar"] is None
+
+
+def test_hard_case_silent_channel(caplog):
+    prediction, target = channels()
+    target[1] = 0
+    prediction[2] = 0
+    figures = summarise(ChannelMetrics(), prediction, target)
+    assert figures["silent_samples"] == 1 and "1 of 5 channels are silent" in caplog.text
+    assert all(value is not None and math.isfinite(value) for value in figures.values())
+    nothing = summarise(ChannelMetrics(), prediction, torch.zeros_like(target))
+    assert nothing["nmse"] is None and nothing["snr_db"] is None and nothing["nmse_scalar"] is None
+
+
+def test_power_figures_in_decibels(caplog):
+    target = torch.tensor([[1e-6], [1e-5], [1e-4]])
+    figures = summarise(PowerMetrics(), target * torch.tensor([[10.0], [0.1], [1.0]]), target)
+    assert figures["rmse_db"] == pytest.approx(math.sqrt(200 / 3), rel=1e-5)
+    assert figures["mae_db"] == pytest.approx(20 / 3, rel=1e-5)
+    # Black is read as the weakest power of the set: 0, 10 and 20 dB off.
+    black = summarise(PowerMetrics(), torch.zeros(3, 1), target)
+    assert black["mae_db"] == pytest.approx(10, rel=1e-5) and "3 predictions" in caplog.text
+    silent = summarise(PowerMetrics(), target, torch.zeros(3, 1))
+    assert silent["rmse_db"] is None and silent["silent_samples"] == 3
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi"])
+def test_paired_values_average_to_the_figures(kind):
+    prediction, target = spectra() if kind == "spectrum" else channels()
+    metric = metrics_for(kind, 0.1)
+    metric.update(prediction, target)
+    samples = metric.compute()
+    figures = metric.summary(samples)
+    values = paired_values(samples)
+    assert {"nmse", "mse"} < set(values)
+    for name, value in values.items():
+        assert value.mean() == pytest.approx(figures[name], rel=1e-9)
+
+
+def test_poison_is_refused():
+    prediction, target = spectra()
+    prediction[1, 0, 0] = torch.nan
+    with pytest.raises(ValueError, match="NaN"):
+        SpectrumMetrics().update(prediction, target)
+    with pytest.raises(ValueError, match="one shape"):
+        SpectrumMetrics().update(target[:, :-1], target)
+    with pytest.raises(ValueError, match="empty"):
+        SpectrumMetrics().compute()
