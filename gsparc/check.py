@@ -32,6 +32,8 @@ def check(path: str, console: Console) -> bool:
 
 def _line(console: Console, text: str) -> None:
     # As it is: paths may hold brackets, and one problem stays one line.
+    # A path that is not UTF-8 must not stop the message about it.
+    text = text.encode("utf-8", "replace").decode()
     console.print(text, markup=False, highlight=False, soft_wrap=True, emoji=False)
 
 

@@ -46,7 +46,9 @@ class Emission(nn.Module):
 
     per_gaussian = True  # every weight has one row per Gaussian; surgery edits them together
 
-    def __init__(self, settings: EmissionSettings, count: int, channels: int, encoding: PositionEncoding) -> None:
+    def __init__(
+        self, settings: EmissionSettings, count: int, channels: int, encoding: PositionEncoding
+    ) -> None:
         super().__init__()
         if settings.log_distance and settings.activation != "sigmoid":
             raise ValueError(
@@ -61,7 +63,9 @@ class Emission(nn.Module):
         if hidden:
             self.weight1 = nn.Parameter(torch.randn(count, width, hidden) / math.sqrt(width))
             self.bias1 = nn.Parameter(torch.randn(count, hidden) * 0.1)
-        self.weight2 = nn.Parameter(torch.randn(count, inner, channels) * settings.init_scale / math.sqrt(inner))
+        self.weight2 = nn.Parameter(
+            torch.randn(count, inner, channels) * settings.init_scale / math.sqrt(inner)
+        )
         self.bias2 = nn.Parameter(torch.full((count, channels), float(settings.init_bias)))
 
     def logits(self, position: Tensor) -> Tensor:
@@ -73,7 +77,9 @@ class Emission(nn.Module):
             return (encoded @ flat).view(-1, count, channels) + self.bias2
         count, width, hidden = self.weight1.shape
         # One product for all Gaussians: the encoded position is the same for each of them.
-        inner = (encoded @ self.weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(-1, count, hidden)
+        inner = (encoded @ self.weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(
+            -1, count, hidden
+        )
         inner = torch.relu(inner + self.bias1)
         return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
 

@@ -43,7 +43,9 @@ class PositionEncoding(nn.Module):
     frequencies: Tensor
     phases: Tensor
 
-    def __init__(self, settings: EncodingSettings, box: Tensor, wavelength: float | None, seed: int = 0) -> None:
+    def __init__(
+        self, settings: EncodingSettings, box: Tensor, wavelength: float | None, seed: int = 0
+    ) -> None:
         super().__init__()
         box = torch.as_tensor(box, dtype=torch.float64)
         extent = (box[1] - box[0]).max().clamp_min(1e-6)  # one scale for all axes keeps distances true

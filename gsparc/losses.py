@@ -15,7 +15,9 @@ STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
 @functools.lru_cache(maxsize=32)
 def _band(size: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """Banded matrix (size - 10, size) that applies the window along one axis, valid part only."""
-    taps = torch.exp(-0.5 * (torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64) / WINDOW_SIGMA) ** 2)
+    taps = torch.exp(
+        -0.5 * (torch.arange(-WINDOW_RADIUS, WINDOW_RADIUS + 1, dtype=torch.float64) / WINDOW_SIGMA) ** 2
+    )
     taps = taps / taps.sum()
     rows = size - 2 * WINDOW_RADIUS
     if rows < 1:
@@ -67,7 +69,9 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
 
 def channel_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
     """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,)."""
-    error = (prediction - target).abs().square() if prediction.is_complex() else (prediction - target).square()
+    error = (
+        (prediction - target).abs().square() if prediction.is_complex() else (prediction - target).square()
+    )
     if mask is None:
         return error.flatten(1).mean(1)
     return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -13,7 +15,18 @@ from gsparc.data.schema import Site
 from gsparc.emission import Emission, EmissionSettings
 from gsparc.encoding import PositionEncoding
 from gsparc.field import FieldSettings, GaussianField, initial_field
-from gsparc.ops import Cutoff, FrozenPlan, Pose, Raster, SphereGrid, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops import (
+    Cutoff,
+    FrozenPlan,
+    Plan,
+    Pose,
+    Raster,
+    SphereGrid,
+    composite,
+    freeze,
+    make_plan,
+    mean_weights,
+)
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 
@@ -51,7 +64,7 @@ class RasterSettings:
         backend: `reference`, `cpu`, `cuda`; null chooses by device.
     """
 
-    projection: str = "equirect"
+    projection: Literal["equirect", "tangent"] = "tangent"
     low_pass: float = 0.3
     compensate: bool = True
     alpha_cutoff: float = 1 / 255
@@ -63,11 +76,11 @@ class RasterSettings:
 class ModelSettings:
     """Everything that shapes the model; see the parts."""
 
-    field: FieldSettings = field(default_factory=FieldSettings)
-    emission: EmissionSettings = field(default_factory=EmissionSettings)
-    attenuation: AttenuationSettings = field(default_factory=AttenuationSettings)
-    raster: RasterSettings = field(default_factory=RasterSettings)
-    confidence: ConfidenceSettings = field(default_factory=ConfidenceSettings)
+    field: FieldSettings = dataclasses.field(default_factory=FieldSettings)
+    emission: EmissionSettings = dataclasses.field(default_factory=EmissionSettings)
+    attenuation: AttenuationSettings = dataclasses.field(default_factory=AttenuationSettings)
+    raster: RasterSettings = dataclasses.field(default_factory=RasterSettings)
+    confidence: ConfidenceSettings = dataclasses.field(default_factory=ConfidenceSettings)
 
 
 @dataclass(frozen=True)
@@ -89,7 +102,11 @@ class GaussianModel(nn.Module):
     """
 
     def __init__(
-        self, settings: ModelSettings, site: Site, receiver: Pose | None = None, transmitter: Tensor | None = None
+        self,
+        settings: ModelSettings,
+        site: Site,
+        receiver: Pose | None = None,
+        transmitter: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.settings = settings
@@ -104,7 +121,9 @@ class GaussianModel(nn.Module):
         encoding = PositionEncoding(settings.emission.encoding, box, site.wavelength)
         self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
         self.confidence = (
-            Confidence(settings.confidence, PositionEncoding(settings.confidence.encoding, box, site.wavelength))
+            Confidence(
+                settings.confidence, PositionEncoding(settings.confidence.encoding, box, site.wavelength)
+            )
             if settings.confidence.enabled
             else None
         )
@@ -138,40 +157,41 @@ class GaussianModel(nn.Module):
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         features = self.features(tx, rx)
+        plan = self.plan(rx)
         if self.site.kind == "spectrum":
-            raster = rasterize(*self._geometry(), features, rx, self._grid(), **self._raster_options())
+            raster = composite(plan, *self._geometry(), features)
             return Rendered(raster.image.squeeze(1), raster)
-        weights = mean_weights(*self._geometry(), rx, self._grid(), **self._raster_options()).share
+        weights = mean_weights(plan, *self._geometry()).share
         if self.site.kind == "rssi":
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
         return Rendered(self.response(weights * gains), None)
 
+    def plan(self, rx: Pose) -> Plan:
+        """Who is seen where from one pose, or from each of B."""
+        settings = self.settings.raster
+        image = self.site.kind == "spectrum"
+        cutoff = Cutoff(settings.alpha_cutoff if image else settings.relative_cutoff, relative=not image)
+        return make_plan(
+            *self._geometry(),
+            rx,
+            self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS),
+            projection=settings.projection,
+            low_pass=settings.low_pass,
+            compensate=settings.compensate,
+            cutoff=cutoff,
+            ids=self.gaussians.ids,
+            backend=settings.backend,
+        )
+
     def freeze(self, rx: Pose) -> FrozenPlan:
         """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
         with torch.no_grad():
-            plan = make_plan(*self._geometry(), rx, self._grid(), **self._raster_options())
-            return freeze(plan, *self._geometry(), version=int(self.gaussians.version))
+            return freeze(self.plan(rx), *self._geometry(), version=int(self.gaussians.version))
 
     def _geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         g = self.gaussians
         return g.means, g.quats, g.scales, g.opacities
-
-    def _grid(self) -> SphereGrid:
-        return self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
-
-    def _raster_options(self) -> dict:
-        settings = self.settings.raster
-        spectrum = self.site.kind == "spectrum"
-        cutoff = Cutoff(settings.alpha_cutoff if spectrum else settings.relative_cutoff, relative=not spectrum)
-        return {
-            "projection": settings.projection,
-            "low_pass": settings.low_pass,
-            "compensate": settings.compensate,
-            "cutoff": cutoff,
-            "ids": self.gaussians.ids,
-            "backend": settings.backend,
-        }
 
 
 class ChannelResponse(nn.Module):

@@ -56,7 +56,7 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
             continue
         array = np.ascontiguousarray(array)
         digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
-        digest.update(memoryview(array).cast("B") if array.size else b"")
+        digest.update(array.tobytes())
     return digest.hexdigest()
 
 
@@ -115,9 +115,9 @@ def assemble(
                 "rx": rx,
                 "rx_rotation": rx_rotation,
                 "target": target,
-                "target_scale": np.float64(target_scale),
+                "target_scale": np.array(target_scale),
                 "array": array,
-                "carrier_hz": None if carrier_hz is None else np.float64(carrier_hz),
+                "carrier_hz": None if carrier_hz is None else np.array(carrier_hz),
                 "subcarriers_hz": subcarriers_hz,
                 "mask": mask,
                 "noise_variance": noise_variance,

@@ -14,7 +14,8 @@ class DataError(ValueError):
     """
 
     def __init__(self, problems: str | Iterable[str], source: str | Path | None = None) -> None:
-        self.problems = (problems,) if isinstance(problems, str) else tuple(problems)
+        listed = (problems,) if isinstance(problems, str) else tuple(problems)
+        self.problems = tuple(" ".join(problem.splitlines()) for problem in listed)
         more = len(self.problems) - 1
         hint = f" (and {more} more: python -m gsparc.check {source or 'FILE'} lists them)" if more > 0 else ""
         super().__init__(self.problems[0] + hint)
@@ -36,7 +37,8 @@ class Problems(list[str]):
     def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> None:
         """Note `what` for each of `rows` (as a user names them), shortened when there are many."""
         names = list(rows)
-        self.extend(f"{where}, {name}: {what}" for name in names[: self.LIMIT])
+        for name in names[: self.LIMIT]:
+            self.add(f"{where}, {name}", what)
         if len(names) > self.LIMIT:
             self.append(f"{where}: {what}; the same in {len(names) - self.LIMIT} more rows")
 

@@ -124,8 +124,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     static_end = _static_end(check, ends["rx"], ends["tx"], rotation)
     check.problems.raise_if_any()
     assert static_end is not None and rotation is not None
-    rx, tx = (np.broadcast_to(ends[end], (rows, 3)).astype(np.float64) for end in ("rx", "tx"))
+    rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
+    if kind == "csi":
+        _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, values, mask)
     if not (np.isfinite(scale) and scale > 0):
         check.problems.add(check.where(measured), "every measured value is zero; expected some signal")
@@ -282,6 +284,19 @@ def _static_end(
     return None
 
 
+def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) -> None:
+    """Positions in one plane cannot tell a source from its mirror image in that plane."""
+    if carrier_hz is None:
+        return
+    thickness = float(np.sqrt(np.linalg.eigvalsh(np.cov(moving.T))[0].clip(0)))
+    wavelength = 299_792_458.0 / carrier_hz
+    if thickness < wavelength / 4:
+        check.notes.append(
+            f"the positions spread only {thickness:.2g} m ({thickness / wavelength:.2g} wavelengths) about a "
+            "plane: a source and its mirror image in it look the same; several heights tell them apart"
+        )
+
+
 def _directions(
     check: Checker, offsets: np.ndarray | None, rx: np.ndarray, rotation: np.ndarray
 ) -> list[np.ndarray] | None:
@@ -295,7 +310,8 @@ def _directions(
     owner = np.repeat(np.arange(len(rx)), np.diff(offsets))
     if name == "path_last_point":
         vectors = np.einsum("pji,pj->pi", rotation[owner], vectors - rx[owner])
-    length = np.linalg.norm(vectors, axis=-1)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(vectors, axis=-1)
     bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
     check.problems.add_rows(
         check.where(name), (f"path {i}" for i in bad), "expected a direction that is not zero"

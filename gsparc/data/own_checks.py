@@ -268,6 +268,6 @@ class Checker:
             values, counts = np.unique(index, return_counts=True)
             self.problems.add_rows(self.where(name), (f"row {i}" for i in values[counts > 1]), "named twice")
             parts.append(values.astype(np.int64))
-        both = np.intersect1d(*parts)
+        both = np.intersect1d(parts[0], parts[1])
         self.problems.add_rows(self.where("split_test"), (f"row {i}" for i in both), "also in split_train")
         return parts[0], parts[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,6 +18,20 @@ import numpy as np
 from gsparc.data.errors import DataError
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+# What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
+DAMAGED = (
+    zipfile.BadZipFile,
+    zlib.error,
+    struct.error,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    RuntimeError,  # includes NotImplementedError
+    ArithmeticError,
+    MemoryError,
+)
 
 
 @dataclass(frozen=True)
@@ -62,11 +77,14 @@ def write_raw(path: str | Path, raw: Raw) -> None:
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, attributes=np.array(about), **raw.arrays)
     elif path.suffix.lower() in HDF5_SUFFIXES:
-        with h5py.File(partial, "w") as file:
+        # Checksums on metadata and data, and text of fixed length: libhdf5 crashes on damage it cannot see.
+        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             for name, array in raw.arrays.items():
-                text = array.dtype.kind in "US"
-                data = array.astype(h5py.string_dtype()) if text else array
-                stored = file.create_dataset(name, data=data)
+                data = np.char.encode(array, "utf-8") if array.dtype.kind == "U" else array
+                dtype = h5py.string_dtype("utf-8", data.dtype.itemsize) if data.dtype.kind == "S" else None
+                stored = file.create_dataset(
+                    name, data=data, dtype=dtype, fletcher32=data.size > 0 and data.ndim > 0
+                )
                 if name in raw.units:
                     stored.attrs["units"] = raw.units[name]
             for name, value in raw.attributes.items():
@@ -86,15 +104,7 @@ def _read_npz(path: Path) -> Raw:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
                 arrays[name] = file[name]
-    except (
-        zipfile.BadZipFile,
-        zlib.error,
-        OSError,
-        EOFError,
-        ValueError,
-        KeyError,
-        NotImplementedError,
-    ) as error:
+    except DAMAGED as error:
         if "allow_pickle" in str(error):
             raise DataError(
                 f"{path}, {name}: holds Python objects; expected plain arrays of numbers"
@@ -124,15 +134,16 @@ def _read_hdf5(path: Path) -> Raw:
     name = "the file"
     try:
         with h5py.File(path, "r") as file:
-            for name, item in file.items():
+            for key, item in file.items():
+                name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
                     arrays[name] = np.asarray(
                         item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
                     )
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
-            attributes = {key: _plain(value) for key, value in file.attrs.items()}
-    except (OSError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
+    except DAMAGED as error:
         raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({_one_line(error)})") from None
     return Raw({k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}, attributes, units)
 

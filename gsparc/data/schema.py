@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -96,7 +96,7 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Batch:
         """The same samples on another device."""
-        moved = {
+        moved: dict[str, Any] = {
             name: value.to(device) if isinstance(value, (Tensor, Pose)) else value
             for name, value in vars(self).items()
         }

@@ -47,10 +47,10 @@ class Room:
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Whether points (..., 3) [m] are inside the room and outside every occluder: (...) bool."""
-        inside = ((points > self.lower) & (points < self.upper)).all(axis=-1)
+        inside = np.all((points > self.lower) & (points < self.upper), axis=-1)
         for low, high in self.occluders:
-            inside &= ~((points >= low) & (points <= high)).all(axis=-1)
-        return inside
+            inside = inside & ~np.all((points >= low) & (points <= high), axis=-1)
+        return np.asarray(inside)
 
 
 @dataclass(frozen=True)
@@ -179,7 +179,7 @@ class Trace:
         if len(self.array) > 1:
             arrays["array_position"] = self.array
         if self.noise_variance > 0:
-            arrays["noise_variance"] = np.float64(self.noise_variance)
+            arrays["noise_variance"] = np.array(self.noise_variance)
         return arrays
 
 

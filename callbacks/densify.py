@@ -1,0 +1,159 @@
+"""Adaptive density: clone small, split large, prune useless Gaussians (paper, algorithm 1)."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from torch import Tensor
+
+from gsparc import surgery
+from gsparc.model import GaussianModel
+
+log = logging.getLogger(__name__)
+
+
+class Densify(L.Callback):
+    """Clone, split and prune on a schedule of steps.
+
+    Args:
+        start, stop, interval: first step, last step and spacing of the edits.
+        grad_threshold: mean screen-space gradient norm [loss per px] above which a Gaussian is
+            under-reconstructed; read per sample before summing.
+        size_share: Gaussians up to this share of the scene radius are cloned, larger ones split.
+        children: number N of children of a split; their scale is the parent's / (0.8 N).
+        min_opacity: prune below this opacity.
+        max_radius: prune above this footprint radius [px]; null never does.
+        max_gaussians: never more than this many.
+        min_gaussians: pruning stops at this many, the most opaque stay.
+    """
+
+    def __init__(
+        self,
+        start: int = 500,
+        stop: int = 15_000,
+        interval: int = 100,
+        grad_threshold: float = 2e-4,
+        size_share: float = 0.01,
+        children: int = 2,
+        min_opacity: float = 0.005,
+        max_radius: float | None = None,
+        max_gaussians: int = 100_000,
+        min_gaussians: int = 16,
+    ) -> None:
+        self.start, self.stop, self.interval = start, stop, interval
+        self.grad_threshold = grad_threshold
+        self.size_share = size_share
+        self.children = children
+        self.min_opacity = min_opacity
+        self.max_radius = max_radius
+        self.max_gaussians = max_gaussians
+        self.min_gaussians = min_gaussians
+        self.statistics: dict[str, Tensor] = {}
+
+    def _blank(self, model: GaussianModel) -> dict[str, Tensor]:
+        count = len(model.gaussians)
+        return {key: torch.zeros(count) for key in ("gradient", "seen", "radius")}
+
+    def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
+        """Accumulate positional gradients and radii of the Gaussians that were seen."""
+        if module.rendered is None or module.rendered.raster is None or trainer.global_step >= self.stop:
+            return
+        raster = module.rendered.raster
+        if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
+            self.statistics = self._blank(module.model)
+        gradient = raster.means2d.grad
+        if gradient is None:
+            return
+        with torch.no_grad():
+            visible = raster.visible.float()
+            self.statistics["gradient"] += (gradient.norm(dim=-1) * visible).sum(0)
+            self.statistics["seen"] += visible.sum(0)
+            radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
+            self.statistics["radius"] = torch.maximum(self.statistics["radius"], radius.float())
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Edit the field when the schedule says so."""
+        step = trainer.global_step
+        if not (self.start <= step <= self.stop and step % self.interval == 0) or not self.statistics:
+            return
+        model: GaussianModel = module.model
+        with torch.no_grad():
+            edit = self.plan(model)
+            before = len(model.gaussians)
+            surgery.apply(edit, model, model.gaussians, trainer.optimizers[0])
+            self.statistics = self._blank(model)
+        log.debug("step %d: %d -> %d Gaussians", step, before, len(model.gaussians))
+
+    def plan(self, model: GaussianModel) -> surgery.Edit:
+        """Decide what to clone, split and prune from the statistics gathered so far."""
+        field = model.gaussians
+        mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
+        wanting = mean_gradient >= self.grad_threshold
+        size = field.scales.amax(1)
+        radius_of_scene = float((torch.as_tensor(model.site.box[1] - model.site.box[0])).norm() / 2)
+        large = size > self.size_share * radius_of_scene
+
+        prune = field.opacities < self.min_opacity
+        if self.max_radius is not None:
+            prune |= self.statistics["radius"] > self.max_radius
+        prune = self._respect_floor(prune, field.opacities)
+
+        room = max(self.max_gaussians - int((~prune).sum()), 0)
+        cost = torch.where(large, self.children - 1, 1)
+        chosen = self._strongest(wanting & ~prune, mean_gradient, cost, room)
+        clone, split = chosen & ~large, chosen & large
+        clones = clone.nonzero().squeeze(1)
+        splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
+        parents = torch.cat([clones, splits])
+        scales = torch.cat(
+            [
+                field.log_scales[clones],
+                field.log_scales[splits] - torch.log(torch.tensor(0.8 * self.children)),
+            ]
+        )
+        spread = _sample_inside(field.scales[splits], field.quats[splits])
+        means = torch.cat([field.means[clones], field.means[splits] + spread])
+        return surgery.Edit(
+            keep=~(prune | split),
+            parents=parents,
+            replace={"gaussians.means": means, "gaussians.log_scales": scales},
+        )
+
+    def _respect_floor(self, prune: Tensor, opacities: Tensor) -> Tensor:
+        short = min(self.min_gaussians, len(prune)) - int((~prune).sum())
+        if short > 0:
+            candidates = torch.where(prune, opacities, -torch.ones_like(opacities))
+            prune = prune.clone()
+            prune[candidates.topk(short).indices] = False
+        return prune
+
+    @staticmethod
+    def _strongest(wanting: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
+        order = torch.where(wanting, gradient, -torch.ones_like(gradient)).argsort(
+            descending=True, stable=True
+        )
+        spent = torch.where(wanting, cost, 0)[order].cumsum(0)
+        chosen = torch.zeros_like(wanting)
+        chosen[order] = wanting[order] & (spent <= room)
+        return chosen
+
+    def state_dict(self) -> dict[str, Any]:
+        """Statistics gathered since the last edit."""
+        return {"statistics": dict(self.statistics)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue in the middle of an interval."""
+        self.statistics = dict(state["statistics"])
+
+
+def _sample_inside(scales: Tensor, quats: Tensor) -> Tensor:
+    """Offsets (M, 3) [m] drawn from Gaussians with the given scales (M, 3) and rotations (M, 4)."""
+    w, *v = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
+    axis = torch.stack(v, -1)
+    local = torch.randn_like(scales) * scales
+    # Rotating by a unit quaternion: x + 2 w (v x x) + 2 v x (v x x).
+    turned = torch.linalg.cross(axis, local)
+    return local + 2 * w.unsqueeze(-1) * turned + 2 * torch.linalg.cross(axis, turned)

@@ -1,0 +1,147 @@
+"""The LightningModule: field, rasterizer and confidence-weighted loss in one training step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+import torch
+from torch import Tensor
+
+from gsparc import surgery
+from gsparc.confidence import weighted
+from gsparc.data.schema import Batch
+from gsparc.losses import channel_loss, spectrum_loss, ssim
+from gsparc.model import GaussianModel, Rendered
+from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """Task loss.
+
+    Attributes:
+        ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone.
+    """
+
+    ssim_weight: float = 0.2
+
+
+class NonFiniteLoss(RuntimeError):
+    """Training met a NaN or an infinity; batch and parameters are on disk."""
+
+
+class GaussianModule(L.LightningModule):
+    """Trains a GaussianModel.
+
+    Args:
+        model: what is trained.
+        loss: task loss.
+        optimizer: learning rates.
+        total_steps: length of the schedules.
+        run_dir: where a poisoned batch is left.
+    """
+
+    def __init__(
+        self,
+        model: GaussianModel,
+        loss: LossSettings,
+        optimizer: OptimizerSettings,
+        total_steps: int,
+        run_dir: Path,
+    ) -> None:
+        super().__init__()
+        self.model = model
+        self.loss = loss
+        self.rates = optimizer
+        self.total_steps = total_steps
+        self.run_dir = run_dir
+        self.train_seconds = 0.0  # written by the cost ledger
+        self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
+
+    def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
+        """Loss per sample (B,) before confidence."""
+        if self.model.site.kind == "spectrum":
+            return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
+        return channel_loss(prediction, batch.target, batch.mask)
+
+    def training_step(self, batch: Batch, step: int) -> Tensor:
+        """Confidence-weighted loss of a batch."""
+        self.rendered = self.model(batch.tx, batch.rx)
+        task = self.task_loss(self.rendered.mean, batch)
+        confidence = self.model.confidence
+        if confidence is None:
+            loss = task.mean()
+        else:
+            exponent = confidence.exponent(self.model.moving(batch.tx, batch.rx))
+            loss = weighted(task, exponent, confidence.settings.alpha).mean()
+        if not torch.isfinite(loss):
+            raise NonFiniteLoss(self._leave_evidence(batch, task))
+        self.log("train/task_loss", task.detach().mean(), prog_bar=True)
+        self.log("model/num_gaussians", float(len(self.model.gaussians)), prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: Batch, step: int) -> None:
+        """Log validation figures."""
+        mean = self.model(batch.tx, batch.rx).mean
+        size = len(batch)
+        error = (mean - batch.target).abs().square().flatten(1).mean(1)
+        if self.model.site.kind == "spectrum":
+            self.log("val/ssim_gauss", ssim(mean, batch.target).mean(), batch_size=size, prog_bar=True)
+            self.log(
+                "val/psnr_db", (-10 * error.clamp_min(1e-12).log10()).mean(), batch_size=size, prog_bar=True
+            )
+        else:
+            self.log("val/mse", error.mean(), batch_size=size, prog_bar=True)
+
+    def configure_optimizers(self) -> Any:
+        """One Adam group per tensor, rates as pure functions of the step."""
+        optimizer = optimizer_for(self.model, self.rates)
+        scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Make room for the checkpoint's number of Gaussians before its tensors arrive."""
+        count = len(checkpoint["state_dict"]["model.gaussians.ids"])
+        surgery.resize(self.model, self.model.gaussians, count)
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+        """Move a batch."""
+        return batch.to(device)
+
+    def _leave_evidence(self, batch: Batch, task: Tensor) -> str:
+        path = self.run_dir / "nonfinite.pt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(
+            {
+                "index": batch.index,
+                "tx": batch.tx,
+                "target": batch.target,
+                "state_dict": self.model.state_dict(),
+                "step": self.global_step,
+            },
+            path,
+        )
+        rows = surgery.row_parameters(self.model, len(self.model.gaussians))
+        culprit = "every parameter is finite: look at the batch"
+        for name, parameter in rows.items():
+            bad = (
+                ~torch.isfinite(parameter).flatten(1).all(1)
+                if parameter.dim() > 1
+                else ~torch.isfinite(parameter)
+            )
+            if bad.any():
+                row = int(bad.nonzero()[0])
+                culprit = f"first offender: Gaussian id {int(self.model.gaussians.ids[row])}, {name}"
+                break
+        sample = (
+            int(batch.index[~torch.isfinite(task)][0])
+            if not torch.isfinite(task).all()
+            else int(batch.index[0])
+        )
+        return (
+            f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "
+            f"batch and parameters are in {path}"
+        )

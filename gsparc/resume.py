@@ -1,0 +1,49 @@
+"""Lightning's checkpoints inside ours: one file that `gsparc.load` reads and `ckpt_path=` resumes from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lightning.pytorch.plugins.io import CheckpointIO
+
+from gsparc import checkpoint
+
+if TYPE_CHECKING:
+    from gsparc.method import Method
+
+
+class GsparcCheckpointIO(CheckpointIO):
+    """Writes a method's checkpoint with the trainer's state beside it, atomically.
+
+    Args:
+        method: what is being trained.
+        config_yaml: the whole configuration as text.
+    """
+
+    def __init__(self, method: Method, config_yaml: str) -> None:
+        self.method = method
+        self.config_yaml = config_yaml
+
+    def save_checkpoint(self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Write atomically."""
+        checkpoint.save(Path(path), self.method, self.config_yaml, extra={"trainer": trainer_state})
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """The trainer's part of a checkpoint.
+
+        Raises:
+            ValueError: when the file holds a finished model without a trainer's state.
+        """
+        stored = checkpoint.read(Path(path))
+        if "trainer" not in stored.extra:
+            raise ValueError(
+                f"{path} holds a finished model, not a training state: resume from last.ckpt instead"
+            )
+        return stored.extra["trainer"]
+
+    def remove_checkpoint(self, path: Any) -> None:
+        """Delete a superseded checkpoint."""
+        Path(path).unlink(missing_ok=True)

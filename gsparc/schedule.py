@@ -1,0 +1,85 @@
+"""Learning rates: one per kind of parameter, each a pure function of the step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from torch import nn
+from torch.optim import Adam
+from torch.optim.lr_scheduler import LambdaLR
+
+
+@dataclass(frozen=True)
+class OptimizerSettings:
+    """Adam's rates (paper, table of hyperparameters) and their decay.
+
+    Attributes:
+        positions, positions_final: rate of the means [m per step], exponentially annealed.
+        scales, rotations, opacities, emission, confidence, gain: initial rates.
+        decay: final rate of everything but the positions, as a share of the initial one (cosine).
+        warmup: steps over which all rates rise linearly from zero.
+        eps: Adam's epsilon.
+    """
+
+    positions: float = 1.6e-4
+    positions_final: float = 1.6e-7
+    scales: float = 0.005
+    rotations: float = 0.001
+    opacities: float = 0.0055
+    emission: float = 0.005
+    confidence: float = 0.005
+    gain: float = 0.005
+    decay: float = 1.0
+    warmup: int = 0
+    eps: float = 1e-15
+
+
+KINDS = {
+    "gaussians.means": "positions",
+    "gaussians.log_scales": "scales",
+    "gaussians.quats": "rotations",
+    "gaussians.opacity_logits": "opacities",
+    "emission": "emission",
+    "response": "emission",
+    "confidence": "confidence",
+    "log_gain": "gain",
+}
+
+
+def kind_of(name: str) -> str:
+    """Which rate a parameter follows, from its dotted name."""
+    for prefix, kind in KINDS.items():
+        if name == prefix or name.startswith(prefix + "."):
+            return kind
+    raise KeyError(f"no learning rate is declared for parameter {name!r}: add it to gsparc.schedule.KINDS")
+
+
+def optimizer_for(model: nn.Module, settings: OptimizerSettings) -> Adam:
+    """Adam with one parameter tensor per group, so that surgery can exchange single tensors."""
+    groups = [
+        {"params": [parameter], "lr": getattr(settings, kind_of(name)), "name": name}
+        for name, parameter in model.named_parameters()
+        if parameter.requires_grad
+    ]
+    return Adam(groups, eps=settings.eps, fused=True)
+
+
+def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -> float:
+    """Rate at `step` as a share of the initial one."""
+    progress = min(step / max(total, 1), 1.0)
+    rise = min((step + 1) / settings.warmup, 1.0) if settings.warmup else 1.0
+    if kind == "positions":
+        if settings.positions == 0:
+            return 0.0
+        return rise * (settings.positions_final / settings.positions) ** progress
+    return rise * (settings.decay + (1 - settings.decay) * 0.5 * (1 + math.cos(math.pi * progress)))
+
+
+def scheduler_for(optimizer: Adam, settings: OptimizerSettings, total: int) -> LambdaLR:
+    """The schedule of every group over `total` steps."""
+
+    def factor(kind: str):
+        return lambda step: rate_factor(kind, settings, step, total)
+
+    return LambdaLR(optimizer, [factor(kind_of(group["name"])) for group in optimizer.param_groups])
