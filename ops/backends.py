@@ -16,7 +16,7 @@ class BackendUnavailable(RuntimeError):
 def choose(name: str | None, device: torch.device) -> ModuleType:
     """The backend called `name`, or the one of `device`."""
     if name is None:
-        name = "reference" if device.type == "cpu" else device.type
+        name = device.type
     backend = named(name)
     if name in ("cpu", "cuda") and device.type != name:
         raise BackendUnavailable(f"backend {name!r} needs tensors on {name}, these are on {device}")
@@ -27,6 +27,19 @@ def named(name: str) -> ModuleType:
     """The backend called `name` (BackendUnavailable, ValueError)."""
     if name == "reference":
         return dense
+    if name == "cpu":
+        return _cpu()
     if name == "cuda":
         raise BackendUnavailable("there are no CUDA kernels in this version; move the tensors to the CPU")
     raise ValueError(f"backend is 'reference', 'cpu' or 'cuda', got {name!r}")
+
+
+def _cpu() -> ModuleType:
+    try:
+        from gsparc.ops import native
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"the CPU kernels are not built ({error}); install gsparc with a C++17 compiler at hand, "
+            "or pass backend='reference' for small scenes"
+        ) from error
+    return native

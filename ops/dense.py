@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.ops import reference
+from gsparc.ops import door, reference
 from gsparc.ops.geometry import Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.settings import Optics
@@ -22,6 +22,7 @@ def make_plan(
     optics: Optics,
 ) -> Plan:
     """Order and radii; the footprints themselves are formed again, differentiably, when compositing."""
+    door.finite(means, quats, scales, strongest)
     orders, centers, reaches, seen_at_all = [], [], [], []
     for index in range(len(pose)):
         seen = reference.project(means, quats, scales, pose[index], grid, optics)
@@ -80,13 +81,11 @@ def mean_weights(
 
 def pixel_weights(
     plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
-) -> list[Tensor]:
-    """For each pose the matrix alpha T, pixels x Gaussians (H W, N)."""
-    still, matrices = torch.zeros_like(plan.means2d), []
-    for index in range(plan.num_poses):
-        weights, _, _ = _weights(plan, index, means, quats, scales, opacities, extinctions, still)
-        matrices.append(weights[torch.argsort(plan.buffers[0][index])].mT)
-    return matrices
+) -> tuple[Tensor, Tensor]:
+    """The matrix alpha T of the only pose, pixels x Gaussians in depth order (H W, N), and that order (N,)."""
+    still = torch.zeros_like(plan.means2d)
+    weights, _, _ = _weights(plan, 0, means, quats, scales, opacities, extinctions, still)
+    return weights.mT, plan.buffers[0][0]
 
 
 def _weights(plan, index, means, quats, scales, opacities, extinctions, means2d):

@@ -19,12 +19,14 @@ class FrozenPlan:
     """Compositing weights of one pose.
 
     Attributes:
-        weights: (H W, N), sparse or dense; alpha times transmittance.
+        weights: (H W, V), sparse or dense; alpha times transmittance of the Gaussians in `order`.
+        order: (V,) rows of the features, the Gaussians that this receiver sees.
         grid: directions of the pixels.
         version: the field's own counter at the time of freezing.
     """
 
     weights: Tensor
+    order: Tensor
     grid: SphereGrid
     version: int
 
@@ -40,8 +42,8 @@ class FrozenPlan:
             )
         batched = features.dim() == 3
         batch = features if batched else features.unsqueeze(0)
-        samples, count, channels = batch.shape
+        samples, _, channels = batch.shape
         with torch.no_grad():
-            columns = batch.permute(1, 0, 2).reshape(count, samples * channels).contiguous()
+            columns = batch[:, self.order].permute(1, 0, 2).reshape(len(self.order), samples * channels)
             image = (self.weights @ columns).mT.reshape(samples, channels, self.grid.height, self.grid.width)
         return image if batched else image[0]

@@ -1,3 +1,177 @@
+// The Python face of the kernels. Tensors arrive as addresses: native.py, the only caller, has checked shape,
+// dtype and contiguity, and keeps them alive. An address of 0 is an absent tensor.
 #include <nanobind/nanobind.h>
+#include <nanobind/stl/vector.h>
 
-NB_MODULE(_native, module) { module.doc() = "GSpaRC CPU kernels"; }
+#include <vector>
+
+#include "plan.h"
+
+namespace nb = nanobind;
+using namespace gsparc;
+
+namespace {
+
+using Addresses = std::vector<uintptr_t>;
+
+template <class S> Lens<S> lens_from(const std::vector<int>& whole, const std::vector<double>& real) {
+    return {whole[0], whole[1], whole[2] != 0, whole[3] != 0, whole[4] != 0, whole[5] != 0,
+            S(real[0]), S(real[1]), S(real[2]), S(real[3]),
+            S(real[4]), S(real[5]), S(real[6]), S(real[7]), S(real[8]), S(real[9])};
+}
+
+// Reads addresses one after the other.
+struct Reader {
+    const Addresses& all;
+    size_t at = 0;
+    template <class T> T* next() { return reinterpret_cast<T*>(all.at(at++)); }
+};
+
+template <class S> Model<S> read_model(Reader& in) {
+    Model<S> m;
+    m.means = in.next<const S>(), m.quats = in.next<const S>(), m.scales = in.next<const S>();
+    m.opacities = in.next<const S>(), m.extinctions = in.next<const S>();
+    m.positions = in.next<const S>(), m.rotations = in.next<const S>();
+    return m;
+}
+
+int strips_of(int height) { return (height + kStripRows - 1) / kStripRows; }
+
+template <class S> PlanView<S> read_plan(Reader& in, int poses, int count, int height) {
+    PlanView<S> p;
+    p.poses = poses, p.count = count, p.strips = strips_of(height);
+    p.records = in.next<const S>(), p.boxes = in.next<const Box>();
+    p.order = in.next<const int32_t>(), p.shown = in.next<const int32_t>();
+    p.slots = in.next<const int64_t>(), p.strip_starts = in.next<const int64_t>();
+    p.entries = in.next<const int32_t>();
+    return p;
+}
+
+// Calls run(S()) with S double or float, without holding Python's lock.
+template <class F> auto with_scalar(bool twice, F run) {
+    nb::gil_scoped_release unlocked;
+    return twice ? run(double()) : run(float());
+}
+
+using Ints = std::vector<int>;
+using Reals = std::vector<double>;
+
+int64_t plan(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    return with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        PlanArgs<S> a;
+        a.model = read_model<S>(in);
+        a.ids = in.next<const int64_t>();
+        a.poses = poses, a.count = count, a.strips = strips_of(whole[0]), a.threads = threads;
+        a.lens = lens_from<S>(whole, real);
+        a.records = in.next<S>(), a.boxes = in.next<Box>(), a.order = in.next<int32_t>(), a.shown = in.next<int32_t>();
+        a.slots = in.next<int64_t>(), a.strip_starts = in.next<int64_t>();
+        a.means2d = in.next<S>(), a.radii = in.next<S>(), a.visible = in.next<bool>();
+        return make_plan(a);
+    });
+}
+
+void entries(bool twice, int poses, int count, int threads, int height, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        const PlanView<S> view = read_plan<S>(in, poses, count, height);
+        fill_entries(view, threads, const_cast<int32_t*>(view.entries));
+    });
+}
+
+template <class S>
+CompositeArgs<S> read_composite(Reader& in, int poses, int count, int samples, int channels, int threads, const Ints& whole, const Reals& real) {
+    CompositeArgs<S> a;
+    a.plan = read_plan<S>(in, poses, count, whole[0]);
+    a.model = read_model<S>(in);
+    a.lens = lens_from<S>(whole, real);
+    a.samples = samples, a.channels = channels, a.threads = threads;
+    a.features = in.next<const S>(), a.image = in.next<S>(), a.transmittance = in.next<S>();
+    return a;
+}
+
+void composite(bool twice, int poses, int count, int samples, int channels, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        kernels<S>().composite(read_composite<S>(in, poses, count, samples, channels, threads, whole, real));
+    });
+}
+
+void composite_backward(bool twice, int poses, int count, int samples, int channels, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        CompositeBackwardArgs<S> b;
+        b.forward = read_composite<S>(in, poses, count, samples, channels, threads, whole, real);
+        b.grad_image = in.next<const S>(), b.grad_transmittance = in.next<const S>();
+        b.means = in.next<S>(), b.quats = in.next<S>(), b.scales = in.next<S>(), b.opacities = in.next<S>();
+        b.extinctions = in.next<S>(), b.features = in.next<S>(), b.screen = in.next<S>();
+        kernels<S>().composite_backward(b);
+    });
+}
+
+template <class S> WeightArgs<S> read_weights(Reader& in, int poses, int count, int threads, const Ints& whole, const Reals& real) {
+    WeightArgs<S> a;
+    a.plan = read_plan<S>(in, poses, count, whole[0]);
+    a.model = read_model<S>(in);
+    a.lens = lens_from<S>(whole, real);
+    a.threads = threads;
+    a.visible_sum = in.next<S>(), a.total = in.next<S>();
+    return a;
+}
+
+void weights(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        kernels<S>().weights(read_weights<S>(in, poses, count, threads, whole, real));
+    });
+}
+
+void weights_backward(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        WeightBackwardArgs<S> b;
+        b.forward = read_weights<S>(in, poses, count, threads, whole, real);
+        b.grad_visible_sum = in.next<const S>(), b.grad_total = in.next<const S>();
+        b.means = in.next<S>(), b.quats = in.next<S>(), b.scales = in.next<S>(), b.opacities = in.next<S>();
+        b.extinctions = in.next<S>();
+        kernels<S>().weights_backward(b);
+    });
+}
+
+void matrix(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        MatrixArgs<S> a;
+        a.plan = read_plan<S>(in, poses, count, whole[0]);
+        a.model = read_model<S>(in);
+        a.lens = lens_from<S>(whole, real);
+        a.threads = threads;
+        a.starts = in.next<int64_t>(), a.columns = in.next<int32_t>(), a.values = in.next<S>();
+        kernels<S>().matrix(a);
+    });
+}
+
+}  // namespace
+
+NB_MODULE(_native, module) {
+    module.doc() = "GSpaRC CPU kernels; see native.py for their arguments";
+    module.attr("RECORD") = kRecord;
+    module.attr("MOMENTS") = kMoments;
+    module.attr("STRIP_ROWS") = kStripRows;
+    module.def("plan", &plan);
+    module.def("entries", &entries);
+    module.def("composite", &composite);
+    module.def("composite_backward", &composite_backward);
+    module.def("weights", &weights);
+    module.def("weights_backward", &weights_backward);
+    module.def("matrix", &matrix);
+    module.def("instruction_set", &instruction_set);
+    module.def("use_instruction_set", &use_instruction_set);
+}

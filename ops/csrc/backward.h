@@ -1,0 +1,243 @@
+// Gradients, front to back with the forward's own recurrence: what lies behind a layer is the total less what
+// came before it, so nothing is divided but 1 / (1 - gamma) <= 100. Each strip leaves its sums in slots of its
+// own; they are added per Gaussian in strip order, whoever computed them.
+#pragma once
+#include "forward.h"
+#include "project.h"
+
+namespace gsparc {
+namespace GSPARC_ISA {
+
+// The sums of Moments over blocks of lanes.
+template <class S, bool kTangent, bool kHides> struct MomentSums {
+    Vec<S> tau1{}, tau2{}, h1{}, h2{}, tau11{}, tau12{}, tau22{}, emits{}, hides{};
+
+    // d_alpha, d_gamma: loss by emitted and hidden share; without kHides the first holds both.
+    GSPARC_INLINE void add(const Layer<S, kHides>& layer, Mask<S> counts, Vec<S> d_alpha, Vec<S> d_gamma, Vec<S> t1, Vec<S> t2,
+                           Vec<S> form, Vec<S> alpha_max) {
+        const Vec<S> none = splat(S(0)), shape = select(counts, layer.shape, none);
+        d_alpha = select(counts & at_most(layer.emits, alpha_max), d_alpha, none);
+        emits = fma(d_alpha, shape, emits);
+        Vec<S> e = d_alpha * layer.alpha;
+        if (kHides) {
+            d_gamma = select(counts & at_most(layer.hides, alpha_max), d_gamma, none);
+            hides = fma(d_gamma, shape, hides);
+            e = fma(d_gamma, layer.gamma, e);
+        }
+        t1 = select(counts, t1, none), t2 = select(counts, t2, none);
+        const Vec<S> e1 = e * t1, e2 = e * t2;
+        tau1 += e1, tau2 += e2;
+        tau11 = fma(e1, t1, tau11), tau12 = fma(e1, t2, tau12), tau22 = fma(e2, t2, tau22);
+        if (kTangent) {
+            form = select(counts, form, none);
+            h1 = fma(form, e1, h1), h2 = fma(form, e2, h2);
+        }
+    }
+    void write(S* to) const {
+        const Vec<S> all[kMoments] = {tau1, tau2, h1, h2, tau11, tau12, tau22, emits, hides};
+        for (int k = 0; k < kMoments; ++k) to[k] = sum<S>(all[k]);
+    }
+};
+
+template <class S> struct StripScratch {
+    S *before, *behind, *planes;  // transmittance, what is still to come, upstream gradient per channel
+};
+
+template <class S, bool kTangent, bool kHides>
+void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>& ranked, const Tables<S>& tables, int task,
+                              StripScratch<S> mine, Vec<S>* feature_sums, S* moments, S* feature_slots) {
+    const CompositeArgs<S>& a = b.forward;
+    const Strip<S> strip(a.plan, a.lens.height, task);
+    const int stride = padded(a.lens.width), area = kStripRows * stride, k_count = ranked.width - 2;
+    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max);
+    const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
+    fill(mine.before, area, S(1));
+    fill(mine.behind, area, S(0));
+    fill(mine.planes, int64_t(area) * k_count, S(0));
+    for (int row = strip.row0; row < strip.row1; ++row) {
+        const int64_t to = (row - strip.row0) * stride, from = int64_t(row) * a.lens.width;
+        for (int k = 0; k < k_count; ++k) {
+            const int64_t plane = (int64_t(strip.pose) * k_count + k) * pixels + from;
+            S *g = mine.planes + int64_t(k) * area + to, *behind = mine.behind + to;
+            for (int j = 0; j < a.lens.width; ++j) g[j] = b.grad_image[plane + j], behind[j] += g[j] * a.image[plane + j];
+        }
+        if (b.grad_transmittance)
+            for (int j = 0; j < a.lens.width; ++j)
+                mine.behind[to + j] += b.grad_transmittance[strip.pose * pixels + from + j] * a.transmittance[strip.pose * pixels + from + j];
+    }
+    for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
+        if ((entry - strip.first) % 64 == 63 && !any_lit(mine.before, area, a.lens.transmittance_min)) break;
+        const S* row = ranked.of(a.plan, strip.pose, *entry);
+        const S opacity = row[0], extinction = row[1];
+        MomentSums<S, kTangent, kHides> sums;
+        for (int k = 0; k < k_count; ++k) feature_sums[k] = splat(S(0));
+        each_block<S, kTangent>(strip, *entry, tables, a.lens, stride, [&](int at, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+            const Vec<S> light = load(mine.before + at);
+            const Mask<S> counts = inside & at_most(floor, light);
+            if (!any(counts)) return;
+            const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
+            const Vec<S> weight = light * layer.alpha, through = S(1) - layer.gamma;
+            Vec<S> gain = splat(S(0));
+            const S* plane = mine.planes + at;
+            for (int k = 0; k < k_count; ++k, plane += area) {
+                const Vec<S> g = load(plane);
+                gain = fma(splat(row[2 + k]), g, gain);
+                feature_sums[k] = fma(weight, g, feature_sums[k]);
+            }
+            const Vec<S> behind = load(mine.behind + at) - weight * gain;
+            store(mine.behind + at, behind);
+            store(mine.before + at, light * through);
+            const Vec<S> d_gamma = -behind / through;
+            sums.add(layer, counts, kHides ? light * gain : fma(light, gain, d_gamma), d_gamma, t1, t2, form, alpha_max);
+        });
+        const int64_t slot = strip.slot(*entry);
+        sums.write(moments + slot * kMoments);
+        for (int k = 0; k < k_count; ++k) feature_slots[slot * k_count + k] = sum<S>(feature_sums[k]);
+    }
+}
+
+// Adds the slots of each Gaussian and chains them into its parameters; poses are added in order.
+template <class S>
+void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, int threads, const S* moments, S* means, S* quats,
+           S* scales, S* opacities, S* extinctions, S* screen) {
+    Buffer<int32_t> rank_of(int64_t(plan.poses) * plan.count);
+    auto invert = [&](int pose, int) {
+        const int64_t base = int64_t(pose) * plan.count;
+        for (int rank = 0; rank < plan.count; ++rank) rank_of[base + plan.order[base + rank]] = rank;
+    };
+    parallel_for(plan.poses, threads, invert);
+    constexpr int chunk = 256;
+    auto run = [&](int task, int) {
+        const int64_t end = int64_t(task + 1) * chunk < plan.count ? int64_t(task + 1) * chunk : plan.count;
+        for (int64_t i = int64_t(task) * chunk; i < end; ++i) {
+            Gradients<S> total{};
+            const Gaussian<S> g = gaussian(model, i);
+            const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : S(0);
+            for (int pose = 0; pose < plan.poses; ++pose) {
+                const int rank = rank_of[int64_t(pose) * plan.count + i];
+                const int64_t* slots = plan.slots + int64_t(pose) * (plan.count + 1) + rank;
+                S* shift = screen ? screen + 2 * (int64_t(pose) * plan.count + i) : nullptr;
+                if (shift) shift[0] = shift[1] = 0;
+                if (slots[0] == slots[1]) continue;
+                S m[kMoments] = {};
+                for (int64_t slot = slots[0]; slot < slots[1]; ++slot)
+                    for (int k = 0; k < kMoments; ++k) m[k] += moments[slot * kMoments + k];
+                const S* rotation = model.rotations + 9 * pose;
+                const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, lens);
+                const Moments<S> sums = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
+                const Gradients<S> one = project_backward(f, sums, opacity, extinction, rotation, lens);
+                for (int k = 0; k < 3; ++k) total.mean[k] += one.mean[k], total.scale[k] += one.scale[k];
+                for (int k = 0; k < 4; ++k) total.quat[k] += one.quat[k];
+                total.opacity += one.opacity, total.extinction += one.extinction;
+                if (shift) shift[0] = one.screen[0], shift[1] = one.screen[1];
+            }
+            memcpy(means + 3 * i, total.mean, sizeof total.mean);
+            memcpy(quats + 4 * i, total.quat, sizeof total.quat);
+            memcpy(scales + 3 * i, total.scale, sizeof total.scale);
+            opacities[i] = total.opacity;
+            if (extinctions) extinctions[i] = total.extinction;
+        }
+    };
+    parallel_for((plan.count + chunk - 1) / chunk, threads, run);
+}
+
+template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
+    const CompositeArgs<S>& a = b.forward;
+    const PlanView<S>& plan = a.plan;
+    const GridTables<S> grid(a.lens);
+    const Ranked<S> ranked(plan, a.model, a.features, a.samples, a.channels, a.threads);
+    const int k_count = ranked.width - 2;
+    const int64_t area = int64_t(kStripRows) * padded(a.lens.width), scratch = area * (2 + k_count) + int64_t(k_count + 2) * kLanes;
+    const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
+    Buffer<S> memory(scratch * a.threads), moments(entries * kMoments), feature_slots(entries * k_count);
+    auto strip = [&](int task, int worker) {
+        S* mine = memory.data + worker * scratch;
+        // The accumulators are vectors: align them.
+        char* tail = reinterpret_cast<char*>(mine + area * (2 + k_count));
+        Vec<S>* sums = reinterpret_cast<Vec<S>*>((reinterpret_cast<uintptr_t>(tail) + sizeof(Vec<S>) - 1) / sizeof(Vec<S>) * sizeof(Vec<S>));
+        const bool hides = a.model.extinctions != nullptr;
+        const auto run = a.lens.tangent ? (hides ? composite_backward_strip<S, true, true> : composite_backward_strip<S, true, false>)
+                                        : (hides ? composite_backward_strip<S, false, true> : composite_backward_strip<S, false, false>);
+        run(b, ranked, grid.tables, task, {mine, mine + area, mine + 2 * area}, sums, moments.data, feature_slots.data);
+    };
+    parallel_for(plan.poses * plan.strips, a.threads, strip);
+
+    constexpr int chunk = 256;
+    const int chunks = (plan.count + chunk - 1) / chunk;
+    auto gather = [&](int task, int) {
+        const int pose = task / chunks, begin = task % chunks * chunk, end = begin + chunk < plan.count ? begin + chunk : plan.count;
+        const int64_t* slots = plan.slots + int64_t(pose) * (plan.count + 1);
+        const int first = plan.poses == 1 ? 0 : pose;
+        for (int rank = begin; rank < end; ++rank) {
+            const int64_t i = plan.order[int64_t(pose) * plan.count + rank];
+            for (int k = 0; k < k_count; ++k) {
+                S total = 0;
+                for (int64_t slot = slots[rank]; slot < slots[rank + 1]; ++slot) total += feature_slots[slot * k_count + k];
+                b.features[(int64_t(first + k / a.channels) * plan.count + i) * a.channels + k % a.channels] = total;
+            }
+        }
+    };
+    if (k_count > 0) parallel_for(plan.poses * chunks, a.threads, gather);
+    chain(plan, a.model, a.lens, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, b.screen);
+}
+
+template <class S, bool kTangent, bool kHides>
+void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Ranked<S>& ranked, const Tables<S>& tables, int task, S* before,
+                          S* behind, S* moments) {
+    const WeightArgs<S>& a = b.forward;
+    const Strip<S> strip(a.plan, a.lens.height, task);
+    const int stride = padded(a.lens.width), area = kStripRows * stride;
+    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
+    fill(before, area, S(1));
+    fill(behind, area, S(0));
+    for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
+        for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
+            const S* row = ranked.of(a.plan, strip.pose, *entry);
+            const S opacity = row[0], extinction = row[1];
+            const Vec<S> per_seen = splat(row[2]), per_alpha = splat(row[3]);
+            MomentSums<S, kTangent, kHides> sums;
+            each_block<S, kTangent>(strip, *entry, tables, a.lens, stride, [&](int at, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+                const Vec<S> light = load(before + at);
+                const Mask<S> lit = at_most(floor, light);
+                const Layer<S, kHides> layer(form, inside, opacity, extinction, alpha_max);
+                const Vec<S> gain = select(lit, per_seen, none), through = S(1) - layer.gamma;
+                const Vec<S> part = light * layer.alpha * gain;
+                store(before + at, select(lit, light * through, light));
+                if (pass == 0) {
+                    store(behind + at, load(behind + at) + part);
+                    return;
+                }
+                const Vec<S> rest = load(behind + at) - part;
+                store(behind + at, rest);
+                const Vec<S> d_alpha = fma(light, gain, per_alpha), d_gamma = select(lit, -rest / through, none);
+                sums.add(layer, inside, kHides ? d_alpha : d_alpha + d_gamma, d_gamma, t1, t2, form, alpha_max);
+            });
+            if (pass == 1) sums.write(moments + strip.slot(*entry) * kMoments);
+        }
+        fill(before, area, S(1));
+    }
+}
+
+template <class S> void weights_backward(const WeightBackwardArgs<S>& b) {
+    const WeightArgs<S>& a = b.forward;
+    const PlanView<S>& plan = a.plan;
+    const GridTables<S> grid(a.lens);
+    const int64_t all = int64_t(plan.poses) * plan.count;
+    Buffer<S> upstream(2 * all);
+    for (int64_t i = 0; i < all; ++i) upstream[2 * i] = b.grad_visible_sum[i], upstream[2 * i + 1] = b.grad_total[i];
+    const Ranked<S> ranked(plan, a.model, upstream.data, 1, 2, a.threads);
+    const int64_t area = int64_t(kStripRows) * padded(a.lens.width);
+    Buffer<S> memory(2 * area * a.threads), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
+    auto strip = [&](int task, int worker) {
+        S* mine = memory.data + 2 * area * worker;
+        const bool hides = a.model.extinctions != nullptr;
+        const auto run = a.lens.tangent ? (hides ? weigh_backward_strip<S, true, true> : weigh_backward_strip<S, true, false>)
+                                        : (hides ? weigh_backward_strip<S, false, true> : weigh_backward_strip<S, false, false>);
+        run(b, ranked, grid.tables, task, mine, mine + area, moments.data);
+    };
+    parallel_for(plan.poses * plan.strips, a.threads, strip);
+    chain(plan, a.model, a.lens, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, static_cast<S*>(nullptr));
+}
+
+}  // namespace GSPARC_ISA
+}  // namespace gsparc

@@ -1,0 +1,74 @@
+// Picks the fastest set of kernels this machine can run.
+#include <string.h>
+
+#include "kernels.h"
+
+namespace gsparc {
+
+namespace baseline {
+extern const Kernels<float> single_kernels;
+extern const Kernels<double> double_kernels;
+}  // namespace baseline
+#ifdef GSPARC_X86
+namespace avx2 {
+extern const Kernels<float> single_kernels;
+extern const Kernels<double> double_kernels;
+}  // namespace avx2
+namespace avx512 {
+extern const Kernels<float> single_kernels;
+extern const Kernels<double> double_kernels;
+}  // namespace avx512
+#endif
+
+namespace {
+
+struct Set {
+    const char* name;
+    const Kernels<float>& single;
+    const Kernels<double>& twice;
+};
+
+const Set kSets[] = {
+#ifdef GSPARC_X86
+    {"avx512", avx512::single_kernels, avx512::double_kernels},
+    {"avx2", avx2::single_kernels, avx2::double_kernels},
+#endif
+    {"baseline", baseline::single_kernels, baseline::double_kernels},
+};
+constexpr int kCount = sizeof kSets / sizeof kSets[0];
+
+bool runs(const char* name) {
+#ifdef GSPARC_X86
+    __builtin_cpu_init();
+    if (!strcmp(name, "avx512"))
+        return __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") &&
+               __builtin_cpu_supports("avx512vl") && __builtin_cpu_supports("avx512bw");
+    if (!strcmp(name, "avx2")) return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma");
+#endif
+    return !strcmp(name, "baseline");
+}
+
+int fastest() {
+    int best = 0;
+    while (!runs(kSets[best].name)) ++best;
+    return best;
+}
+
+int& choice() {
+    static int index = fastest();
+    return index;
+}
+
+}  // namespace
+
+template <> const Kernels<float>& kernels<float>() { return kSets[choice()].single; }
+template <> const Kernels<double>& kernels<double>() { return kSets[choice()].twice; }
+const char* instruction_set() { return kSets[choice()].name; }
+
+bool use_instruction_set(const char* name) {
+    for (int k = 0; k < kCount; ++k)
+        if (!strcmp(kSets[k].name, name) && runs(name)) return choice() = k, true;
+    return false;
+}
+
+}  // namespace gsparc

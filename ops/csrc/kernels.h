@@ -1,0 +1,70 @@
+// What one instruction set offers; kernels.cpp implements it once per set, dispatch.cpp picks one at run time.
+#pragma once
+#include "layout.h"
+
+namespace gsparc {
+
+template <class S> struct ProjectArgs {
+    Model<S> model;                 // opacities here: the larger of opacity and extinction
+    int count;
+    Lens<S> lens;
+    S *records, *depths, *means2d, *radii;  // (N, kRecord), (N,), (N, 2), (N,)
+    Box* boxes;                     // (N,), rows empty where culled
+    bool* visible;                  // (N,)
+    int pose;
+};
+
+template <class S> struct CompositeArgs {
+    PlanView<S> plan;
+    Model<S> model;
+    Lens<S> lens;
+    int samples, channels, threads;
+    const S* features;              // (B, N, C)
+    S *image, *transmittance;       // (B, C, H, W), (P, H, W)
+};
+
+template <class S> struct CompositeBackwardArgs {
+    CompositeArgs<S> forward;
+    const S *grad_image, *grad_transmittance;    // as above; the second may be null
+    S *means, *quats, *scales, *opacities, *extinctions, *features, *screen;  // gradients; screen (P, N, 2)
+};
+
+template <class S> struct WeightArgs {
+    PlanView<S> plan;
+    Model<S> model;
+    Lens<S> lens;
+    int threads;
+    S *visible_sum, *total;         // (P, N): sums over pixels of alpha T and alpha
+};
+
+template <class S> struct WeightBackwardArgs {
+    WeightArgs<S> forward;
+    const S *grad_visible_sum, *grad_total;      // (P, N)
+    S *means, *quats, *scales, *opacities, *extinctions;
+};
+
+template <class S> struct MatrixArgs {
+    PlanView<S> plan;
+    Model<S> model;
+    Lens<S> lens;
+    int threads;
+    int64_t* starts;                // (H W + 1), counted first, then given back to be filled
+    int32_t* columns;               // (nnz), null while counting
+    S* values;
+};
+
+// Returns -1, or 4 * Gaussian + (0 means, 1 quats, 2 scales, 3 opacities) for the first that is not sound.
+template <class S> struct Kernels {
+    int64_t (*project)(const ProjectArgs<S>&, int begin, int end);
+    void (*composite)(const CompositeArgs<S>&);
+    void (*composite_backward)(const CompositeBackwardArgs<S>&);
+    void (*weights)(const WeightArgs<S>&);
+    void (*weights_backward)(const WeightBackwardArgs<S>&);
+    void (*matrix)(const MatrixArgs<S>&);
+};
+
+template <class S> const Kernels<S>& kernels();  // the fastest set this machine has
+const char* instruction_set();
+bool use_instruction_set(const char* name);  // for tests; false if this machine or build lacks it
+
+}  // namespace gsparc

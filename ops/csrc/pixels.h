@@ -1,0 +1,89 @@
+// One footprint on one row of pixels: standardised offsets for a block of lanes. A record holds
+//   tangent:  f1 (3), f2 (3), n (3), reach^2, gain    with tau_i = f_i . u / n . u for a pixel direction u
+//   equirect: column, row, sqrt(A), rho, sqrt(B), -, -, -, -, reach^2, gain
+#pragma once
+#include "footprint.h"
+#include "simd.h"
+
+namespace gsparc {
+namespace GSPARC_ISA {
+
+constexpr int kReach = 9, kGain = 10;
+
+template <class S> inline void write_record(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens, S* out) {
+    if (lens.tangent) {
+        for (int k = 0; k < 3; ++k) {
+            out[k] = f.root_a * (f.e1[k] - f.rho * f.e2[k]) * f.stretch2;
+            out[3 + k] = f.root_b * f.e2[k] * f.stretch2;
+            out[6 + k] = f.n[k];
+        }
+    } else {
+        out[0] = column, out[1] = row, out[2] = f.root_a, out[3] = f.rho, out[4] = f.root_b;
+        for (int k = 5; k < 9; ++k) out[k] = 0;
+    }
+    out[kReach] = reach, out[kGain] = f.gain, out[11] = 0;
+}
+
+// Per-column and per-row numbers of a grid. Columns are padded with NaN: a lane past the edge passes no test.
+template <class S> struct Tables {
+    const S *cos_column, *sin_column, *column;  // (width + kLanes)
+    const S *cos_row, *sin_row;                 // (height)
+    S turn, per_turn;                           // columns in a full circle and its inverse
+};
+
+template <class S, bool kTangent> struct RowView;
+
+template <class S> struct RowView<S, true> {
+    Vec<S> x1, y1, z1, x2, y2, z2, xn, yn, zn, reach, horizon;
+    const Tables<S>& table;
+
+    GSPARC_INLINE RowView(const S* r, int row, const Tables<S>& t, const Lens<S>& lens) : table(t) {
+        const S c = t.cos_row[row], s = t.sin_row[row];
+        x1 = splat(r[0] * c), y1 = splat(r[1] * c), z1 = splat(r[2] * s);
+        x2 = splat(r[3] * c), y2 = splat(r[4] * c), z2 = splat(r[5] * s);
+        xn = splat(r[6] * c), yn = splat(r[7] * c), zn = splat(r[8] * s);
+        reach = splat(r[kReach]), horizon = splat(lens.horizon_cosine);
+    }
+    // Standardised offsets and their squared length; false if no lane lies inside the footprint.
+    GSPARC_INLINE bool offsets(int column, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
+        const Vec<S> c = load(table.cos_column + column), s = load(table.sin_column + column);
+        const Vec<S> a = fma(x1, c, fma(y1, s, z1)), b = fma(x2, c, fma(y2, s, z2)), d = fma(xn, c, fma(yn, s, zn));
+        inside = at_most(fma(a, a, b * b), reach * (d * d)) & at_most(horizon, d);
+        if (!any(inside)) return false;
+        const Vec<S> inverse = S(1) / d;
+        tau1 = a * inverse, tau2 = b * inverse, form = fma(tau1, tau1, tau2 * tau2);
+        return true;
+    }
+};
+
+template <class S> struct RowView<S, false> {
+    Vec<S> center, root_a, shift, tau2_row, square2, reach, turn, per_turn;
+    const Tables<S>& table;
+
+    GSPARC_INLINE RowView(const S* r, int row, const Tables<S>& t, const Lens<S>&) : table(t) {
+        const S q = S(row) - r[1];
+        center = splat(r[0]), root_a = splat(r[2]), shift = splat(r[3] * q), tau2_row = splat(r[4] * q);
+        square2 = tau2_row * tau2_row, reach = splat(r[kReach]), turn = splat(t.turn), per_turn = splat(t.per_turn);
+    }
+    GSPARC_INLINE bool offsets(int column, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
+        const Vec<S> away = load(table.column + column) - center;
+        const Vec<S> p = away - turn * nearest(away * per_turn);  // the nearest image of this column
+        tau1 = root_a * (p - shift), tau2 = tau2_row, form = fma(tau1, tau1, square2);
+        inside = at_most(form, reach);
+        return any(inside);
+    }
+};
+
+// A footprint's columns as at most two runs [from, to) of the row; each pixel occurs once, also when blocks of
+// lanes overhang, because a box within kLanes of the full circle was widened to it.
+struct Runs {
+    int from[2], to[2], count;
+};
+GSPARC_INLINE Runs runs_of(const Box& box, int width) {
+    const int end = box.column0 + box.columns;
+    if (end <= width) return {{box.column0, 0}, {end, 0}, 1};
+    return {{box.column0, 0}, {width, end - width}, 2};
+}
+
+}  // namespace GSPARC_ISA
+}  // namespace gsparc

@@ -1,0 +1,122 @@
+// Lanes of pixels. One width per instruction set; each translation unit sees exactly one of the three branches.
+#pragma once
+#include <stdint.h>
+#if defined(__AVX512F__) || defined(__AVX2__)
+#include <immintrin.h>
+#endif
+
+#ifndef GSPARC_ISA
+#define GSPARC_ISA baseline
+#endif
+
+namespace gsparc {
+namespace GSPARC_ISA {
+
+#if defined(__AVX512F__)
+constexpr int kBytes = 64;
+#elif defined(__AVX2__)
+constexpr int kBytes = 32;
+#else
+constexpr int kBytes = 16;
+#endif
+
+template <class S> struct Lanes;
+template <> struct Lanes<float> {
+    typedef float V __attribute__((vector_size(kBytes)));
+    typedef int32_t I __attribute__((vector_size(kBytes)));
+    static constexpr int n = kBytes / 4;
+};
+template <> struct Lanes<double> {
+    typedef double V __attribute__((vector_size(kBytes)));
+    typedef int64_t I __attribute__((vector_size(kBytes)));
+    static constexpr int n = kBytes / 8;
+};
+template <class S> using Vec = typename Lanes<S>::V;
+template <class S> using Int = typename Lanes<S>::I;
+
+#define GSPARC_INLINE inline __attribute__((always_inline))
+
+template <class S> GSPARC_INLINE Vec<S> splat(S x) { return Vec<S>{} + x; }
+template <class S> GSPARC_INLINE Vec<S> load(const S* p) {
+    Vec<S> v;
+    __builtin_memcpy(&v, p, sizeof v);
+    return v;
+}
+template <class S> GSPARC_INLINE void store(S* p, Vec<S> v) { __builtin_memcpy(p, &v, sizeof v); }
+
+// Masks, and fused multiply-add where the machine has it: always the same instruction in forward and backward,
+// because the compiler may not contract on its own (-ffp-contract=off).
+#if defined(__AVX512F__)
+template <class S> struct MaskOf;
+template <> struct MaskOf<float> { typedef __mmask16 M; };
+template <> struct MaskOf<double> { typedef __mmask8 M; };
+template <class S> using Mask = typename MaskOf<S>::M;
+GSPARC_INLINE __mmask16 at_most(Vec<float> a, Vec<float> b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
+GSPARC_INLINE __mmask8 at_most(Vec<double> a, Vec<double> b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LE_OQ); }
+GSPARC_INLINE Vec<float> select(__mmask16 m, Vec<float> a, Vec<float> b) { return (Vec<float>)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
+GSPARC_INLINE Vec<double> select(__mmask8 m, Vec<double> a, Vec<double> b) { return (Vec<double>)_mm512_mask_blend_pd(m, (__m512d)b, (__m512d)a); }
+template <class M> GSPARC_INLINE bool any(M m) { return m != 0; }
+GSPARC_INLINE Vec<float> fma(Vec<float> a, Vec<float> b, Vec<float> c) { return (Vec<float>)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c); }
+GSPARC_INLINE Vec<double> fma(Vec<double> a, Vec<double> b, Vec<double> c) { return (Vec<double>)_mm512_fmadd_pd((__m512d)a, (__m512d)b, (__m512d)c); }
+#else
+template <class S> using Mask = Int<S>;
+GSPARC_INLINE Int<float> at_most(Vec<float> a, Vec<float> b) { return a <= b; }
+GSPARC_INLINE Int<double> at_most(Vec<double> a, Vec<double> b) { return a <= b; }
+GSPARC_INLINE Vec<float> select(Int<float> m, Vec<float> a, Vec<float> b) { return m ? a : b; }
+GSPARC_INLINE Vec<double> select(Int<double> m, Vec<double> a, Vec<double> b) { return m ? a : b; }
+#if defined(__AVX2__)
+GSPARC_INLINE bool any(Int<float> m) { return _mm256_movemask_ps((__m256)m) != 0; }
+GSPARC_INLINE bool any(Int<double> m) { return _mm256_movemask_pd((__m256d)m) != 0; }
+GSPARC_INLINE Vec<float> fma(Vec<float> a, Vec<float> b, Vec<float> c) { return (Vec<float>)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c); }
+GSPARC_INLINE Vec<double> fma(Vec<double> a, Vec<double> b, Vec<double> c) { return (Vec<double>)_mm256_fmadd_pd((__m256d)a, (__m256d)b, (__m256d)c); }
+#else
+template <class I> GSPARC_INLINE bool any(I m) {
+    auto set = m[0];
+    for (int i = 1; i < int(sizeof m / sizeof m[0]); ++i) set |= m[i];
+    return set != 0;
+}
+template <class V> GSPARC_INLINE V fma(V a, V b, V c) { return a * b + c; }
+#endif
+#endif
+
+template <class S> GSPARC_INLINE S sum(Vec<S> v) {
+    S lanes[Lanes<S>::n];
+    store(lanes, v);
+    for (int width = Lanes<S>::n / 2; width > 0; width /= 2)
+        for (int i = 0; i < width; ++i) lanes[i] += lanes[i + width];
+    return lanes[0];
+}
+template <class S> GSPARC_INLINE Vec<S> lesser(Vec<S> a, Vec<S> b) { return select(at_most(a, b), a, b); }
+template <class S> GSPARC_INLINE Vec<S> greater(Vec<S> a, Vec<S> b) { return select(at_most(a, b), b, a); }
+
+// Nearest integer, halves to even, for |x| < 2^22.
+GSPARC_INLINE Vec<float> nearest(Vec<float> x) { return (x + 12582912.0f) - 12582912.0f; }
+GSPARC_INLINE Vec<double> nearest(Vec<double> x) { return (x + 6755399441055744.0) - 6755399441055744.0; }
+
+// exp(x) for x <= 0, relative error below 4e-7 in float32 and 1e-15 in float64; flat below the normal numbers.
+GSPARC_INLINE Vec<float> exponential(Vec<float> x) {
+    x = greater<float>(x, splat(-87.0f));
+    const Vec<float> shifted = x * 1.44269504f + 12582912.0f, whole = shifted - 12582912.0f;
+    const Vec<float> r = fma(whole, splat(-1.42860677e-6f), fma(whole, splat(-0.693145752f), x));
+    Vec<float> p = splat(1.38888889e-3f);
+    p = fma(p, r, splat(8.33333333e-3f));
+    p = fma(p, r, splat(4.16666667e-2f));
+    p = fma(p, r, splat(0.166666667f));
+    p = fma(p, r, splat(0.5f));
+    p = fma(p, r, splat(1.0f));
+    p = fma(p, r, splat(1.0f));
+    return (Vec<float>)((Int<float>)p + ((Int<float>)shifted << 23));
+}
+GSPARC_INLINE Vec<double> exponential(Vec<double> x) {
+    x = greater<double>(x, splat(-700.0));
+    const Vec<double> shifted = x * 1.4426950408889634 + 6755399441055744.0, whole = shifted - 6755399441055744.0;
+    const Vec<double> r = fma(whole, splat(-1.9082149292705877e-10), fma(whole, splat(-0.69314718036912382), x));
+    Vec<double> p = splat(1.0 / 6227020800.0);
+    const double factors[] = {1.0 / 479001600, 1.0 / 39916800, 1.0 / 3628800, 1.0 / 362880, 1.0 / 40320,
+                              1.0 / 5040, 1.0 / 720, 1.0 / 120, 1.0 / 24, 1.0 / 6, 0.5, 1.0, 1.0};
+    for (int i = 0; i < 13; ++i) p = fma(p, r, splat(factors[i]));
+    return (Vec<double>)((Int<double>)p + ((Int<double>)shifted << 52));
+}
+
+}  // namespace GSPARC_ISA
+}  // namespace gsparc
