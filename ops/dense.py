@@ -82,7 +82,7 @@ def mean_weights(
 def pixel_weights(
     plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """The matrix alpha T of the only pose, pixels x Gaussians in depth order (H W, N), and that order (N,)."""
+    """The matrix alpha T of the only pose, pixels x Gaussians in depth order (H W, N), and that order."""
     still = torch.zeros_like(plan.means2d)
     weights, _, _ = _weights(plan, 0, means, quats, scales, opacities, extinctions, still)
     return weights.mT, plan.buffers[0][0]

@@ -83,7 +83,11 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
         int64_t total = 0;
         for (int64_t rank = 0; rank < count; ++rank) {
             slots[rank] = total;
-            if (rank >= a.shown[pose]) continue;
+            if (rank >= a.shown[pose]) {
+                a.boxes[base + rank] = {0, 0, 0, 0};
+                std::fill_n(a.records + (base + rank) * kRecord, kRecord, S(0));
+                continue;
+            }
             const int64_t i = base + a.order[base + rank];
             const Box box = boxes[i];
             a.boxes[base + rank] = box;
