@@ -1,0 +1,178 @@
+"""Checkpoints: what goes in comes out, and what should not come in stays out."""
+
+from __future__ import annotations
+
+import collections
+import os
+import pickle
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc import checkpoint
+from gsparc.checkpoint import CheckpointError
+from gsparc.peers.gp import GaussianProcess
+from gsparc.peers.idw import InverseDistance
+
+CONFIG = """
+model: {_target_: gsparc.peers.idw.InverseDistance, neighbours: 3, power: 1.0}
+seed: 4
+"""
+
+
+@pytest.fixture
+def fitted(campaign, folds, tmp_path):
+    data = campaign("spectrum", 30)
+    method = GaussianProcess()
+    method.fit(data, folds(30).folds[0], tmp_path)
+    return method, data.batch(folds(30).folds[0].test)
+
+
+def test_predictions_survive_bit_for_bit(fitted, tmp_path):
+    method, batch = fitted
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, stored = checkpoint.load(tmp_path / "m.ckpt")
+    before, after = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    assert torch.equal(before.mean, after.mean) and torch.equal(before.variance, after.variance)
+    assert stored.method == "gp" and stored.site.grid == method.site.grid
+    for name in ("origin", "box", "static_position", "rx_rotation"):
+        assert np.array_equal(getattr(stored.site, name), getattr(method.site, name))
+    assert stored.site.target_scale == method.site.target_scale and stored.site.array is None
+
+
+def test_the_stored_settings_are_used(campaign, folds, tmp_path):
+    data = campaign("rssi", 20)
+    method = InverseDistance(neighbours=3, power=1.0)
+    method.fit(data, folds(20).folds[0], tmp_path)
+    checkpoint.save(tmp_path / "m.ckpt", method, CONFIG)
+    again, stored = checkpoint.load(tmp_path / "m.ckpt")
+    assert (again.neighbours, again.power) == (3, 1.0) and stored.configuration["seed"] == 4
+
+
+def test_extra_keeps_its_shape(fitted, tmp_path):
+    named = collections.namedtuple("Named", "a b")
+    extra = {
+        "optimizer": {
+            "state": {0: {"step": torch.tensor(3.0)}},
+            "groups": [{"lr": 1e-3, "betas": (0.9, 0.99)}],
+        },
+        "rng": torch.get_rng_state(),
+        "numpy": np.arange(3, dtype=np.int64),
+        "scalar": np.float64(0.25),
+        "path": Path("a/b"),
+        "none": None,
+        "ordered": collections.OrderedDict(x=1),
+        "tuple": named(1, 2),
+    }
+    checkpoint.save(tmp_path / "m.ckpt", fitted[0], extra=extra)
+    back = checkpoint.read(tmp_path / "m.ckpt").extra
+    assert back["optimizer"]["groups"] == [{"lr": 1e-3, "betas": (0.9, 0.99)}]
+    assert back["optimizer"]["state"][0]["step"] == 3 and torch.equal(back["rng"], extra["rng"])
+    assert back["scalar"] == 0.25 and back["path"] == "a/b" and back["ordered"] == {"x": 1}
+    assert torch.equal(back["numpy"], torch.arange(3)) and back["tuple"] == (1, 2) and back["none"] is None
+
+
+def test_what_cannot_be_stored_is_named(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    before = path.read_bytes()
+    with pytest.raises(CheckpointError, match=re.escape("extra.a[1] is a object")):
+        checkpoint.save(path, fitted[0], extra={"a": [1, object()]})
+    assert path.read_bytes() == before
+    with pytest.raises(CheckpointError, match="not been fitted"):
+        checkpoint.save(path, GaussianProcess())
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(fitted, tmp_path, monkeypatch):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    before = path.read_bytes()
+
+    def full(content, file):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(OSError, match="No space"):
+        checkpoint.save(path, fitted[0])
+    assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["m.ckpt"]
+
+
+def test_a_view_does_not_drag_its_storage_along(fitted, tmp_path):
+    checkpoint.save(tmp_path / "small.ckpt", fitted[0])
+    checkpoint.save(tmp_path / "view.ckpt", fitted[0], extra={"row": torch.zeros(1_000_000)[:10]})
+    small, view = ((tmp_path / f"{name}.ckpt").stat().st_size for name in ("small", "view"))
+    assert view < small + 10_000
+
+
+class Hostile:
+    def __reduce__(self):
+        return os.system, (f"touch {self.mark}",)
+
+
+def test_hostile_pickle_is_refused_and_not_run(tmp_path):
+    thing = Hostile()
+    thing.mark = tmp_path / "owned"
+    torch.save({"format": checkpoint.FORMAT, "state": thing}, tmp_path / "m.ckpt")
+    with pytest.raises(CheckpointError, match="could run code"):
+        checkpoint.read(tmp_path / "m.ckpt")
+    (tmp_path / "p.ckpt").write_bytes(pickle.dumps(thing))
+    with pytest.raises(CheckpointError, match="not a gsparc checkpoint"):
+        checkpoint.read(tmp_path / "p.ckpt")
+    assert not (tmp_path / "owned").exists()
+
+
+def rewritten(path: Path, **changes) -> Path:
+    content = torch.load(path, weights_only=True)
+    content.update(changes)
+    torch.save(content, path)
+    return path
+
+
+def test_hostile_config_is_refused_and_not_run(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    mark = tmp_path / "owned"
+    rewritten(path, target="os.system", config=f"model: {{_target_: os.system, command: 'touch {mark}'}}")
+    with pytest.raises(CheckpointError, match="refused"):
+        checkpoint.load(path)
+    rewritten(path, target="os.system", config="")
+    with pytest.raises(CheckpointError, match="does not know"):
+        checkpoint.load(path)
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"schema_version": 99}, "schema 99"),
+        ({"schema_version": "1"}, "schema 1"),
+        ({"format": "other"}, "not a gsparc checkpoint"),
+        ({"site": {}}, "incomplete"),
+        ({"state": 3}, "incomplete"),
+    ],
+)
+def test_wrong_content_is_one_clear_line(fitted, tmp_path, changes, words):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    with pytest.raises(CheckpointError, match=words) as caught:
+        checkpoint.load(rewritten(path, **changes))
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_missing_and_damaged_files(fitted, tmp_path):
+    with pytest.raises(CheckpointError, match="no such checkpoint"):
+        checkpoint.read(tmp_path / "none.ckpt")
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    whole = path.read_bytes()
+    for cut in (0, 10, len(whole) // 2, len(whole) - 1):
+        path.write_bytes(whole[:cut])
+        with pytest.raises(CheckpointError):
+            checkpoint.load(path)
+    path.write_bytes(whole)
+    with pytest.raises(CheckpointError, match="cannot be restored"):
+        checkpoint.load(rewritten(path, state={"shape": [1]}))

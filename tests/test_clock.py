@@ -1,0 +1,32 @@
+"""The clock: turns, warm-up, budget, machine facts."""
+
+from __future__ import annotations
+
+import time
+
+from gsparc.clock import ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
+
+
+def test_contenders_take_turns_after_warming_up():
+    calls: list[tuple[str, int]] = []
+    contenders = {name: (lambda turn, name=name: calls.append((name, turn))) for name in "ab"}
+    times = interleaved(contenders, ClockSettings(rounds=3, warmup=1))
+    assert calls[2:] == [("a", 0), ("b", 0), ("a", 1), ("b", 1), ("a", 2), ("b", 2)]
+    assert {name: len(values) for name, values in times.items()} == {"a": 3, "b": 3}
+
+
+def test_budget_stops_rounds_but_not_below_the_least():
+    slow = {"slow": lambda turn: time.sleep(0.02)}
+    times = interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, budget_s=0.01))
+    assert len(times["slow"]) == 4 and (times["slow"] >= 20).all()
+
+
+def test_facts_are_numbers_and_words():
+    facts = {**machine_facts(), **peak_memory()}
+    assert facts["machine/threads"] >= 1 and facts["machine/load"] >= 0 and facts["machine/cpu"]
+    assert 10 < facts["memory/peak_mb"] < 1e6
+
+
+def test_reference_work_takes_time():
+    times = interleaved({"copy": reference_copy()}, ClockSettings(rounds=5))["copy"]
+    assert (times > 0.05).all()

@@ -1,0 +1,186 @@
+"""The harness: pooling, pairing, skill, cache, time beside every accuracy."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.baselines import BASELINES, baseline
+from gsparc.clock import ClockSettings
+from gsparc.evaluation import evaluate, paired_differences
+from gsparc.method import Method, Prediction
+from gsparc.peers.idw import InverseDistance
+from gsparc.peers.mean import Mean
+from gsparc.scoring import score
+from gsparc.summary import write_samples, write_summary
+
+QUICK = ClockSettings(rounds=3, least=2, warmup=1)
+
+
+def fit_all(make, data, split, path):
+    methods = [make() for _ in split.folds]
+    return methods, [
+        method.fit(data, fold, path).seconds for method, fold in zip(methods, split.folds, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
+def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
+    data, split = campaign(kind, 40), folds(40)
+    methods, seconds = fit_all(InverseDistance, data, split, tmp_path)
+    found = evaluate(methods, seconds, data, split, clock=QUICK)
+    facts = found.facts
+    own = {
+        "spectrum": {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "mse", "mae", "nmse"},
+        "csi": {"nmse", "nmse_scalar", "snr_db"},
+        "rssi": {"rmse_db", "mae_db", "nmse"},
+    }[kind]
+    for figure in own | {"skill"}:
+        assert f"test/{figure}" in facts
+        assert all(f"baseline/{name}/{figure}" in facts for name in BASELINES)
+    for name in BASELINES:
+        assert facts[f"baseline/{name}/train_s"] >= 0 and facts[f"baseline/{name}/render_ms_p50"] > 0
+    for key in (
+        "paired/gp/nmse", "paired/gp/nmse_se", "time/train_s", "time/render_ms_p50", "time/render_ms_p95",
+        "time/render_ms_batch64", "time/ratio_to_copy", "time/includes", "machine/threads", "machine/load",
+        "machine/cpu", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
+        "dataset/sha256",
+        "dataset/stand_in", "dataset/convergence_error", "split/name", "split/sha256",
+    ):  # fmt: skip
+        assert key in facts, key
+    assert facts["time/render_ms_p95"] >= facts["time/render_ms_p50"] > 0
+    write_summary(tmp_path / "summary.json", facts)
+    write_samples(tmp_path / "per_sample.csv", found.columns)
+    assert len((tmp_path / "per_sample.csv").read_text().splitlines()) == 1 + len(split.folds[0].test)
+
+
+def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
+    data, split = campaign("spectrum", 40), folds(40)
+    methods, seconds = fit_all(InverseDistance, data, split, tmp_path)
+    facts = evaluate(methods, seconds, data, split, clock=QUICK).facts
+    for figure in ("ssim", "ssim_gauss", "psnr_db", "skill"):
+        assert facts[f"test/{figure}"] == facts[f"baseline/idw/{figure}"]
+    assert facts["baseline/nearest/skill"] == 0
+    assert facts["test/skill"] == pytest.approx(1 - facts["test/mse"] / facts["baseline/nearest/mse"])
+    for key in ("ssim_gauss", "psnr_db"):
+        assert facts[f"paired/gp/{key}"] == pytest.approx(facts[f"test/{key}"] - facts[f"baseline/gp/{key}"])
+
+
+def test_standard_error_of_paired_differences(campaign, folds, tmp_path):
+    data, split = campaign("csi", 40), folds(40)
+    own, other = (baseline(name, data, split).scores for name in ("idw", "gp"))
+    facts = paired_differences(own, other, "gp")
+    difference = own.samples["snr_db"] - other.samples["snr_db"]
+    assert facts["paired/gp/snr_db"] == pytest.approx(difference.mean())
+    assert facts["paired/gp/snr_db_se"] == pytest.approx(difference.std(ddof=1) / np.sqrt(len(difference)))
+    assert facts["paired/gp/nmse"] == pytest.approx(own.figures()["nmse"] - other.figures()["nmse"])
+    with pytest.raises(ValueError, match="different rows"):
+        paired_differences(own, dataclasses.replace(other, row=other.row + 1), "gp")
+
+
+def test_folds_are_pooled(campaign, folds, tmp_path):
+    data, split = campaign("spectrum", 45), folds(45, 5)
+    methods, seconds = fit_all(Mean, data, split, tmp_path)
+    scores = score(methods, data, split)
+    assert sorted(scores.row) == list(range(45)) and list(np.unique(scores.fold)) == [0, 1, 2, 3, 4]
+    first = score(methods[:1], data, dataclasses.replace(split, folds=split.folds[:1]))
+    assert np.array_equal(scores.samples["ssim"][:9], first.samples["ssim"])
+    facts = evaluate(methods, seconds, data, split, baselines=("nearest", "gp"), clock=QUICK).facts
+    assert facts["test/ssim"] == pytest.approx(scores.samples["ssim"].mean())
+    assert facts["split/folds"] == 5 and facts["test/samples"] == 45
+    assert facts["time/train_total_s"] == pytest.approx(5 * facts["time/train_s"])
+
+
+def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
+    data, split = campaign("spectrum", 40), folds(40)
+    methods, _ = fit_all(Mean, data, split, tmp_path)
+    facts = evaluate(methods, None, data, split, eval_on="train", baselines=("nearest",), clock=QUICK).facts
+    assert facts["train/samples"] == len(split.folds[0].train) and "test/ssim" not in facts
+    # The nearest training row is the row itself: its error is no bar.
+    assert facts["train/skill"] is None and facts["time/train_s"] is None
+    with pytest.raises(ValueError, match="eval_on='tset'"):
+        evaluate(methods, None, data, split, eval_on="tset", clock=QUICK)
+
+
+def test_wrong_counts_are_refused(campaign, folds, tmp_path):
+    data, split = campaign("spectrum", 40), folds(40, 2)
+    methods, seconds = fit_all(Mean, data, split, tmp_path)
+    with pytest.raises(ValueError, match="1 methods for the 2 folds"):
+        evaluate(methods[0], seconds[:1], data, split, clock=QUICK)
+    with pytest.raises(ValueError, match="1 training times for 2 methods"):
+        evaluate(methods, seconds[0], data, split, clock=QUICK)
+
+
+def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
+    data, split = campaign("spectrum", 40), folds(40)
+    (method,), _ = fit_all(Mean, data, split, tmp_path)
+    method.value[3] = torch.nan
+    with pytest.raises(ValueError, match="NaN or Inf"):
+        evaluate(method, None, data, split, clock=QUICK)
+
+
+def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatch):
+    data, split = campaign("csi", 40), folds(40, 2)
+    monkeypatch.setattr("gsparc.baselines.STORE_ABOVE_S", 0.0)
+    first = baseline("gp", data, split, cache=tmp_path)
+
+    def refuse(*arguments):
+        raise AssertionError("fitted again")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("gsparc.peers.gp.GaussianProcess.fit", refuse)
+        patch.setattr("gsparc.baselines.score", refuse)
+        second = baseline("gp", data, split, cache=tmp_path)
+    assert second.train_s == first.train_s
+    for name, values in first.scores.samples.items():
+        assert np.array_equal(second.scores.samples[name], values)
+    other = dataclasses.replace(data, site=dataclasses.replace(data.site, sha256="other"))
+    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="fitted again"):
+        patch.setattr("gsparc.peers.gp.GaussianProcess.fit", refuse)
+        baseline("gp", other, split, cache=tmp_path)
+
+
+def test_a_damaged_cache_is_made_anew(campaign, folds, tmp_path, monkeypatch, caplog):
+    data, split = campaign("csi", 40), folds(40)
+    monkeypatch.setattr("gsparc.baselines.STORE_ABOVE_S", 0.0)
+    first = baseline("gp", data, split, cache=tmp_path)
+    for path in tmp_path.rglob("*.*"):
+        path.write_bytes(b"rubbish")
+    again = baseline("gp", data, split, cache=tmp_path)
+    assert again.scores.figures() == first.scores.figures()
+    assert "made anew" in caplog.text
+
+
+class Remembering(Method):
+    """Keeps the rows it was asked about."""
+
+    name = "remembering"
+
+    def __init__(self, shape):
+        self.asked, self.shape = [], shape
+
+    def fit(self, data, fold, run_dir):
+        raise NotImplementedError
+
+    def predict(self, tx, rx):
+        self.asked.append(tx.clone())
+        return Prediction(torch.zeros(len(tx), *self.shape))
+
+    def state(self):
+        return {}
+
+    def restore(self, site, state):
+        raise NotImplementedError
+
+
+def test_only_the_chosen_rows_are_asked_about(campaign, folds):
+    data, split = campaign("spectrum", 40), folds(40)
+    method = Remembering((12, 24))
+    evaluate(method, None, data, split, eval_on="val", baselines=(), clock=QUICK)
+    allowed = torch.from_numpy(data.tx[split.folds[0].val]).float()
+    for asked in method.asked:
+        assert (torch.cdist(asked, allowed).min(1).values < 1e-6).all()
+    assert {len(asked) for asked in method.asked} == {3, 1, 64}

@@ -1,0 +1,110 @@
+"""gsparc.load: world coordinates in, the same kind of array out."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+import gsparc
+from gsparc import checkpoint
+from gsparc.peers.gp import GaussianProcess
+from gsparc.peers.mean import Mean
+from gsparc.registry import method_class
+
+
+def loaded(data, fold, path, name="gp"):
+    method = method_class(name)()
+    method.fit(data, fold, path)
+    checkpoint.save(path / f"{name}.ckpt", method)
+    return gsparc.load(path / f"{name}.ckpt")
+
+
+@pytest.fixture
+def spectra(campaign, folds, tmp_path):
+    data = campaign("spectrum", 40)
+    return data, loaded(data, folds(40).folds[0], tmp_path)
+
+
+def test_world_positions_many_and_one(spectra):
+    data, predictor = spectra
+    world = data.tx[:3] + data.site.origin
+    batch = data.batch(np.arange(3))
+    expected = predictor.method.predict(batch.tx, batch.rx)
+    many = predictor.spectrum(tx=world)
+    assert isinstance(many, np.ndarray) and many.shape == (3, 12, 24) and many.dtype == np.float32
+    assert np.allclose(many, expected.mean.numpy(), atol=1e-5)
+    one = predictor.spectrum(tx=torch.tensor(world[0]))
+    assert isinstance(one, torch.Tensor) and one.shape == (12, 24)
+    assert np.allclose(one.numpy(), many[0], atol=1e-6)
+    assert isinstance(predictor.spectrum(tx=world[0].tolist()), np.ndarray)
+    sure = predictor.confidence(tx=world)
+    assert sure.shape == (3,) and np.allclose(sure, expected.confidence.numpy(), atol=1e-4)
+    assert isinstance(predictor.confidence(tx=world[0]), float)
+
+
+def test_static_end_is_known_and_not_moved(spectra):
+    data, predictor = spectra
+    world, still = data.tx[:2] + data.site.origin, data.rx_position[0] + data.site.origin
+    with_pose = gsparc.Pose(torch.tensor(still), torch.eye(3, dtype=torch.float64))
+    for rx in (still, np.tile(still, (2, 1)), with_pose):
+        assert np.array_equal(np.asarray(predictor.spectrum(tx=world, rx=rx)), predictor.spectrum(tx=world))
+    with pytest.raises(ValueError, match="rx= differs from where it stood"):
+        predictor.spectrum(tx=world, rx=still + 1)
+
+
+def test_far_from_the_origin(campaign, folds, tmp_path):
+    near = campaign("spectrum", 40)
+    here = loaded(near, folds(40).folds[0], tmp_path)
+    shift = np.array([1e5, -2e5, 3e4])
+    predictor = gsparc.Predictor(
+        here.method, type(near.site)(**{**vars(near.site), "origin": near.site.origin + shift})
+    )
+    world = near.tx[:4] + near.site.origin
+    assert np.allclose(predictor.spectrum(tx=world + shift), here.spectrum(tx=world), atol=1e-5)
+
+
+def test_channels_in_physical_units_with_a_moving_receiver(campaign, folds, tmp_path):
+    data = campaign("csi", 40, "tx")
+    predictor = loaded(data, folds(40).folds[0], tmp_path, "nearest")
+    row = folds(40).folds[0].train[0]
+    found = predictor.csi(rx=data.rx_position[row] + data.site.origin)
+    assert found.shape == (4, 3) and found.dtype == np.complex64
+    assert np.allclose(found, data.target[row] * 2, atol=1e-5)  # target_scale
+    pose = gsparc.Pose(torch.tensor(data.rx_position[[row]] + data.site.origin), torch.eye(3).double()[None])
+    assert torch.allclose(predictor.csi(rx=pose), torch.from_numpy(found))
+
+
+def test_wrong_questions_get_clear_answers(spectra, campaign, folds, tmp_path):
+    data, predictor = spectra
+    here = data.site.origin
+    with pytest.raises(ValueError, match=r"predicts spectrum \(dataset toy\), not csi: call .spectrum"):
+        predictor.csi(tx=here)
+    with pytest.raises(ValueError, match="tx= is needed"):
+        predictor.spectrum()
+    with pytest.raises(ValueError, match="NaN or Inf in row 1"):
+        predictor.spectrum(tx=[here, here * np.nan])
+    for wrong in (here[:2], np.zeros((2, 2, 3)), np.zeros((0, 3))):
+        with pytest.raises(ValueError, match="shape"):
+            predictor.spectrum(tx=wrong)
+    with pytest.raises(ValueError, match="numbers"):
+        predictor.spectrum(tx="here")
+    with pytest.raises(ValueError, match="holds 2 positions, the other end 3"):
+        predictor.spectrum(tx=np.tile(here, (2, 1)), rx=np.tile(here, (3, 1)))
+    with pytest.raises(ValueError, match="mean has no confidence"):
+        loaded(data, folds(40).folds[0], tmp_path, Mean.name).confidence(tx=here)
+
+
+def test_importing_costs_nothing():
+    code = "import sys, gsparc; assert 'torch' not in sys.modules; gsparc.load; assert 'torch' in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    assert "load" in dir(gsparc)
+    with pytest.raises(AttributeError, match="lod"):
+        gsparc.lod  # noqa: B018
+
+
+def test_load_restores_the_class(spectra):
+    assert isinstance(spectra[1].method, GaussianProcess)

@@ -1,0 +1,52 @@
+"""Methods by name, and what a file may ask to build."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsparc.method import Method
+from gsparc.peers.gp import GaussianProcess
+from gsparc.registry import METHODS, build, method_class
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_every_name_is_a_method(name):
+    assert issubclass(method_class(name), Method)
+
+
+def test_a_typo_gets_the_nearest_name():
+    with pytest.raises(ValueError, match="did you mean 'nearest'"):
+        method_class("neareast")
+    with pytest.raises(ValueError, match="there are gp, gsparc, idw"):
+        method_class("xxxxxxxx")
+
+
+def test_a_config_becomes_a_method():
+    method = build({"_target_": "gsparc.peers.gp.GaussianProcess", "components": 7})
+    assert isinstance(method, GaussianProcess) and method.limit == 7
+    with pytest.raises(ValueError, match=r"not a gsparc\.method\.Method"):
+        build({"_target_": "pathlib.Path"})
+    with pytest.raises(ValueError, match="_target_"):
+        build({"components": 7})
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "gsparc.summary.os.system",
+        "gsparc.summary.write_summary",
+        "gsparc.nowhere.X",
+        3,
+        "builtins.eval",
+    ],
+)
+def test_text_from_a_file_builds_our_classes_only(target, tmp_path):
+    hostile = {
+        "_target_": "gsparc.peers.gp.GaussianProcess",
+        "components": {"_target_": target, "_args_": ["x"]},
+    }
+    for config in (hostile, {"_target_": target}, {**hostile, "components": [hostile["components"]]}):
+        with pytest.raises(ValueError, match="refused"):
+            build(config, trusted=False)
+    assert build({"_target_": "gsparc.peers.gp.GaussianProcess"}, trusted=False).limit > 0

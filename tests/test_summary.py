@@ -1,0 +1,80 @@
+"""What a run leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from rich.console import Console
+
+import gsparc.summary
+from gsparc.summary import provenance, results_table, write_samples, write_summary
+
+
+def test_numbers_strings_and_null(tmp_path):
+    facts = {"b": np.float32(0.5), "a": 3, "c": None, "d": "text", "e": torch.tensor(2.0), "f": True}
+    write_summary(tmp_path / "run" / "summary.json", facts)
+    text = (tmp_path / "run" / "summary.json").read_text()
+    assert json.loads(text) == {"a": 3, "b": 0.5, "c": None, "d": "text", "e": 2.0, "f": 1}
+    assert [p.name for p in (tmp_path / "run").iterdir()] == ["summary.json"]
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), np.float32("nan"), torch.tensor(-torch.inf)])
+def test_what_is_not_finite_is_refused_by_name(tmp_path, bad):
+    path = tmp_path / "summary.json"
+    write_summary(path, {"test/ssim": 0.5})
+    with pytest.raises(ValueError, match="test/psnr_db"):
+        write_summary(path, {"test/ssim": 0.6, "test/psnr_db": bad})
+    assert json.loads(path.read_text()) == {"test/ssim": 0.5}
+
+
+@pytest.mark.parametrize("bad", [[1], {"a": 1}, np.ones(2), 1j])
+def test_what_is_not_flat_is_refused_by_name(tmp_path, bad):
+    with pytest.raises(ValueError, match="model/effects"):
+        write_summary(tmp_path / "summary.json", {"model/effects": bad})
+
+
+def test_samples_become_rows(tmp_path):
+    write_samples(tmp_path / "s.csv", {"row": np.arange(2), "name": ["a", "b,c"], "ssim": [0.5, np.nan]})
+    rows = list(csv.reader((tmp_path / "s.csv").open(newline="")))
+    assert rows == [["row", "name", "ssim"], ["0", "a", "0.5"], ["1", "b,c", ""]]
+    with pytest.raises(ValueError, match="different lengths"):
+        write_samples(tmp_path / "s.csv", {"a": [1], "b": [1, 2]})
+
+
+def test_table_shows_no_accuracy_without_its_time():
+    facts = {
+        "test/ssim": 0.91234,
+        "test/psnr_db": 30.0,
+        "time/train_s": 123.0,
+        "time/render_ms_p50": 1.25,
+        "baseline/gp/ssim": 0.9,
+        "baseline/gp/train_s": 0.5,
+        "baseline/gp/render_ms_p50": 2.5,
+        "baseline/zero/ssim": 0.001,
+    }
+    console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
+    console.print(results_table(facts, "gsparc", "toy"))
+    lines = [line for line in console.export_text().splitlines() if "│" in line]
+    cells = [[cell.strip() for cell in line.strip("│ ").split("│")] for line in lines]
+    assert [row[0] for row in cells] == ["zero", "gp", "gsparc"]
+    assert cells[2] == ["gsparc", "0.9123", "-", "30.00", "-", "123", "1.25"]
+    assert cells[1][-2:] == ["0.5", "2.5"]
+
+
+def test_commit_is_known_inside_the_tree_only(tmp_path):
+    facts = provenance()
+    assert "torch" in facts["versions"] and "python 3" in facts["versions"]
+    outside = tmp_path / "summary.py"
+    shutil.copy(gsparc.summary.__file__, outside)
+    # Inside another project's repository an untracked copy must not claim that project's commit.
+    subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
+    code = f"import runpy; print(runpy.run_path({str(outside)!r})['provenance']()['git'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "None"
