@@ -108,7 +108,7 @@ def _store_scores(path: Path, scores: Scores) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, partial = tempfile.mkstemp(suffix=".npz", dir=path.parent)
     with os.fdopen(handle, "wb") as file:
-        np.savez(file, **scores.arrays())
+        np.savez(file, allow_pickle=False, **scores.arrays())
     os.replace(partial, path)
 
 

@@ -187,7 +187,9 @@ def _site_facts(site: Site) -> dict[str, Any]:
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
     known = {f.name for f in fields(Site)}
-    values = {k: v.numpy() if isinstance(v, Tensor) else v for k, v in facts.items() if k in known}
+    values: dict[str, Any] = {
+        k: v.numpy() if isinstance(v, Tensor) else v for k, v in facts.items() if k in known
+    }
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
     return Site(**values)

@@ -25,6 +25,10 @@ CONFIGS = "pkg://gsparc.conf"
 class _Failed(BaseException):
     """Carries an error past Hydra, which would add a line of its own."""
 
+    def __init__(self, error: Exception) -> None:
+        super().__init__(str(error))
+        self.error = error
+
 
 def run(task: Callable[[DictConfig], object], config: str) -> None:
     """Run `task` under Hydra with `conf/<config>.yaml` and the command line's overrides.
@@ -36,23 +40,24 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         task: called with the composed configuration.
         config: name of the primary configuration.
     """
-    wanted_full = os.environ.get(FULL_ERROR, "0") == "1"
+    before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     try:
         main()
-    except KeyboardInterrupt as error:
-        _say(str(error) or "interrupted")
+    except KeyboardInterrupt as interrupt:
+        _say(str(interrupt) or "interrupted")
         sys.exit(130)
     except (_Failed, Exception) as failure:
-        error = failure.__cause__ if isinstance(failure, _Failed) else failure
-        assert error is not None
-        if wanted_full:
+        error = failure.error if isinstance(failure, _Failed) else failure
+        if before == "1":
             raise error from error.__cause__
         _say(one_line(error))
         sys.exit(1)
     finally:
-        os.environ[FULL_ERROR] = "1" if wanted_full else "0"
+        os.environ.pop(FULL_ERROR)
+        if before is not None:
+            os.environ[FULL_ERROR] = before
 
 
 def one_line(error: BaseException) -> str:
@@ -100,7 +105,7 @@ def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], obje
             return task(config)
         except Exception as error:
             if HydraConfig.get().mode == RunMode.RUN:
-                raise _Failed from error
+                raise _Failed(error) from error
             raise  # in a sweep Hydra names the job that failed
 
     return wrapped

@@ -100,8 +100,9 @@ def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | 
 
 def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     """The folds the checkpoints were trained on: all of them in order, or those each file names."""
-    numbers = [one.extra.get("fold") for one in stored]
-    if None in numbers:
+    if all("fold" in one.extra for one in stored):
+        numbers = [int(one.extra["fold"]) for one in stored]
+    else:
         numbers = list(range(len(stored)))
         if len(stored) != len(split.folds):
             raise ValueError(

@@ -208,7 +208,8 @@ def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     `nmse` is each sample's share, |e|^2 / mean |h|^2: its mean is the global NMSE.
     """
-    values = {k: samples[k] for k in ("ssim", "ssim_gauss", "psnr_db", "snr_db", "mse") if k in samples}
+    direct = ("ssim", "ssim_gauss", "psnr_db", "snr_db", "mse")
+    values: dict[str, np.ndarray] = {name: samples[name] for name in direct if name in samples}
     if "error_db" in samples:
         values["mae_db"] = np.abs(samples["error_db"])
     error, power = samples.get("error_power", samples["mse"]), samples["target_power"]

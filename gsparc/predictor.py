@@ -72,21 +72,20 @@ class Predictor:
         """The prediction, whether one position was asked for, and whether torch was given."""
         given = rx.position if isinstance(rx, Pose) else rx
         places = {
-            end: None if value is None else _positions(end, value)
-            for end, value in (("tx", tx), ("rx", given))
+            end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
         }
         moving, static = self.site.moving_end, self.site.static_end
-        if places[moving] is None:
+        if moving not in places:
             raise ValueError(
                 f"{moving}= is needed: it is the end that moved when {self.site.name} was measured"
             )
-        single = all(p is None or p.ndim == 1 for p in places.values())
-        local = {end: None if p is None else np.atleast_2d(p) - self.site.origin for end, p in places.items()}
-        count = max(len(p) for p in local.values() if p is not None)
+        single = all(place.ndim == 1 for place in places.values())
+        local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
+        count = max(len(place) for place in local.values())
         for end, place in local.items():
-            if place is not None and len(place) not in (1, count):
+            if len(place) not in (1, count):
                 raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
-        ends = {moving: np.broadcast_to(local[moving], (count, 3)), static: self._static(local[static])}
+        ends = {moving: local[moving], static: self._static(local.get(static))}
         rotation = self._rotation(rx, count)
         if static == "rx" and rotation.ndim == 2:
             pose = Pose(_float(ends["rx"]), _float(rotation))

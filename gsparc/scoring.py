@@ -83,7 +83,8 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     for number, (method, fold) in enumerate(zip(methods, split.folds, strict=True)):
         rows = rows_of(fold, eval_on)
         metric = metrics_for(data.site.kind, data.site.target_scale)
-        confidence, variance = [], []
+        confidence: list[np.ndarray] = []
+        variance: list[np.ndarray] = []
         for start in range(0, len(rows), CHUNK):
             batch = data.batch(rows[start : start + CHUNK])
             prediction = method.predict(batch.tx, batch.rx)
