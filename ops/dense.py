@@ -79,13 +79,18 @@ def mean_weights(
     return torch.stack(averages), torch.stack(shares)
 
 
-def pixel_weights(
+def freeze(
     plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """The matrix alpha T of the only pose, pixels x Gaussians in depth order (H W, N), and that order."""
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
     still = torch.zeros_like(plan.means2d)
     weights, _, _ = _weights(plan, 0, means, quats, scales, opacities, extinctions, still)
-    return weights.mT, plan.buffers[0][0]
+    return plan.buffers[0][0], (weights,)
+
+
+def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
+    """Image (K, H, W) of features (N, K) in the order of `freeze`."""
+    return (features.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
 
 
 def _weights(plan, index, means, quats, scales, opacities, extinctions, means2d):

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.ops import backends
 from gsparc.ops.geometry import SphereGrid
 
 
@@ -16,20 +17,23 @@ class StalePlan(RuntimeError):
 
 @dataclass(frozen=True)
 class FrozenPlan:
-    """Compositing weights of one pose.
+    """Compositing weights of one pose, pixels by Gaussians.
 
     Attributes:
-        weights: (H W, V), sparse or dense; alpha times transmittance of the Gaussians in `order`.
-        order: (V,) rows of the features, the Gaussians that this receiver sees.
         grid: directions of the pixels.
+        backend: name of the backend that made it and renders it.
         version: the field's own counter at the time of freezing.
+        order: (V,) rows of the features, the Gaussians that this receiver sees.
+        buffers: the backend's sparse weights, alpha times transmittance.
     """
 
-    weights: Tensor
-    order: Tensor
     grid: SphereGrid
+    backend: str
     version: int
+    order: Tensor
+    buffers: tuple[Tensor, ...]
 
+    @torch.no_grad()
     def render(self, features: Tensor, version: int) -> Tensor:
         """Image (C, H, W) of features (N, C), or (B, C, H, W) of (B, N, C); not differentiable.
 
@@ -40,10 +44,10 @@ class FrozenPlan:
             raise StalePlan(
                 f"this view was frozen at version {self.version}, the field is at {version}: freeze again"
             )
-        batched = features.dim() == 3
-        batch = features if batched else features.unsqueeze(0)
+        batch = features if features.dim() == 3 else features.unsqueeze(0)
         samples, _, channels = batch.shape
-        with torch.no_grad():
-            columns = batch[:, self.order].permute(1, 0, 2).reshape(len(self.order), samples * channels)
-            image = (self.weights @ columns).mT.reshape(samples, channels, self.grid.height, self.grid.width)
-        return image if batched else image[0]
+        columns = (
+            batch.index_select(1, self.order).transpose(0, 1).reshape(len(self.order), samples * channels)
+        )
+        image = backends.named(self.backend).thaw(self.grid, self.buffers, columns)
+        return image.unflatten(0, (samples, channels)) if features.dim() == 3 else image

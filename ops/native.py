@@ -393,23 +393,47 @@ def mean_weights(
     return seen / (plan.grid.height * plan.grid.width), share
 
 
-def pixel_weights(
-    plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """The sparse matrix alpha T, pixels x visible Gaussians in depth order (H W, V), and that order (V,)."""
+def freeze(
+    plan: Plan,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Order (V,) of the visible Gaussians, and the weights alpha T as blocks of pixels; see frozen.h."""
     whole, real = _numbers(plan.grid, plan.optics)
-    pixels, shown = plan.grid.height * plan.grid.width, int(plan.buffers[3][0])
     model = _model(means, quats, scales, opacities, extinctions, plan.pose.position, plan.pose.rotation)
-    head = (means.dtype == torch.float64, 1, means.shape[0], torch.get_num_threads(), whole, real)
-    counts = torch.zeros(pixels, dtype=torch.int64)
-    _native.matrix(*head, _addresses(*plan.buffers, *model, counts, None, None))
-    starts = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
+    head = (means.dtype == torch.float64, means.shape[0], torch.get_num_threads(), whole, real)
+    counts = torch.zeros(_strips(plan.grid.height) + 1, dtype=torch.int64)
+    lanes = _native.freeze(*head, _addresses(*plan.buffers, *model, counts, None, None))
+    starts = counts.cumsum(0)
     size = int(starts[-1])
-    _check_memory(size, 4 + means.element_size())
-    columns, values = torch.empty(size, dtype=torch.int32), means.new_empty(size)
-    _native.matrix(*head, _addresses(*plan.buffers, *model, starts, columns, values))
-    matrix = torch.sparse_csr_tensor(starts.to(torch.int32), columns, values, size=(pixels, shown))
-    return matrix, plan.buffers[2][0, :shown].to(torch.int64)
+    _check_memory(size, 8 + lanes * means.element_size())
+    heads, weights = torch.empty(size, 2, dtype=torch.int32), means.new_empty(size, lanes)
+    if size > 0:
+        _native.freeze(*head, _addresses(*plan.buffers, *model, starts, heads, weights))
+    shown = int(plan.buffers[3][0])
+    return plan.buffers[2][0, :shown].to(torch.int64), (starts, heads, weights)
+
+
+def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
+    """Image (K, H, W) of features (V, K) in the order of `freeze`."""
+    if features.dtype != buffers[2].dtype:
+        raise TypeError(f"features are {features.dtype}, this view was frozen in {buffers[2].dtype}")
+    features = features.contiguous()
+    image = features.new_empty(features.shape[1], grid.height, grid.width)
+    _native.thaw(
+        *(
+            features.dtype == torch.float64,
+            grid.height,
+            grid.width,
+            features.shape[1],
+            torch.get_num_threads(),
+        ),
+        _addresses(*buffers, features, image),
+    )
+    return image
 
 
 def _model(means, quats, scales, opacities, extinctions, positions, rotations) -> list[Tensor | None]:

@@ -145,14 +145,12 @@ def freeze(
     version: int,
     extinctions: Tensor | None = None,
 ) -> FrozenPlan:
-    """The view of one static receiver as a sparse pixel x Gaussian matrix, for the parameters of `version`.
+    """The view of one static receiver as a sparse pixel x Gaussian matrix for the parameters of `version`.
 
     `version` is the field's own counter, raised whenever its geometry or opacity changes; a tensor's hidden
     counter misses writes through `.data`.
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
-    weights = backends.named(plan.backend).pixel_weights(plan, means, quats, scales, opacities, extinctions)[
-        0
-    ]
-    return FrozenPlan(weights, plan.grid, version)
+    order, buffers = backends.named(plan.backend).freeze(plan, means, quats, scales, opacities, extinctions)
+    return FrozenPlan(plan.grid, plan.backend, version, order, buffers)

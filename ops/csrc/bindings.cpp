@@ -144,17 +144,29 @@ void weights_backward(bool twice, int poses, int count, int threads, const Ints&
     });
 }
 
-void matrix(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+int freeze(bool twice, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    return with_scalar(twice, [&](auto zero) {
         using S = decltype(zero);
         Reader in{tensors};
-        MatrixArgs<S> a;
-        a.plan = read_plan<S>(in, poses, count, whole[0]);
+        FreezeArgs<S> a;
+        a.plan = read_plan<S>(in, 1, count, whole[0]);
         a.model = read_model<S>(in);
         a.lens = lens_from<S>(whole, real);
         a.threads = threads;
-        a.starts = in.next<int64_t>(), a.columns = in.next<int32_t>(), a.values = in.next<S>();
-        kernels<S>().matrix(a);
+        a.starts = in.next<int64_t>(), a.heads = in.next<int32_t>(), a.weights = in.next<S>();
+        return kernels<S>().freeze(a);
+    });
+}
+
+void thaw(bool twice, int height, int width, int channels, int threads, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        ThawArgs<S> a;
+        a.height = height, a.width = width, a.channels = channels, a.threads = threads;
+        a.starts = in.next<const int64_t>(), a.heads = in.next<const int32_t>();
+        a.weights = in.next<const S>(), a.features = in.next<const S>(), a.image = in.next<S>();
+        kernels<S>().thaw(a);
     });
 }
 
@@ -171,7 +183,8 @@ NB_MODULE(_native, module) {
     module.def("composite_backward", &composite_backward);
     module.def("weights", &weights);
     module.def("weights_backward", &weights_backward);
-    module.def("matrix", &matrix);
+    module.def("freeze", &freeze);
+    module.def("thaw", &thaw);
     module.def("instruction_set", &instruction_set);
     module.def("use_instruction_set", &use_instruction_set);
 }

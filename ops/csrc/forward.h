@@ -1,4 +1,4 @@
-// Front-to-back blending: images, weights, and the weights as a sparse matrix.
+// Front-to-back blending: images, and each Gaussian's weights.
 #pragma once
 #include "strips.h"
 
@@ -111,55 +111,6 @@ template <class S> void weights(const WeightArgs<S>& a) {
         }
     };
     parallel_for(a.plan.poses, a.threads, gather);
-}
-
-// Counts (columns null) or writes the weights of one pose, pixel by pixel, columns in depth order.
-template <class S, bool kTangent, bool kHides>
-void matrix_strip(const MatrixArgs<S>& a, const Ranked<S>& ranked, const Tables<S>& tables, int task, S* before) {
-    const Strip<S> strip(a.plan, a.lens.height, task);
-    const int stride = padded(a.lens.width);
-    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max);
-    fill(before, int64_t(kStripRows) * stride, S(1));
-    Buffer<int64_t> cursor(int64_t(kStripRows) * stride);
-    const int64_t corner = int64_t(strip.row0) * a.lens.width;
-    if (a.columns)
-        for (int row = 0; row < strip.row1 - strip.row0; ++row)
-            memcpy(cursor.data + row * stride, a.starts + corner + row * a.lens.width, a.lens.width * sizeof(int64_t));
-    for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-        const S* row = ranked.of(a.plan, strip.pose, *entry);
-        const S opacity = row[0], extinction = row[1];
-        each_block<S, kTangent>(strip, *entry, tables, a.lens, stride, [&](int at, Vec<S>, Vec<S>, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
-            const Vec<S> light = load(before + at);
-            const Mask<S> counts = inside & at_most(floor, light);
-            if (!any(counts)) return;
-            const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
-            store(before + at, light * (S(1) - layer.gamma));
-            S values[Lanes<S>::n];
-            store(values, light * layer.alpha);
-            for (int lane = 0; lane < Lanes<S>::n; ++lane) {
-                if (!(values[lane] > 0)) continue;
-                const int64_t to = cursor[at + lane]++;
-                if (a.columns) a.columns[to] = *entry, a.values[to] = values[lane];
-            }
-        });
-    }
-    if (!a.columns)
-        for (int row = 0; row < strip.row1 - strip.row0; ++row)
-            memcpy(a.starts + corner + row * a.lens.width, cursor.data + row * stride, a.lens.width * sizeof(int64_t));
-}
-
-template <class S> void matrix(const MatrixArgs<S>& a) {
-    const GridTables<S> grid(a.lens);
-    const Ranked<S> ranked(a.plan, a.model, nullptr, 0, 0, a.threads);
-    const int64_t area = int64_t(kStripRows) * padded(a.lens.width);
-    Buffer<S> memory(area * a.threads);
-    auto strip = [&](int task, int worker) {
-        const bool hides = a.model.extinctions != nullptr;
-        const auto run = a.lens.tangent ? (hides ? matrix_strip<S, true, true> : matrix_strip<S, true, false>)
-                                        : (hides ? matrix_strip<S, false, true> : matrix_strip<S, false, false>);
-        run(a, ranked, grid.tables, task, memory.data + worker * area);
-    };
-    parallel_for(a.plan.strips, a.threads, strip);
 }
 
 }  // namespace GSPARC_ISA

@@ -1,6 +1,6 @@
 // The kernels, compiled once per instruction set (GSPARC_ISA names it); results do not depend on the threads.
 #include "backward.h"
-#include "forward.h"
+#include "frozen.h"
 #include "project.h"
 
 namespace gsparc {
@@ -9,9 +9,9 @@ namespace GSPARC_ISA {
 extern const Kernels<float> single_kernels;
 extern const Kernels<double> double_kernels;
 const Kernels<float> single_kernels = {project_range<float>, composite<float>, composite_backward<float>,
-                                       weights<float>, weights_backward<float>, matrix<float>};
+                                       weights<float>, weights_backward<float>, freeze<float>, thaw<float>};
 const Kernels<double> double_kernels = {project_range<double>, composite<double>, composite_backward<double>,
-                                        weights<double>, weights_backward<double>, matrix<double>};
+                                        weights<double>, weights_backward<double>, freeze<double>, thaw<double>};
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc

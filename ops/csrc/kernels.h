@@ -43,14 +43,22 @@ template <class S> struct WeightBackwardArgs {
     S *means, *quats, *scales, *opacities, *extinctions;
 };
 
-template <class S> struct MatrixArgs {
-    PlanView<S> plan;
+template <class S> struct FreezeArgs {
+    PlanView<S> plan;               // of one pose
     Model<S> model;
     Lens<S> lens;
     int threads;
-    int64_t* starts;                // (H W + 1), counted first, then given back to be filled
-    int32_t* columns;               // (nnz), null while counting
-    S* values;
+    int64_t* starts;                // (strips + 1), first block of each strip; [1:] is counted while heads is null
+    int32_t* heads;                 // (blocks, 2) rank and place in the strip
+    S* weights;                     // (blocks, lanes)
+};
+
+template <class S> struct ThawArgs {
+    int height, width, channels, threads;
+    const int64_t* starts;
+    const int32_t* heads;
+    const S *weights, *features;    // features (V, K) by rank
+    S* image;                       // (K, H, W)
 };
 
 // Returns -1, or 4 * Gaussian + (0 means, 1 quats, 2 scales, 3 opacities) for the first that is not sound.
@@ -60,7 +68,8 @@ template <class S> struct Kernels {
     void (*composite_backward)(const CompositeBackwardArgs<S>&);
     void (*weights)(const WeightArgs<S>&);
     void (*weights_backward)(const WeightBackwardArgs<S>&);
-    void (*matrix)(const MatrixArgs<S>&);
+    int (*freeze)(const FreezeArgs<S>&);  // returns the lanes of a block
+    void (*thaw)(const ThawArgs<S>&);
 };
 
 template <class S> const Kernels<S>& kernels();  // the fastest set this machine has

@@ -1,0 +1,182 @@
+"""The kernels against the float64 reference, forward and backward, on random fields."""
+
+import pytest
+import torch
+from rasters import GRIDS, assert_close, poses, random_scene, render
+
+from gsparc.ops import Cutoff, SphereGrid, _native, make_plan, mean_weights, rasterize
+
+TOLERANCE = {torch.float64: 1e-9, torch.float32: 1e-4}
+BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+PROJECTIONS = pytest.mark.parametrize("projection", ["tangent", "equirect"])
+
+
+@BOTH
+@PROJECTIONS
+@pytest.mark.parametrize("grid", GRIDS.values(), ids=GRIDS.keys())
+@pytest.mark.parametrize("count", [0, 3], ids=["shared", "posed"])
+@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
+def test_equals_reference(dtype, projection, grid, count, hides):
+    scene, pose = random_scene(hides=hides, seed=count), poses(count)
+    want = render(scene, pose, grid, "reference", projection=projection)
+    got = render(scene.to(dtype), pose, grid, projection=projection)
+    assert_close(got, want, TOLERANCE[dtype])
+    assert not (want["visible"] & ~got["visible"]).any()
+    assert torch.allclose(got["radii"][want["visible"]].double(), want["radii"][want["visible"]], rtol=1e-4)
+
+
+@PROJECTIONS
+@pytest.mark.parametrize(
+    "optics",
+    [
+        {"compensate": False},
+        {"low_pass": 0.0},
+        {"cutoff": Cutoff(0.01, 1e-4, relative=True)},
+        {"near": 1.5},
+    ],
+    ids=["uncompensated", "sharp", "relative", "fading"],
+)
+def test_switches_equal_reference(projection, optics):
+    scene, pose, grid = random_scene(seed=7, hides=True), poses(0), GRIDS["hemisphere"]
+    want = render(scene, pose, grid, "reference", projection=projection, **optics)
+    assert_close(render(scene, pose, grid, projection=projection, **optics), want, 1e-9)
+
+
+@BOTH
+@PROJECTIONS
+@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
+def test_weights_equal_reference(dtype, projection, hides):
+    scene, pose, grid = random_scene(hides=hides, seed=2), poses(2), GRIDS["hemisphere"]
+    cut = Cutoff(1e-3, 1e-4, relative=True)
+    results = {}
+    for backend, kind in (("reference", torch.float64), ("cpu", dtype)):
+        cast = scene.to(kind)
+        leaves = [
+            getattr(cast, k).detach().clone().requires_grad_()
+            for k in ("means", "quats", "scales", "opacities")
+        ]
+        hidden = cast.extinctions.detach().clone().requires_grad_() if hides else None
+        plan = make_plan(
+            *leaves, pose, grid, projection=projection, cutoff=cut, extinctions=hidden, backend=backend
+        )
+        seen = mean_weights(plan, *leaves, extinctions=hidden)
+        draw = torch.Generator().manual_seed(3)
+        a, b = (torch.randn(seen.mean.shape, generator=draw, dtype=torch.float64).to(kind) for _ in range(2))
+        (1000 * (seen.mean * a).sum() + (seen.share * b).sum()).backward()
+        values = [seen.mean.detach(), seen.share.detach(), *(leaf.grad for leaf in leaves)]
+        results[backend] = dict(enumerate(values + ([hidden.grad] if hides else [])))
+    assert_close(results["cpu"], results["reference"], TOLERANCE[dtype])
+
+
+def test_weights_are_the_image_of_indicators():
+    scene, pose, grid = random_scene(n=12, seed=4), poses(0), GRIDS["hemisphere"]
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    seen = mean_weights(make_plan(*model, pose, grid), *model)
+    image = rasterize(*model, torch.eye(12, dtype=torch.float64), pose, grid).image[0]
+    assert torch.allclose(seen.mean[0], image.mean((1, 2)), atol=1e-12)
+    assert (seen.share >= 0).all() and (seen.share <= 1).all() and seen.share.max() > 0.9
+
+
+@pytest.mark.parametrize("channels,samples", [(1, 1), (3, 5), (40, 2), (0, 2), (2, 0)])
+def test_any_number_of_channels_and_samples(channels, samples):
+    scene = random_scene(channels=channels, samples=samples, seed=9)
+    want = render(scene, poses(0), GRIDS["sphere"], "reference")
+    got = render(scene, poses(0), GRIDS["sphere"])
+    assert got["image"].shape == (samples, channels, 24, 48)
+    assert_close(got, want, 1e-9)
+
+
+@pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
+@BOTH
+def test_every_instruction_set(name, dtype):
+    fastest = _native.instruction_set()
+    if not _native.use_instruction_set(name):
+        pytest.skip(f"this machine or build has no {name}")
+    try:
+        for projection in ("tangent", "equirect"):
+            scene = random_scene(seed=11, hides=True)
+            want = render(scene, poses(3), GRIDS["hemisphere"], "reference", projection=projection)
+            got = render(scene.to(dtype), poses(3), GRIDS["hemisphere"], projection=projection)
+            assert_close(got, want, TOLERANCE[dtype])
+    finally:
+        _native.use_instruction_set(fastest)
+
+
+@PROJECTIONS
+def test_flips_at_the_cutoff_are_rare(projection):
+    """In float32 a pixel may fall on the other side of a cut-off: few do, and none by more than the cut."""
+    scene, pose, grid = random_scene(n=150, seed=5), poses(0), SphereGrid.hemisphere()
+    want = render(scene, pose, grid, "reference", projection=projection)["image"]
+    got = render(scene.to(torch.float32), pose, grid, projection=projection)["image"].double()
+    gap = (got - want).abs()
+    assert (gap > 1e-4).double().mean() < 1e-4
+    assert gap.max() < 2 * scene.features.abs().max() / 255
+
+
+@PROJECTIONS
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_gradcheck(projection, backend):
+    """Every derivative by finite differences, with cut-offs so low that none is crossed."""
+    scene = random_scene(n=4, seed=3, hides=True)
+    cut = Cutoff(1e-30, 0.0)
+    features = scene.features[:2, :, :1]
+    inputs = [scene.means, scene.quats, scene.scales, scene.opacities, scene.extinctions, features]
+    inputs = [tensor.clone().requires_grad_() for tensor in inputs]
+    kind = {"projection": projection, "cutoff": cut, "backend": backend}
+
+    def picture(m, q, s, o, x, f):
+        raster = rasterize(m, q, s, o, f, poses(2), SphereGrid.full_sphere(4, 8), extinctions=x, **kind)
+        return raster.image, raster.transmittance
+
+    def weights(m, q, s, o, x):
+        plan = make_plan(m, q, s, o, poses(2), SphereGrid.full_sphere(4, 8), extinctions=x, **kind)
+        seen = mean_weights(plan, m, q, s, o, extinctions=x)
+        return seen.mean, seen.share
+
+    assert torch.autograd.gradcheck(picture, inputs, atol=1e-6)
+    assert torch.autograd.gradcheck(weights, inputs[:5], atol=1e-6)
+
+
+def test_clamped_layers_pass_gradient_to_features_only():
+    from rasters import one, origin
+
+    scene = one([1.0, 0, 0.5], opacity=1.0, sigma=3.0)
+    grid = SphereGrid(1, 1, float(torch.atan2(torch.tensor(0.5), torch.tensor(1.0))), 0.0, 0.01, 0.01)
+    for backend in ("cpu", "reference"):
+        got = render(scene, origin(), grid, backend, behind=False)
+        assert float(got["image"]) == 0.99
+        assert got["d_features"].abs().max() > 0
+        for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_means2d"):
+            assert (got[name] == 0).all(), name
+
+
+def test_culled_gaussians_get_exactly_zero():
+    scene = random_scene(n=80, seed=6)
+    got = render(scene, poses(0), GRIDS["patch"])
+    hidden = ~got["visible"][0]
+    assert 0 < hidden.sum() < 80
+    for name in ("d_means", "d_quats", "d_scales", "d_opacities"):
+        assert (got[name][hidden] == 0).all() and (got[name][~hidden] != 0).any(), name
+
+
+def test_screen_gradient_is_the_shift_of_the_footprint():
+    """means2d.grad: a tiny sideways move of a round footprint, per pose, in pixels."""
+    from rasters import one, origin
+
+    scene, grid, step = one([1.0, 0.2, 0.7], sigma=0.3), SphereGrid.hemisphere(), 1e-5
+    got = render(scene, origin(), grid, projection="equirect")
+    turned = []
+    for sign in (1, -1):
+        angle = torch.tensor(sign * step * grid.azimuth_step, dtype=torch.float64)
+        c, s, z = angle.cos(), angle.sin(), torch.zeros_like(angle)
+        turn = torch.stack([c, -s, z, s, c, z, z, z, z + 1]).reshape(3, 3)
+        moved = type(scene)(**{**vars(scene), "means": scene.means @ turn.mT})
+        picture = render(moved, origin(), grid, projection="equirect")
+        draw = torch.Generator().manual_seed(5)
+        loss = 0.0
+        for name in ("image", "transmittance"):
+            noise = torch.randn(picture[name].shape, generator=draw, dtype=torch.float64)
+            loss = loss + (noise * picture[name]).sum()
+        turned.append(loss)
+    slope = (turned[0] - turned[1]) / (2 * step)
+    assert torch.isclose(got["d_means2d"][0, 0, 0], slope, rtol=1e-4)

@@ -1,0 +1,69 @@
+"""The operators obey torch.library's rules and exist once; the package has one name."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from rasters import poses, random_scene
+from torch.library import opcheck
+
+from gsparc.ops import SphereGrid, composite, make_plan, native
+
+ROOT = Path(__file__).parents[2]
+GRID = SphereGrid.hemisphere(10, 40)
+
+
+@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
+def test_opcheck(hides):
+    scene, pose = random_scene(n=7, samples=2, hides=hides), poses(2)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
+    view = (pose.position, pose.rotation)
+    numbers = native._numbers(GRID, plan.optics)
+    leaves = [tensor.clone().requires_grad_() for tensor in model]
+    hidden = scene.extinctions.clone().requires_grad_() if hides else None
+    features, means2d = scene.features.clone().requires_grad_(), plan.means2d.clone().requires_grad_()
+    buffers = list(plan.buffers)
+    opcheck(native.plan_op, (*model, None, *view, *numbers))
+    opcheck(native.composite_op, (*leaves, hidden, features, means2d, *view, buffers, *numbers))
+    opcheck(native.weights_op, (*leaves, hidden, *view, buffers, *numbers))
+
+
+def test_bare_import_is_refused_with_a_reason():
+    code = "import gsparc.ops, sys; sys.path.insert(0, '.'); import ops"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode != 0
+    assert "installed as gsparc.ops" in done.stderr and "registered" not in done.stderr
+
+
+def test_importing_twice_registers_once():
+    code = (
+        "import gsparc.ops.native, importlib, sys, gsparc.ops; importlib.import_module('gsparc.ops.native');"
+        "import torch;"
+        "ops = [o for o in torch._C._dispatch_get_all_op_names() if o.startswith('gsparc::')];"
+        "assert len(ops) == len(set(ops)) == 5, ops"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_plan_allocates_nothing_it_may_not(monkeypatch):
+    scene = random_scene(n=50, size=4.0)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    monkeypatch.setattr(native, "MEMORY_BOUND", 100)
+    with pytest.raises(MemoryError, match="footprint entries need"):
+        make_plan(*model, poses(0), GRID)
+
+
+def test_inputs_on_strides_are_understood():
+    scene, pose = random_scene(n=9), poses(0)
+    wide = torch.empty(9, 6, dtype=torch.float64)[:, ::2]
+    wide.copy_(scene.means)
+    plain = make_plan(scene.means, scene.quats, scene.scales, scene.opacities, pose, GRID)
+    strided = make_plan(wide, scene.quats, scene.scales, scene.opacities, pose, GRID)
+    for a, b in zip(plain.buffers, strided.buffers, strict=True):
+        assert torch.equal(a, b)
+    rest = (scene.quats, scene.scales, scene.opacities, scene.features)
+    assert torch.equal(composite(plain, scene.means, *rest).image, composite(strided, wide, *rest).image)
