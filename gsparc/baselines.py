@@ -7,7 +7,7 @@ import logging
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -55,18 +55,24 @@ def baseline(
     Args:
         name: as in `gsparc.registry.METHODS`.
         data: the dataset.
-        split: folds; baselines learn from train and val rows.
+        split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
         eval_on: `train`, `val` or `test`.
         cache: folder of earlier results; None keeps nothing.
     """
+    unseen = eval_on == "val"
     key = hashlib.sha256(f"{data.site.sha256} {split.sha256}".encode()).hexdigest()[:24]
-    room = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key / name
+    room = (
+        None
+        if cache is None
+        else Path(cache) / f"baselines-v{CACHE_VERSION}" / key / (f"{name}-train" if unseen else name)
+    )
     methods, seconds = [], []
     for number, fold in enumerate(split.folds):
         found = None if room is None else _stored_fit(room / f"fold{number}.ckpt")
         if found is None:
             method = method_class(name)()
-            report = method.fit(data, fold, room or Path())
+            known = replace(fold, val=fold.val[:0]) if unseen else fold
+            report = method.fit(data, known, room or Path())
             for note in report.notes:
                 log.info("fold %d: %s", number, note)
             found = (method, report.seconds)

@@ -105,6 +105,15 @@ def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
         evaluate(methods, None, data, split, eval_on="tset", clock=QUICK)
 
 
+@pytest.mark.parametrize("name", ["nearest", "gp"])
+def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, tmp_path, name):
+    data, split = campaign("csi", 40), folds(40)
+    for subset in ("test", "val"):
+        assert baseline(name, data, split, subset, cache=tmp_path).scores.figures()["nmse"] > 0.001
+    assert baseline(name, data, split, "test", cache=tmp_path).methods[0].size() == 30
+    assert baseline(name, data, split, "val", cache=tmp_path).methods[0].size() == 27
+
+
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40, 2)
     methods, seconds = fit_all(Mean, data, split, tmp_path)
