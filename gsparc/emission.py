@@ -12,6 +12,9 @@ from torch import Tensor, nn
 from gsparc.encoding import EncodingSettings, PositionEncoding
 
 
+EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities
+
+
 @dataclass(frozen=True)
 class EmissionSettings:
     """Shape of the emission networks (paper: 3-16-2, raw coordinates).
@@ -91,3 +94,13 @@ class Emission(nn.Module):
         if self.settings.activation == "sigmoid":
             return torch.sigmoid(logits)
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
+
+    def inverse(self, emission: Tensor, distance: Tensor) -> Tensor:
+        """The logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
+        if self.settings.activation == "linear":
+            return emission
+        if self.settings.activation == "softplus":
+            positive = emission.clamp_min(EMISSION_FLOOR)
+            return positive + torch.log(-torch.expm1(-positive))
+        logits = torch.logit(emission.clamp(EMISSION_FLOOR, 1 - EMISSION_FLOOR))
+        return logits + distance.log().unsqueeze(-1) if self.settings.log_distance else logits

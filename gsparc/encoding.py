@@ -10,22 +10,39 @@ import torch
 from torch import Tensor, nn
 
 
+JITTER = 1e-5  # relative to the unit variance of the kernel
+
+
 @dataclass(frozen=True)
 class EncodingSettings:
     """Choice of encoding.
 
     Attributes:
-        kind: `raw` coordinates (the paper), `fourier` octaves along the axes, or `matern`: random Fourier
-            features of a Matern-3/2 covariance, so that a linear read-out is a Gaussian process.
+        kind: `raw` coordinates (the paper), `fourier` octaves along the axes, or `kernel`: whitened
+            Matern-3/2 similarities to training positions, so that a linear read-out with independent
+            weights is a Gaussian process of the emission.
         octaves: number of octaves of `fourier`; the first has a period of twice the scene box.
-        features: number of cosines of `matern`.
-        length: correlation length of `matern` [m]; null means half a wavelength.
+        anchors: largest number of training positions of `kernel`.
     """
 
-    kind: Literal["raw", "fourier", "matern"] = "fourier"
+    kind: Literal["raw", "fourier", "kernel"] = "fourier"
     octaves: int = 5
-    features: int = 64
-    length: float | None = None
+    anchors: int = 1024
+
+
+@dataclass(frozen=True)
+class Prior:
+    """How smoothly targets change with position: what leave-one-out likelihood found on training data.
+
+    Attributes:
+        anchors: (M, 3) float32 [m], training positions.
+        length: Matern-3/2 correlation length [m].
+        noise: variance of the unexplained part relative to the signal's.
+    """
+
+    anchors: Tensor
+    length: float
+    noise: float
 
 
 class PositionEncoding(nn.Module):
@@ -34,56 +51,64 @@ class PositionEncoding(nn.Module):
     Args:
         settings: which encoding.
         box: (2, 3) [m], lower and upper corner of the moving end's box, local frame.
-        wavelength: carrier wavelength [m], for the default correlation length.
-        seed: of the random frequencies of `matern`.
+        prior: needed by `kernel`.
     """
 
     centre: Tensor
     half_extent: Tensor
     frequencies: Tensor
     phases: Tensor
+    anchors: Tensor
+    whitening: Tensor
 
-    def __init__(
-        self, settings: EncodingSettings, box: Tensor, wavelength: float | None, seed: int = 0
-    ) -> None:
+    def __init__(self, settings: EncodingSettings, box: Tensor, prior: Prior | None = None) -> None:
         super().__init__()
         box = torch.as_tensor(box, dtype=torch.float64)
         extent = (box[1] - box[0]).max().clamp_min(1e-6)  # one scale for all axes keeps distances true
         self.settings = settings
         self.register_buffer("centre", box.mean(0).float())
         self.register_buffer("half_extent", (extent / 2).float())
-        if settings.kind == "raw":
-            frequencies, phases = torch.zeros(0, 3), torch.zeros(0)
-        elif settings.kind == "fourier":
+        if settings.kind == "fourier":
             octaves = math.pi * 2.0 ** torch.arange(settings.octaves)
             axes = (octaves[:, None, None] * torch.eye(3)).reshape(-1, 3)
-            frequencies = axes.repeat(2, 1)
-            phases = torch.cat([torch.zeros(len(axes)), torch.full((len(axes),), -math.pi / 2)])
-        elif settings.kind == "matern":
-            length = settings.length if settings.length is not None else (wavelength or float(extent) / 4) / 2
-            frequencies = _matern_frequencies(settings.features, seed) * float(extent / 2) / length
-            generator = torch.Generator().manual_seed(seed + 1)
-            phases = 2 * math.pi * torch.rand(settings.features, generator=generator)
-        else:
-            raise ValueError(f"model.emission.encoding.kind={settings.kind!r}: choose raw, fourier or matern")
-        self.register_buffer("frequencies", frequencies)
-        self.register_buffer("phases", phases)
+            self.register_buffer("frequencies", axes.repeat(2, 1))
+            quarter = torch.full((len(axes),), -math.pi / 2)
+            self.register_buffer("phases", torch.cat([torch.zeros(len(axes)), quarter]))
+        elif settings.kind == "kernel":
+            if prior is None:
+                raise ValueError(
+                    "model.emission.encoding.kind=kernel needs a prior learned from training positions"
+                )
+            self.length = prior.length
+            self.register_buffer("anchors", prior.anchors.float())
+            gram = _matern(prior.anchors.double(), prior.anchors.double(), prior.length)
+            gram += JITTER * torch.eye(len(gram), dtype=gram.dtype)  # repeated positions stay invertible
+            inverse = torch.linalg.solve_triangular(
+                torch.linalg.cholesky(gram), torch.eye(len(gram), dtype=gram.dtype), upper=False
+            )
+            self.register_buffer("whitening", inverse.T.float().contiguous())
+        elif settings.kind != "raw":
+            raise ValueError(f"model.emission.encoding.kind={settings.kind!r}: choose raw, fourier or kernel")
 
     @property
     def width(self) -> int:
         """Number of encoded values."""
-        return 3 + len(self.frequencies) if self.settings.kind != "matern" else len(self.frequencies)
+        if self.settings.kind == "kernel":
+            return len(self.anchors)
+        return 3 + (len(self.frequencies) if self.settings.kind == "fourier" else 0)
 
     def forward(self, position: Tensor) -> Tensor:
         """Encode (B, 3) [m] as (B, width)."""
+        if self.settings.kind == "kernel":
+            return _matern(position, self.anchors, self.length) @ self.whitening
         scaled = (position - self.centre) / self.half_extent
-        waves = torch.cos(scaled @ self.frequencies.T + self.phases)
-        return waves * math.sqrt(2) if self.settings.kind == "matern" else torch.cat([scaled, waves], dim=-1)
+        if self.settings.kind == "raw":
+            return scaled
+        return torch.cat([scaled, torch.cos(scaled @ self.frequencies.T + self.phases)], dim=-1)
 
 
-def _matern_frequencies(count: int, seed: int) -> Tensor:
-    """Angular frequencies (count, 3) of a unit-length Matern-3/2 in 3D: its spectrum is a t with 3 dof."""
-    generator = torch.Generator().manual_seed(seed)
-    normal = torch.randn(count, 3, generator=generator)
-    chi_square = torch.randn(count, 3, generator=generator).square().sum(-1, keepdim=True)
-    return normal / (chi_square / 3).sqrt()
+def _matern(a: Tensor, b: Tensor, length: float) -> Tensor:
+    """Matern-3/2 correlations (A, B) between positions (A, 3) and (B, 3) [m]."""
+    # Differences are formed before squaring: the expanded form loses millimetres in float32.
+    scaled = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist") * (math.sqrt(3) / length)
+    return (1 + scaled) * torch.exp(-scaled)

@@ -109,7 +109,5 @@ def initial_field(
     distance = settings.near + (settings.far - settings.near) * torch.rand(count, 1)
     means = receiver.float() + distance * directions @ rotation.float().T
     spacing = math.sqrt(2 * math.pi / max(count, 1))
-    scales = (
-        settings.scale * torch.ones(count, 3) if settings.scale else (distance * spacing * 0.6).expand(-1, 3)
-    )
+    scales = settings.scale * torch.ones(count, 3) if settings.scale else (distance * spacing).expand(-1, 3)
     return GaussianField(means, scales, settings.opacity)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +18,14 @@ from gsparc import surgery
 from gsparc.data.module import MeasurementsModule
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.encoding import Prior
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.model import GaussianModel, ModelSettings
 from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import FrozenPlan, Pose
 from gsparc.resume import GsparcCheckpointIO
 from gsparc.schedule import OptimizerSettings
+from gsparc.warmstart import learn_prior, warm_start
 
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
@@ -37,7 +40,6 @@ class TrainerSettings:
         val_every: steps between validations.
         checkpoint_every: steps between `last.ckpt`.
         gradient_clip: largest gradient norm; null never clips.
-        progress: show a progress bar.
         accelerator: Lightning's choice of device.
     """
 
@@ -46,7 +48,6 @@ class TrainerSettings:
     val_every: int = 500
     checkpoint_every: int = 500
     gradient_clip: float | None = None
-    progress: bool = True
     accelerator: str = "cpu"
 
 
@@ -79,6 +80,7 @@ class LearnedField(Method):
         loss: task loss.
         optimizer: learning rates.
         name: as it appears in tables.
+        warm_start: solve the emission in closed form before training (spectra of a static receiver).
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -88,17 +90,20 @@ class LearnedField(Method):
         loss: LossSettings,
         optimizer: OptimizerSettings,
         name: str = "gsparc",
+        warm_start: bool = False,
         guesses: Sequence[str] = (),
     ) -> None:
         self.settings = model
         self.loss = loss
         self.rates = optimizer
         self.name = name
+        self.warm_start = warm_start
         self.guesses = tuple(guesses)
         self.training = Training()
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self._ends: dict[str, Tensor] = {}
+        self._prior: Prior | None = None
         self._frozen: FrozenPlan | None = None
 
     # -- learning ----------------------------------------------------------------------------------
@@ -114,19 +119,29 @@ class LearnedField(Method):
             else {"tx_position": first.tx[0]}
         )
         self.site = data.site
+        started = time.perf_counter()
+        if "kernel" in (self.settings.emission.encoding.kind, self.settings.confidence.encoding.kind):
+            anchors = self.settings.emission.encoding.anchors
+            self._prior = learn_prior(data, fold.train, anchors, training.seed)
         self.model = self._new_model(data.site)
+        if self.warm_start and training.resume is None:
+            if data.site.kind != "spectrum" or data.site.static_end != "rx" or self._prior is None:
+                raise ValueError(
+                    "model.warm_start=true needs spectra, a static receiver and encoding.kind=kernel"
+                )
+            warm_start(self.model, data, fold.train, first.rx, self._prior.noise)
+        prepared = time.perf_counter() - started
         module = GaussianModule(self.model, self.loss, self.rates, settings.max_steps, run_dir)
         last = L.callbacks.ModelCheckpoint(
             run_dir, filename="last", every_n_train_steps=settings.checkpoint_every, save_top_k=1,
             save_on_train_epoch_end=False, enable_version_counter=False,
         )  # fmt: skip
-        bar = [L.callbacks.RichProgressBar(leave=True)] if settings.progress else []
         trainer = L.Trainer(
             accelerator=settings.accelerator,
             devices=1,
             max_steps=settings.max_steps,
             max_epochs=-1,
-            callbacks=[*training.callbacks(), last, *bar],
+            callbacks=[*training.callbacks(), last],
             logger=list(training.loggers) or False,
             plugins=[GsparcCheckpointIO(self, training.config_yaml)],
             gradient_clip_val=settings.gradient_clip,
@@ -134,7 +149,7 @@ class LearnedField(Method):
             check_val_every_n_epoch=None,
             limit_val_batches=None if len(fold.val) else 0,
             num_sanity_val_steps=0,
-            enable_progress_bar=settings.progress,
+            enable_progress_bar=False,
             enable_model_summary=False,
             log_every_n_steps=50,
             default_root_dir=run_dir,
@@ -145,12 +160,12 @@ class LearnedField(Method):
             raise KeyboardInterrupt(f"training was interrupted; go on with ckpt_path={run_dir / 'last.ckpt'}")
         self._frozen = None
         self._calibrate(data, fold)
-        return FitReport(module.train_seconds, self.guesses)
+        return FitReport(prepared + module.train_seconds, self.guesses)
 
     def _new_model(self, site: Site) -> GaussianModel:
         ends = self._ends
         receiver = Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
-        return GaussianModel(self.settings, site, receiver, ends.get("tx_position"))
+        return GaussianModel(self.settings, site, receiver, ends.get("tx_position"), self._prior)
 
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
         model = self.fitted()
@@ -205,12 +220,14 @@ class LearnedField(Method):
 
     def state(self) -> dict[str, Any]:
         """Everything `restore` needs."""
-        return {"ends": self._ends, "model": self.fitted().state_dict()}
+        prior = None if self._prior is None else vars(self._prior)
+        return {"ends": self._ends, "prior": prior, "model": self.fitted().state_dict()}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
         self.site = site
         self._ends = dict(state["ends"])
+        self._prior = None if state["prior"] is None else Prior(**state["prior"])
         self.model = self._new_model(site)
         surgery.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])

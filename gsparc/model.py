@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from gsparc.confidence import Confidence, ConfidenceSettings
 from gsparc.data.schema import Site
 from gsparc.emission import Emission, EmissionSettings
-from gsparc.encoding import PositionEncoding
+from gsparc.encoding import PositionEncoding, Prior
 from gsparc.field import FieldSettings, GaussianField, initial_field
 from gsparc.ops import (
     Cutoff,
@@ -99,6 +99,7 @@ class GaussianModel(nn.Module):
         site: what the dataset declares.
         receiver: the static receiver's pose, or None when it moves.
         transmitter: (3,) [m], the static transmitter, or None when it moves.
+        prior: smoothness found on training data, for `encoding.kind=kernel`.
     """
 
     def __init__(
@@ -107,6 +108,7 @@ class GaussianModel(nn.Module):
         site: Site,
         receiver: Pose | None = None,
         transmitter: Tensor | None = None,
+        prior: Prior | None = None,
     ) -> None:
         super().__init__()
         self.settings = settings
@@ -118,12 +120,10 @@ class GaussianModel(nn.Module):
             None if receiver is None else receiver.position,
             None if receiver is None else receiver.rotation,
         )
-        encoding = PositionEncoding(settings.emission.encoding, box, site.wavelength)
+        encoding = PositionEncoding(settings.emission.encoding, box, prior)
         self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
         self.confidence = (
-            Confidence(
-                settings.confidence, PositionEncoding(settings.confidence.encoding, box, site.wavelength)
-            )
+            Confidence(settings.confidence, PositionEncoding(settings.confidence.encoding, box, prior))
             if settings.confidence.enabled
             else None
         )
@@ -147,12 +147,19 @@ class GaussianModel(nn.Module):
 
     def features(self, tx: Tensor, rx: Pose) -> Tensor:
         """Attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
-        settings = self.settings.attenuation
-        offset = tx[:, None, :] - self.gaussians.means
-        distance = (offset.square().sum(-1) + settings.d_min**2).sqrt() / self.d_ref
+        distance = self.distances(tx)
         emitted = self.emission(self.moving(tx, rx), distance)
-        gain = self.log_gain.exp()
-        return emitted * (gain / distance).unsqueeze(-1) if settings.inverse_distance else emitted
+        attenuation = self.attenuation(distance)
+        return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
+
+    def distances(self, tx: Tensor) -> Tensor:
+        """d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
+        offset = tx[:, None, :] - self.gaussians.means
+        return (offset.square().sum(-1) + self.settings.attenuation.d_min**2).sqrt() / self.d_ref
+
+    def attenuation(self, distance: Tensor) -> Tensor | None:
+        """a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""
+        return self.log_gain.exp() / distance if self.settings.attenuation.inverse_distance else None
 
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""

@@ -81,10 +81,9 @@ def write_raw(path: str | Path, raw: Raw) -> None:
         with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             for name, array in raw.arrays.items():
                 data = np.char.encode(array, "utf-8") if array.dtype.kind == "U" else array
-                dtype = h5py.string_dtype("utf-8", data.dtype.itemsize) if data.dtype.kind == "S" else None
-                stored = file.create_dataset(
-                    name, data=data, dtype=dtype, fletcher32=data.size > 0 and data.ndim > 0
-                )
+                if data.dtype.kind == "S":
+                    data = data.astype(h5py.string_dtype("utf-8", data.dtype.itemsize))
+                stored = file.create_dataset(name, data=data, fletcher32=data.ndim > 0 and data.size > 0)
                 if name in raw.units:
                     stored.attrs["units"] = raw.units[name]
             for name, value in raw.attributes.items():

@@ -1,0 +1,55 @@
+"""One line of progress over all steps: what is left, how good it is, how large the field is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import lightning.pytorch as L
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+SHOWN = {
+    "train/task_loss": "loss",
+    "val/ssim_gauss": "val ssim",
+    "val/psnr_db": "val dB",
+    "val/mse": "val mse",
+}
+
+
+class StepProgress(L.Callback):
+    """A rich progress bar over optimiser steps (epochs mean little when data are few)."""
+
+    def __init__(self) -> None:
+        self._bar: Progress | None = None
+
+    def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
+        """Draw the bar."""
+        self._bar = Progress(
+            TextColumn("step"), TextColumn("{task.completed:.0f}/{task.total:.0f}"), BarColumn(),
+            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[figures]}"),
+        )  # fmt: skip
+        self._bar.start()
+        self._bar.add_task("train", total=trainer.max_steps, completed=trainer.global_step, figures="")
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Advance; figures are read now and then, not at every step."""
+        if self._bar is None:
+            return
+        task = self._bar.task_ids[0]
+        self._bar.update(task, completed=trainer.global_step)
+        if trainer.global_step % 20 == 0 or trainer.global_step == trainer.max_steps:
+            found = {name: trainer.callback_metrics.get(key) for key, name in SHOWN.items()}
+            figures = [f"{name} {float(value):.4g}" for name, value in found.items() if value is not None]
+            self._bar.update(task, figures=", ".join([*figures, f"{len(module.model.gaussians)} Gaussians"]))
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Leave the finished bar on the screen."""
+        self._close()
+
+    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
+        """Give the terminal back."""
+        self._close()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
