@@ -114,7 +114,7 @@ def read(path: str | Path) -> Stored:
     if not zipfile.is_zipfile(path):
         raise CheckpointError(f"{path}: not a gsparc checkpoint, or cut short")
     try:
-        content = torch.load(path, map_location="cpu", weights_only=False)
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
         raise CheckpointError(
             f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could run code"
