@@ -34,6 +34,21 @@ def test_good_file_is_described(tmp_path, arrays):
         assert words in text, text
 
 
+def test_receivers_in_one_plane_are_noted(tmp_path, arrays):
+    arrays["csi"] = arrays.pop("spectrum")[:, 0, 0] + 1j
+    arrays["frequency_hz"] = np.array(2.4e9)
+    write_own(tmp_path / "a.npz", arrays)
+    assert "about a plane" not in _said(tmp_path / "a.npz")[1]
+    arrays["tx_position"][:, 2] = 1.5
+    write_own(tmp_path / "flat.npz", arrays)
+    assert "about a plane" in _said(tmp_path / "flat.npz")[1]
+
+
+def test_path_that_is_not_utf8(tmp_path):
+    good, text = _said(tmp_path / "\udcff.npz")
+    assert not good and "no such file" in text
+
+
 def test_unknown_carrier_is_said(tmp_path, arrays):
     write_own(tmp_path / "a.npz", arrays)
     assert "unknown; give frequency_hz" in _said(tmp_path / "a.npz")[1]

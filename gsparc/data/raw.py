@@ -77,7 +77,7 @@ def write_raw(path: str | Path, raw: Raw) -> None:
         with partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, attributes=np.array(about), **raw.arrays)
     elif path.suffix.lower() in HDF5_SUFFIXES:
-        # Checksums on metadata and data, and text of fixed length: libhdf5 crashes on damage it cannot see.
+        # Checksums and text of fixed length: libhdf5 crashes or hangs on damage that it cannot see.
         with h5py.File(partial, "w", libver=("v110", "v110")) as file:
             for name, array in raw.arrays.items():
                 data = np.char.encode(array, "utf-8") if array.dtype.kind == "U" else array
@@ -85,9 +85,9 @@ def write_raw(path: str | Path, raw: Raw) -> None:
                     data = data.astype(h5py.string_dtype("utf-8", data.dtype.itemsize))
                 stored = file.create_dataset(name, data=data, fletcher32=data.ndim > 0 and data.size > 0)
                 if name in raw.units:
-                    stored.attrs["units"] = raw.units[name]
+                    stored.attrs["units"] = np.bytes_(raw.units[name], "utf-8")
             for name, value in raw.attributes.items():
-                file.attrs[name] = value
+                file.attrs[name] = np.bytes_(value, "utf-8") if isinstance(value, str) else value
     else:
         raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5")
     os.replace(partial, path)

@@ -12,7 +12,7 @@ from PIL import Image
 
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.newrf import load_newrf
-from gsparc.data.own import from_arrays, load_own
+from gsparc.data.own import from_arrays, load_own, write_own
 from gsparc.data.rfid import load_rfid
 
 
@@ -347,6 +347,46 @@ def test_wrong_units_are_refused(tmp_path, csi_arrays):
         load_own(_npz_file(tmp_path / "units.npz", {**csi_arrays, "attributes": np.array(about)}))
     with pytest.raises(DataError, match="expected a JSON table"):
         load_own(_npz_file(tmp_path / "units.npz", {**csi_arrays, "attributes": np.array("{")}))
+
+
+def test_fuzzed_files_are_read_or_refused(tmp_path, csi_arrays):
+    """Found by this: encrypted zip entries, HDF5 names that are no text, crashes inside libhdf5."""
+    rng = np.random.default_rng(0)
+    csi_arrays["row_name"] = np.array(["a"] * 12)
+    refused = 0
+    for suffix in ("npz", "h5"):
+        write_own(tmp_path / f"good.{suffix}", csi_arrays, {"name": "garage"})
+        content = (tmp_path / f"good.{suffix}").read_bytes()
+        for _ in range(150):
+            spoilt = bytearray(content)
+            for position in rng.integers(len(spoilt), size=3):
+                spoilt[position] = rng.integers(256)
+            (tmp_path / f"bad.{suffix}").write_bytes(bytes(spoilt))
+            try:
+                data = load_own(tmp_path / f"bad.{suffix}")
+            except DataError as error:
+                refused += 1
+                assert all("\n" not in problem for problem in error.problems)
+            else:
+                assert np.isfinite(data.target).all() and np.isfinite(data.tx).all()
+    assert 100 < refused < 300
+
+
+def test_encrypted_entry_is_refused(tmp_path, csi_arrays):
+    path = _npz_file(tmp_path / "locked.npz", csi_arrays)
+    content = bytearray(path.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + 8] |= 1  # the flag in the last entry of the directory
+    path.write_bytes(bytes(content))
+    with pytest.raises(DataError, match=r"damaged or not an npz file.*encrypted"):
+        load_own(path)
+
+
+def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
+    path = tmp_path / "name.h5"
+    write_own(path, csi_arrays)
+    with h5py.File(path, "a") as file:
+        file[b"\xff\xfe\xfd"] = np.ones(3)
+    assert len(load_own(path)) == 12
 
 
 @pytest.mark.parametrize("name", ["tx_pos", "rx_pos", "csi", "frequency_hz"])

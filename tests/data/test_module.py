@@ -74,7 +74,8 @@ def _fit(data, tmp_path, model, steps, ckpt=None, every=None):
         ]
     trainer = pl.Trainer(
         max_steps=steps, accelerator="cpu", logger=False, callbacks=callbacks,
-        enable_checkpointing=bool(every), enable_progress_bar=False, enable_model_summary=False, default_root_dir=tmp_path,
+        enable_checkpointing=bool(every), enable_progress_bar=False, enable_model_summary=False,
+        default_root_dir=tmp_path,
     )  # fmt: skip
     trainer.fit(model, MeasurementsModule(data, FOLD, 4, seed=7), ckpt_path=ckpt, weights_only=False)
     return trainer
