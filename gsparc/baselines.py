@@ -60,7 +60,9 @@ def baseline(
         cache: folder of earlier results; None keeps nothing.
     """
     unseen = eval_on == "val"
-    key = hashlib.sha256(f"{data.site.sha256} {split.sha256}".encode()).hexdigest()[:24]
+    # The same data may be looked at in another model's local coordinates and units.
+    frame = f"{data.site.origin.tolist()} {data.site.target_scale}"
+    key = hashlib.sha256(f"{data.site.sha256} {split.sha256} {frame}".encode()).hexdigest()[:24]
     room = (
         None
         if cache is None
