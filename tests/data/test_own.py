@@ -83,6 +83,13 @@ def test_directions_from_last_points(csi_arrays):
     data = from_arrays({**csi_arrays, "path_offsets": offsets, "path_last_point": points})
     assert len(data.directions) == 12 and data.directions[0].shape == (2, 3)
     np.testing.assert_allclose(np.concatenate(data.directions), np.tile([0, 0, 1], (24, 1)), atol=1e-6)
+    # Rolled by 90 degrees about x, the receiver's y axis is the world's z: up is along its y.
+    rolled = {
+        **csi_arrays,
+        "rx_orientation": Rotation.from_euler("x", 90, degrees=True).as_quat(scalar_first=True),
+    }
+    data = from_arrays({**rolled, "path_offsets": offsets, "path_last_point": points})
+    np.testing.assert_allclose(np.concatenate(data.directions), np.tile([0, 1, 0], (24, 1)), atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["csi", "spectrum"])
