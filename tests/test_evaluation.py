@@ -159,11 +159,10 @@ def test_the_cache_knows_the_local_frame(campaign, folds, tmp_path, monkeypatch)
     shift = np.array([5.0, 0.0, 0.0])
     site = dataclasses.replace(data.site, origin=data.site.origin - shift)
     moved = dataclasses.replace(data, site=site, tx=data.tx + shift, rx_position=data.rx_position + shift)
-    there = baseline("gp", moved, split, "train", cache=tmp_path).methods[0]
-    assert np.allclose(there.positions.mean(0) - shift, data.tx[split.folds[0].train].mean(0), atol=0.1)
-    assert baseline("gp", moved, split, cache=tmp_path).scores.figures()["nmse"] == pytest.approx(
-        here["nmse"], rel=1e-3
-    )
+    there = baseline("gp", moved, split, cache=tmp_path)
+    fold = split.folds[0]
+    assert np.allclose(there.methods[0].positions, moved.tx[np.concatenate([fold.train, fold.val])])
+    assert there.scores.figures()["nmse"] == pytest.approx(here["nmse"], rel=1e-2)
 
 
 def test_a_damaged_cache_is_made_anew(campaign, folds, tmp_path, monkeypatch, caplog):
