@@ -24,9 +24,13 @@ class StepProgress(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Draw the bar."""
         self._bar = Progress(
-            TextColumn("step"), TextColumn("{task.completed:.0f}/{task.total:.0f}"), BarColumn(),
-            TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[figures]}"),
-        )  # fmt: skip
+            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
+            BarColumn(bar_width=30),
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[figures]}"),
+        )
         self._bar.start()
         self._bar.add_task("train", total=trainer.max_steps, completed=trainer.global_step, figures="")
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from gsparc.encoding import EncodingSettings, PositionEncoding
 
-
 EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities
 
 

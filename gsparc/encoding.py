@@ -9,7 +9,6 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-
 JITTER = 1e-5  # relative to the unit variance of the kernel
 
 

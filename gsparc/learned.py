@@ -3,101 +3,67 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
 import numpy as np
 import torch
-from lightning.pytorch.loggers import Logger
 from torch import Tensor
 
-from gsparc import surgery
-from gsparc.data.module import MeasurementsModule
+from gsparc import checkpoint, surgery
+from gsparc.confidence import Confidence, ConfidenceSettings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.emission import EmissionSettings
 from gsparc.encoding import Prior
+from gsparc.field import FieldSettings
 from gsparc.method import FitReport, Method, Prediction
-from gsparc.model import GaussianModel, ModelSettings
+from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import FrozenPlan, Pose
 from gsparc.resume import GsparcCheckpointIO
 from gsparc.schedule import OptimizerSettings
+from gsparc.trainer import Training, run_stage
 from gsparc.warmstart import learn_prior, warm_start
 
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
-
-
-@dataclass(frozen=True)
-class TrainerSettings:
-    """How long and how training runs.
-
-    Attributes:
-        max_steps: optimiser steps.
-        batch_size: samples per step.
-        val_every: steps between validations.
-        checkpoint_every: steps between `last.ckpt`.
-        gradient_clip: largest gradient norm; null never clips.
-        accelerator: Lightning's choice of device.
-    """
-
-    max_steps: int = 3000
-    batch_size: int = 16
-    val_every: int = 500
-    checkpoint_every: int = 500
-    gradient_clip: float | None = None
-    accelerator: str = "cpu"
-
-
-@dataclass
-class Training:
-    """What a run brings along; the method itself only knows how to learn.
-
-    Attributes:
-        settings: length and pace.
-        seed: of initial parameters, data order and densification.
-        callbacks: makes fresh Lightning callbacks.
-        loggers: made once per run, closed by the caller.
-        resume: checkpoint to go on from, or None.
-        config_yaml: the whole configuration, stored in every checkpoint.
-    """
-
-    settings: TrainerSettings = field(default_factory=TrainerSettings)
-    seed: int = 0
-    callbacks: Callable[[], Sequence[L.Callback]] = tuple
-    loggers: Sequence[Logger] = ()
-    resume: Path | None = None
-    config_yaml: str = ""
 
 
 class LearnedField(Method):
     """A Gaussian field trained by gradient.
 
     Args:
-        model: all switches of the model.
+        field, emission, attenuation, raster, confidence: all switches of the model.
         loss: task loss.
         optimizer: learning rates.
         name: as it appears in tables.
         warm_start: solve the emission in closed form before training (spectra of a static receiver).
+        refit: after validation, train again on training and validation rows together.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
     def __init__(
         self,
-        model: ModelSettings,
-        loss: LossSettings,
-        optimizer: OptimizerSettings,
+        field: FieldSettings = FieldSettings(),
+        emission: EmissionSettings = EmissionSettings(),
+        attenuation: AttenuationSettings = AttenuationSettings(),
+        raster: RasterSettings = RasterSettings(),
+        confidence: ConfidenceSettings = ConfidenceSettings(),
+        loss: LossSettings = LossSettings(),
+        optimizer: OptimizerSettings = OptimizerSettings(),
         name: str = "gsparc",
         warm_start: bool = False,
+        refit: bool = False,
         guesses: Sequence[str] = (),
     ) -> None:
-        self.settings = model
+        self.settings = ModelSettings(field, emission, attenuation, raster, confidence)
         self.loss = loss
         self.rates = optimizer
         self.name = name
         self.warm_start = warm_start
+        self.refit = refit
         self.guesses = tuple(guesses)
         self.training = Training()
         self.model: GaussianModel | None = None
@@ -109,63 +75,73 @@ class LearnedField(Method):
     # -- learning ----------------------------------------------------------------------------------
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
-        """Train on `fold.train`; `fold.val` is watched and calibrates the confidence."""
-        training, settings = self.training, self.training.settings
+        """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
+
+        The second stage (`refit`) trains again on both with the confidence fixed, because the baselines
+        learn from all of them.
+        """
+        training = self.training
+        self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
+        resumed = None if training.resume is None else checkpoint.read(training.resume)
+        stage = "train" if resumed is None else str(resumed.extra.get("stage", "train"))
+        seconds, confidence = 0.0, None
+        if resumed is not None:
+            seconds = float(resumed.extra.get("earlier_s", 0.0))
+        if stage == "train":
+            seconds += self._stage("train", data, fold, run_dir, training.resume, seconds)
+            self._calibrate(data, fold)
+        elif resumed is not None:
+            self.restore(data.site, resumed.state)
+        if self.refit and len(fold.val):
+            confidence = self.fitted().confidence
+            every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+            resume = training.resume if stage == "refit" else None
+            seconds += self._stage("refit", data, every, run_dir / "refit", resume, seconds, confidence)
+        self._frozen = None
+        return FitReport(seconds)
+
+    def _stage(
+        self,
+        stage: str,
+        data: Measurements,
+        fold: Fold,
+        folder: Path,
+        resume: Path | None,
+        earlier_s: float,
+        confidence: Confidence | None = None,
+    ) -> float:
+        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
+        training = self.training
         L.seed_everything(training.seed, verbose=False)
-        first = data.batch(fold.train[:1])
-        self._ends = (
-            {"rx_position": first.rx.position, "rx_rotation": first.rx.rotation}
-            if data.site.static_end == "rx"
-            else {"tx_position": first.tx[0]}
-        )
-        self.site = data.site
         started = time.perf_counter()
         if "kernel" in (self.settings.emission.encoding.kind, self.settings.confidence.encoding.kind):
-            anchors = self.settings.emission.encoding.anchors
-            self._prior = learn_prior(data, fold.train, anchors, training.seed)
+            self._prior = learn_prior(
+                data, fold.train, self.settings.emission.encoding.anchors, training.seed
+            )
         self.model = self._new_model(data.site)
-        if self.warm_start and training.resume is None:
-            if data.site.kind != "spectrum" or data.site.static_end != "rx" or self._prior is None:
+        if confidence is not None:
+            self.model.confidence = confidence.requires_grad_(False)
+        if self.warm_start and resume is None:
+            receiver = self._receiver()
+            if data.site.kind != "spectrum" or receiver is None or self._prior is None:
                 raise ValueError(
-                    "model.warm_start=true needs spectra, a static receiver and encoding.kind=kernel"
+                    "model.warm_start=true needs spectra, a static receiver and "
+                    "model.emission.encoding.kind=kernel"
                 )
-            warm_start(self.model, data, fold.train, first.rx, self._prior.noise)
+            warm_start(self.model, data, fold.train, receiver, self._prior.noise)
         prepared = time.perf_counter() - started
-        module = GaussianModule(self.model, self.loss, self.rates, settings.max_steps, run_dir)
-        last = L.callbacks.ModelCheckpoint(
-            run_dir, filename="last", every_n_train_steps=settings.checkpoint_every, save_top_k=1,
-            save_on_train_epoch_end=False, enable_version_counter=False,
-        )  # fmt: skip
-        trainer = L.Trainer(
-            accelerator=settings.accelerator,
-            devices=1,
-            max_steps=settings.max_steps,
-            max_epochs=-1,
-            callbacks=[*training.callbacks(), last],
-            logger=list(training.loggers) or False,
-            plugins=[GsparcCheckpointIO(self, training.config_yaml)],
-            gradient_clip_val=settings.gradient_clip,
-            val_check_interval=settings.val_every if len(fold.val) else None,
-            check_val_every_n_epoch=None,
-            limit_val_batches=None if len(fold.val) else 0,
-            num_sanity_val_steps=0,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            log_every_n_steps=50,
-            default_root_dir=run_dir,
-        )
-        batches = MeasurementsModule(data, fold, settings.batch_size, training.seed)
-        trainer.fit(module, datamodule=batches, ckpt_path=training.resume, weights_only=True)
-        if trainer.interrupted:
-            raise KeyboardInterrupt(f"training was interrupted; go on with ckpt_path={run_dir / 'last.ckpt'}")
-        self._frozen = None
-        self._calibrate(data, fold)
-        return FitReport(prepared + module.train_seconds, self.guesses)
+        module = GaussianModule(self.model, self.loss, self.rates, training.settings.max_steps, folder)
+        marks = {"stage": stage, "earlier_s": earlier_s + prepared}
+        files = GsparcCheckpointIO(self, training.config_yaml, marks)
+        return prepared + run_stage(module, data, fold, training, files, resume)
+
+    def _receiver(self) -> Pose | None:
+        ends = self._ends
+        return Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
 
     def _new_model(self, site: Site) -> GaussianModel:
-        ends = self._ends
-        receiver = Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
-        return GaussianModel(self.settings, site, receiver, ends.get("tx_position"), self._prior)
+        transmitter = self._ends.get("tx_position")
+        return GaussianModel(self.settings, site, self._receiver(), transmitter, self._prior)
 
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
         model = self.fitted()
@@ -196,23 +172,25 @@ class LearnedField(Method):
             ]
             confidence = None if parts[0].confidence is None else torch.cat([p.confidence for p in parts])  # type: ignore[misc]
             return Prediction(torch.cat([p.mean for p in parts]), confidence)
-        static = model.site.kind == "spectrum" and model.site.static_end == "rx"
-        if static and not rx.batched:
-            mean = (
-                self._frozen_plan(rx).render(model.features(tx, rx), int(model.gaussians.version)).squeeze(1)
-            )
-        else:
+        frozen = self._frozen_plan(rx)
+        if frozen is None:
             mean = model(tx, rx).mean
+        else:
+            mean = frozen.render(model.features(tx, rx), int(model.gaussians.version)).squeeze(1)
         if model.site.kind == "spectrum":
             mean = mean.clamp(0, 1)
         if model.confidence is None:
             return Prediction(mean)
         return Prediction(mean, model.confidence.normalised(model.moving(tx, rx)))
 
-    def _frozen_plan(self, rx: Pose) -> FrozenPlan:
-        model = self.fitted()
-        version = int(model.gaussians.version)
-        if self._frozen is None or self._frozen.version != version:
+    def _frozen_plan(self, rx: Pose) -> FrozenPlan | None:
+        """The matrix of the static receiver, made anew after an edit; None for any other pose."""
+        model, static = self.fitted(), self._receiver()
+        if model.site.kind != "spectrum" or static is None or rx.batched:
+            return None
+        if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
+            return None
+        if self._frozen is None or self._frozen.version != int(model.gaussians.version):
             self._frozen = model.freeze(rx)
         return self._frozen
 
@@ -236,3 +214,11 @@ class LearnedField(Method):
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.fitted().gaussians)
+
+
+def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:
+    """Where the end that never moves stands, local coordinates [m]."""
+    one = data.batch(np.array([row]))
+    if data.site.static_end == "rx":
+        return {"rx_position": one.rx.position, "rx_rotation": one.rx.rotation}
+    return {"tx_position": one.tx[0]}

@@ -55,7 +55,7 @@ def _taps() -> tuple[float, ...]:
 
 
 def _window(images: Tensor) -> Tensor:
-    """Gaussian window over (B, H, W), valid part: (B, H - 10, W - 10); shifted sums beat a convolution here."""
+    """Gaussian window over (B, H, W), valid part: (B, H - 10, W - 10). Shifted sums beat a convolution."""
     for axis in (1, 2):
         length = images.shape[axis] - 2 * WINDOW_RADIUS
         taps = _taps()

@@ -107,10 +107,6 @@ class GaussianModule(L.LightningModule):
         count = len(checkpoint["state_dict"]["model.gaussians.ids"])
         surgery.resize(self.model, self.model.gaussians, count)
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
-        """Move a batch."""
-        return batch.to(device)
-
     def _leave_evidence(self, batch: Batch, task: Tensor) -> str:
         path = self.run_dir / "nonfinite.pt"
         path.parent.mkdir(parents=True, exist_ok=True)

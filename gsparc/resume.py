@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,15 +20,19 @@ class GsparcCheckpointIO(CheckpointIO):
     Args:
         method: what is being trained.
         config_yaml: the whole configuration as text.
+        marks: what else a resumed run must know (which stage, seconds spent before it).
     """
 
-    def __init__(self, method: Method, config_yaml: str) -> None:
+    def __init__(self, method: Method, config_yaml: str, marks: Mapping[str, Any]) -> None:
         self.method = method
         self.config_yaml = config_yaml
+        self.marks = dict(marks)
 
     def save_checkpoint(self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write atomically."""
-        checkpoint.save(Path(path), self.method, self.config_yaml, extra={"trainer": trainer_state})
+        checkpoint.save(
+            Path(path), self.method, self.config_yaml, extra={"trainer": trainer_state, **self.marks}
+        )
 
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None

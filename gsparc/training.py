@@ -22,10 +22,11 @@ from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation import Evaluation, evaluate
-from gsparc.learned import LearnedField, Training
+from gsparc.learned import LearnedField
 from gsparc.method import Method
 from gsparc.registry import build
 from gsparc.summary import provenance, results_table, write_samples, write_summary
+from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)
 

@@ -25,7 +25,7 @@ COMPONENTS = 128
 
 
 def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
-    """Anchors and smoothness from training rows (n,); `anchors` of them, drawn by seed, when there are more."""
+    """Smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
     generator = np.random.default_rng(seed)
     chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]

@@ -1,0 +1,119 @@
+"""One stage of gradient training under Lightning."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import lightning.pytorch as L
+from lightning.pytorch.loggers import Logger
+from lightning.pytorch.plugins.io import CheckpointIO
+
+from gsparc.data.module import MeasurementsModule
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.module import GaussianModule
+
+
+@dataclass(frozen=True)
+class TrainerSettings:
+    """How long and how training runs.
+
+    Attributes:
+        max_steps: optimiser steps.
+        batch_size: samples per step.
+        val_every: steps between validations.
+        checkpoint_every: steps between `last.ckpt`.
+        gradient_clip: largest gradient norm; null never clips.
+        accelerator: Lightning's choice of device.
+    """
+
+    max_steps: int = 3000
+    batch_size: int = 16
+    val_every: int = 500
+    checkpoint_every: int = 500
+    gradient_clip: float | None = None
+    accelerator: str = "cpu"
+
+
+@dataclass
+class Training:
+    """What a run brings along; the method itself only knows how to learn.
+
+    Attributes:
+        settings: length and pace.
+        seed: of initial parameters, data order and densification.
+        callbacks: makes fresh Lightning callbacks.
+        loggers: made once per run, closed by the caller.
+        resume: checkpoint to go on from, or None.
+        config_yaml: the whole configuration, stored in every checkpoint.
+    """
+
+    settings: TrainerSettings = field(default_factory=TrainerSettings)
+    seed: int = 0
+    callbacks: Callable[[], Sequence[L.Callback]] = tuple
+    loggers: Sequence[Logger] = ()
+    resume: Path | None = None
+    config_yaml: str = ""
+
+
+def run_stage(
+    module: GaussianModule,
+    data: Measurements,
+    fold: Fold,
+    training: Training,
+    checkpoints: CheckpointIO,
+    resume: Path | None,
+) -> float:
+    """Train `module` on `fold.train`, watching `fold.val`; returns the seconds spent learning [s].
+
+    Raises:
+        KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
+    """
+    settings, folder = training.settings, module.run_dir
+    _hush()
+    last = L.callbacks.ModelCheckpoint(
+        folder,
+        filename="last",
+        every_n_train_steps=settings.checkpoint_every,
+        save_on_train_epoch_end=False,
+        save_on_exception=True,
+        enable_version_counter=False,
+    )
+    trainer = L.Trainer(
+        accelerator=settings.accelerator,
+        devices=1,
+        max_steps=settings.max_steps,
+        max_epochs=-1,
+        callbacks=[*training.callbacks(), last],
+        logger=list(training.loggers) or False,
+        plugins=[checkpoints],
+        gradient_clip_val=settings.gradient_clip,
+        val_check_interval=settings.val_every if len(fold.val) else None,
+        check_val_every_n_epoch=None if len(fold.val) else 1,
+        limit_val_batches=None if len(fold.val) else 0,
+        num_sanity_val_steps=0,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        log_every_n_steps=min(50, max(1, len(fold.train) // settings.batch_size)),
+        default_root_dir=folder,
+    )
+    batches = MeasurementsModule(data, fold, settings.batch_size, training.seed)
+    trainer.fit(module, datamodule=batches, ckpt_path=resume, weights_only=True)
+    if trainer.interrupted:
+        raise KeyboardInterrupt(f"training was interrupted; go on with ckpt_path={folder / 'last.ckpt'}")
+    return module.train_seconds
+
+
+def _hush() -> None:
+    """Lightning advertises and repeats what the progress line says; its warnings stay, but for three."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for pointless in (
+        r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
+        r".*does not have many workers.*",  # data this small is faster without
+        r".*Checkpoint directory .* exists and is not empty.*",  # it is the run directory
+    ):
+        warnings.filterwarnings("ignore", pointless)
