@@ -8,37 +8,6 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
-// The sums of Moments over blocks of lanes.
-template <class S, bool kTangent, bool kHides> struct MomentSums {
-    Vec<S> tau1{}, tau2{}, h1{}, h2{}, tau11{}, tau12{}, tau22{}, emits{}, hides{};
-
-    // d_alpha, d_gamma: loss by emitted and hidden share; without kHides the first holds both.
-    GSPARC_INLINE void add(const Layer<S, kHides>& layer, Mask<S> counts, Vec<S> d_alpha, Vec<S> d_gamma, Vec<S> t1, Vec<S> t2,
-                           Vec<S> form, Vec<S> alpha_max) {
-        const Vec<S> none = splat(S(0)), shape = select(counts, layer.shape, none);
-        d_alpha = select(counts & at_most(layer.emits, alpha_max), d_alpha, none);
-        emits = fma(d_alpha, shape, emits);
-        Vec<S> e = d_alpha * layer.alpha;
-        if (kHides) {
-            d_gamma = select(counts & at_most(layer.hides, alpha_max), d_gamma, none);
-            hides = fma(d_gamma, shape, hides);
-            e = fma(d_gamma, layer.gamma, e);
-        }
-        t1 = select(counts, t1, none), t2 = select(counts, t2, none);
-        const Vec<S> e1 = e * t1, e2 = e * t2;
-        tau1 += e1, tau2 += e2;
-        tau11 = fma(e1, t1, tau11), tau12 = fma(e1, t2, tau12), tau22 = fma(e2, t2, tau22);
-        if (kTangent) {
-            form = select(counts, form, none);
-            h1 = fma(form, e1, h1), h2 = fma(form, e2, h2);
-        }
-    }
-    void write(S* to) const {
-        const Vec<S> all[kMoments] = {tau1, tau2, h1, h2, tau11, tau12, tau22, emits, hides};
-        for (int k = 0; k < kMoments; ++k) to[k] = sum<S>(all[k]);
-    }
-};
-
 template <class S> struct StripScratch {
     S *before, *behind, *planes;  // transmittance, what is still to come, upstream gradient per channel
 };

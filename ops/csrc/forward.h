@@ -1,24 +1,10 @@
 // Front-to-back blending: images, and each Gaussian's weights.
 #pragma once
+#include "layer.h"
 #include "strips.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
-
-// Emitted and hidden share of one layer at a block of pixels. Used by forward and backward alike, so that the
-// transmittance of the second is that of the first, bit for bit.
-template <class S, bool kHides> struct Layer {
-    Vec<S> shape, emits, hides, alpha, gamma;
-
-    GSPARC_INLINE Layer(Vec<S> form, Mask<S> counts, S opacity, S extinction, Vec<S> alpha_max) {
-        const Vec<S> none = splat(S(0));
-        shape = exponential(form * S(-0.5));
-        emits = splat(opacity) * shape;
-        alpha = select(counts, lesser<S>(emits, alpha_max), none);
-        hides = kHides ? splat(extinction) * shape : emits;
-        gamma = kHides ? select(counts, lesser<S>(hides, alpha_max), none) : alpha;
-    }
-};
 
 template <class S, bool kTangent, bool kHides>
 void composite_strip(const CompositeArgs<S>& a, const Ranked<S>& ranked, const Tables<S>& tables, int task, S* before, S* planes) {

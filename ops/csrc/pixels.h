@@ -3,14 +3,18 @@
 //   equirect: column, row, sqrt(A), rho, sqrt(B), -, -, -, -, reach^2, gain
 #pragma once
 #include "footprint.h"
-#include "simd.h"
+
+#ifndef GSPARC_LANES
+#define GSPARC_LANES "simd.h"  // the CPU's vectors; a GPU thread is a vector of one lane
+#endif
+#include GSPARC_LANES
 
 namespace gsparc {
 namespace GSPARC_ISA {
 
 constexpr int kReach = 9, kGain = 10;
 
-template <class S> inline void write_record(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens, S* out) {
+template <class S> GSPARC_HD void write_record(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens, S* out) {
     if (lens.tangent) {
         for (int k = 0; k < 3; ++k) {
             out[k] = f.root_a * (f.e1[k] - f.rho * f.e2[k]) * f.stretch2;
@@ -30,6 +34,23 @@ template <class S> struct Tables {
     const S *cos_row, *sin_row;                 // (height)
     S turn, per_turn;                           // columns in a full circle and its inverse
 };
+
+// Fills numbers (3 (width + kLanes) + 2 height) and points the tables at them.
+template <class S> inline Tables<S> tables_of(const Lens<S>& lens, S* numbers) {
+    const int padded = lens.width + kLanes;
+    S *cc = numbers, *sc = cc + padded, *column = sc + padded, *cr = column + padded, *sr = cr + lens.height;
+    for (int j = 0; j < padded; ++j) {
+        const double azimuth = double(lens.first_azimuth) + j * double(lens.azimuth_step);
+        const bool real = j < lens.width;
+        cc[j] = real ? S(cos(azimuth)) : S(NAN), sc[j] = real ? S(sin(azimuth)) : S(NAN), column[j] = real ? S(j) : S(NAN);
+    }
+    for (int i = 0; i < lens.height; ++i) {
+        const double elevation = double(lens.first_elevation) + i * double(lens.elevation_step);
+        cr[i] = S(cos(elevation)), sr[i] = S(sin(elevation));
+    }
+    const S turn = lens.periodic ? S(lens.width) : S(6.283185307179586) / lens.azimuth_step;
+    return {cc, sc, column, cr, sr, turn, 1 / turn};
+}
 
 template <class S, bool kTangent> struct RowView;
 

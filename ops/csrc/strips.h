@@ -25,19 +25,7 @@ template <class S> struct GridTables {
     Tables<S> tables;
 
     explicit GridTables(const Lens<S>& lens) : numbers(3 * (lens.width + kLanes) + 2 * lens.height) {
-        const int padded = lens.width + kLanes;
-        S *cc = numbers.data, *sc = cc + padded, *column = sc + padded, *cr = column + padded, *sr = cr + lens.height;
-        for (int j = 0; j < padded; ++j) {
-            const double azimuth = double(lens.first_azimuth) + j * double(lens.azimuth_step);
-            const bool real = j < lens.width;
-            cc[j] = real ? S(cos(azimuth)) : S(NAN), sc[j] = real ? S(sin(azimuth)) : S(NAN), column[j] = real ? S(j) : S(NAN);
-        }
-        for (int i = 0; i < lens.height; ++i) {
-            const double elevation = double(lens.first_elevation) + i * double(lens.elevation_step);
-            cr[i] = S(cos(elevation)), sr[i] = S(sin(elevation));
-        }
-        const S turn = lens.periodic ? S(lens.width) : S(6.283185307179586) / lens.azimuth_step;
-        tables = {cc, sc, column, cr, sr, turn, 1 / turn};
+        tables = tables_of(lens, numbers.data);
     }
 };
 
