@@ -25,15 +25,16 @@ class EmissionSettings:
             `softplus` (powers without a ceiling) or `linear` (signed CSI).
         log_distance: subtract log d_i before the sigmoid (eq. 1 of the paper).
         init_scale: standard deviation of the last layer's initial weights.
-        init_bias: initial bias of the output, in units of the activation's input.
+        init_bias: initial bias of the output, in units of the activation's input; `auto` lets all
+            Gaussians together start at unit power where they simply add up (RSSI), else 0.
     """
 
     encoding: EncodingSettings = field(default_factory=EncodingSettings)
     hidden: int = 32
-    activation: Literal["sigmoid", "softplus", "linear"] = "sigmoid"
+    activation: Literal["auto", "sigmoid", "softplus", "linear"] = "sigmoid"
     log_distance: bool = True
     init_scale: float = 0.1
-    init_bias: float = 0.0
+    init_bias: float | Literal["auto"] = 0.0
 
 
 class Emission(nn.Module):

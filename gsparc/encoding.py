@@ -24,7 +24,7 @@ class EncodingSettings:
         anchors: largest number of training positions of `kernel`.
     """
 
-    kind: Literal["raw", "fourier", "kernel"] = "fourier"
+    kind: Literal["auto", "raw", "fourier", "kernel"] = "fourier"
     octaves: int = 5
     anchors: int = 1024
 

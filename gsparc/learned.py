@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import lightning.pytorch as L
 import numpy as np
@@ -23,10 +24,13 @@ from gsparc.method import FitReport, Method, Prediction
 from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import FrozenPlan, Pose
+from gsparc.resolve import Choices, resolve, settled
 from gsparc.resume import GsparcCheckpointIO
 from gsparc.schedule import OptimizerSettings
 from gsparc.trainer import Training, run_stage
 from gsparc.warmstart import learn_prior, warm_start
+
+log = logging.getLogger(__name__)
 
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
@@ -39,7 +43,8 @@ class LearnedField(Method):
         loss: task loss.
         optimizer: learning rates.
         name: as it appears in tables.
-        warm_start: solve the emission in closed form before training (spectra of a static receiver).
+        warm_start: solve the emission in closed form before training (spectra of a static receiver);
+            `auto` does so where it can.
         refit: after validation, train again on training and validation rows together.
         guesses: settings the source of this configuration does not give, one line each.
     """
@@ -54,7 +59,7 @@ class LearnedField(Method):
         loss: LossSettings = LossSettings(),
         optimizer: OptimizerSettings = OptimizerSettings(),
         name: str = "gsparc",
-        warm_start: bool = False,
+        warm_start: bool | Literal["auto"] = False,
         refit: bool = False,
         guesses: Sequence[str] = (),
     ) -> None:
@@ -68,6 +73,7 @@ class LearnedField(Method):
         self.training = Training()
         self.model: GaussianModel | None = None
         self.site: Site | None = None
+        self.choices: Choices | None = None
         self._ends: dict[str, Tensor] = {}
         self._prior: Prior | None = None
         self._frozen: FrozenPlan | None = None
@@ -82,6 +88,9 @@ class LearnedField(Method):
         """
         training = self.training
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
+        self.choices, reasons = resolve(self.settings, self.warm_start, data.site)
+        for reason in reasons:
+            log.info("%s", reason)
         resumed = None if training.resume is None else checkpoint.read(training.resume)
         stage = "train" if resumed is None else str(resumed.extra.get("stage", "train"))
         seconds, confidence = 0.0, None
@@ -114,14 +123,15 @@ class LearnedField(Method):
         training = self.training
         L.seed_everything(training.seed, verbose=False)
         started = time.perf_counter()
-        if "kernel" in (self.settings.emission.encoding.kind, self.settings.confidence.encoding.kind):
+        assert self.choices is not None
+        if "kernel" in (self.choices.encoding, self.settings.confidence.encoding.kind):
             self._prior = learn_prior(
                 data, fold.train, self.settings.emission.encoding.anchors, training.seed
             )
         self.model = self._new_model(data.site)
         if confidence is not None:
             self.model.confidence = confidence.requires_grad_(False)
-        if self.warm_start and resume is None:
+        if self.choices.warm_start and resume is None:
             receiver = self._receiver()
             if data.site.kind != "spectrum" or receiver is None or self._prior is None:
                 raise ValueError(
@@ -140,8 +150,10 @@ class LearnedField(Method):
         return Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
 
     def _new_model(self, site: Site) -> GaussianModel:
+        assert self.choices is not None
+        settings = settled(self.settings, self.choices)
         transmitter = self._ends.get("tx_position")
-        return GaussianModel(self.settings, site, self._receiver(), transmitter, self._prior)
+        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior)
 
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
         model = self.fitted()
@@ -199,11 +211,14 @@ class LearnedField(Method):
     def state(self) -> dict[str, Any]:
         """Everything `restore` needs."""
         prior = None if self._prior is None else vars(self._prior)
-        return {"ends": self._ends, "prior": prior, "model": self.fitted().state_dict()}
+        choices = None if self.choices is None else vars(self.choices)
+        model = self.fitted().state_dict()
+        return {"choices": choices, "ends": self._ends, "prior": prior, "model": model}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
         self.site = site
+        self.choices = Choices(**state["choices"])
         self._ends = dict(state["ends"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
         self.model = self._new_model(site)

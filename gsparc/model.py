@@ -111,6 +111,11 @@ class GaussianModel(nn.Module):
         prior: Prior | None = None,
     ) -> None:
         super().__init__()
+        if site.kind == "csi" and settings.emission.activation != "linear":
+            raise ValueError(
+                f"model.emission.activation={settings.emission.activation}: channels are signed, "
+                "choose linear (or auto)"
+            )
         self.settings = settings
         self.site = site
         box = torch.as_tensor(site.box).float()

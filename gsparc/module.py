@@ -62,8 +62,10 @@ class GaussianModule(L.LightningModule):
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
-        """Loss per sample (B,) before confidence."""
+        """Loss per sample (B,) before confidence; what was not measured counts as met."""
         if self.model.site.kind == "spectrum":
+            if batch.mask is not None:
+                prediction = torch.where(batch.mask, prediction, batch.target)
             return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
         return channel_loss(prediction, batch.target, batch.mask)
 
@@ -86,6 +88,8 @@ class GaussianModule(L.LightningModule):
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""
         mean = self.model(batch.tx, batch.rx).mean
+        if batch.mask is not None:
+            mean = torch.where(batch.mask, mean, batch.target)
         size = len(batch)
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
         if self.model.site.kind == "spectrum":

@@ -16,6 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.encoding import Prior
 from gsparc.model import GaussianModel
 from gsparc.ops import Pose
+from gsparc.peers.encoding import training_targets
 from gsparc.peers.gp import choose_kernel, principal_components
 
 IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
@@ -29,7 +30,7 @@ def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -
     generator = np.random.default_rng(seed)
     chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
-    parts = principal_components(data.target[looked_at], data.site.kind, COMPONENTS)
+    parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
     kernel = choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
     return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
 
@@ -58,9 +59,12 @@ def warm_start(
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
     factor = torch.linalg.cholesky(gram + ridge)
     logits, encoded = [], []
+    targets = training_targets(data, rows)  # holes are filled
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
-        emission = torch.cholesky_solve(weights.mT @ batch.target.flatten(1).mT, factor).mT
+        images = torch.from_numpy(targets[start : start + CHUNK]).flatten(1)
+        images = images.float() / 255 if images.dtype == torch.uint8 else images.float()
+        emission = torch.cholesky_solve(weights.mT @ images.mT, factor).mT
         distance = model.distances(batch.tx)
         attenuation = model.attenuation(distance)
         emission = emission if attenuation is None else emission / attenuation
