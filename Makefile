@@ -6,7 +6,7 @@ RUN := $(VENV)/bin/python
 SOURCES := $(wildcard ops/csrc/* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow bench lint format clean
+.PHONY: help setup demo test test-slow bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,7 +40,10 @@ bench: setup ## timings of the kernels as ratios
 lint: setup ## ruff and mypy
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
-	@rm -rf build/typed && mkdir -p build/typed/gsparc  # mypy sees the packages under their installed names
+	@$(MAKE) --no-print-directory typecheck
+
+typecheck: setup ## mypy over the packages under their installed names
+	@rm -rf build/typed && mkdir -p build/typed/gsparc
 	@cp -rs $(CURDIR)/gsparc/. build/typed/gsparc/ && for room in ops callbacks conf; do cp -rs $(CURDIR)/$$room build/typed/gsparc/; done
 	cd build/typed && $(CURDIR)/$(RUN) -m mypy --config-file $(CURDIR)/pyproject.toml gsparc
 
