@@ -102,15 +102,15 @@ def project(
     area = to_column * to_row * _norm(cofactors * torch.einsum("nki,nk->ni", axes, n))
     eps = optics.low_pass
     determinant = area**2 + eps * (k11 + k22) + eps**2
-    sharp = determinant > torch.finfo(means.dtype).tiny
-    determinant = torch.where(sharp, determinant, 1.0)
+    sharp = (determinant > torch.finfo(means.dtype).tiny) & (k22 + eps > torch.finfo(means.dtype).tiny)
+    determinant, k22 = torch.where(sharp, determinant, 1.0), torch.where(sharp, k22, 1.0)
 
     fade = ((distance - optics.near) / optics.near).clamp(0, 1)
     gain = fade**2 * (3 - 2 * fade)
     if optics.compensate:
         gain = gain * area / determinant.sqrt()
     return Projected(
-        present=present & sharp & (k22 + eps > torch.finfo(means.dtype).tiny),
+        present=present & sharp,
         distance=distance,
         direction=n,
         east=east,
@@ -189,12 +189,11 @@ def layers(
 
 def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     """Light before each ordered layer, (N, H W), zero once below the floor, and behind all, (H W,)."""
+    clear = gamma.new_ones(1, gamma.shape[1])
     with torch.no_grad():
-        before = torch.cumprod(torch.cat([torch.ones_like(gamma[:1]), 1 - gamma[:-1]]), 0)
-        lit = before >= floor
-    after = torch.cumprod(1 - torch.where(lit, gamma, 0.0), 0)
-    before = torch.cat([torch.ones_like(gamma[:1]), after[:-1]])
-    return torch.where(lit, before, 0.0), after[-1]
+        lit = torch.cumprod(torch.cat([clear, 1 - gamma]), 0)[:-1] >= floor
+    light = torch.cumprod(torch.cat([clear, 1 - torch.where(lit, gamma, 0.0)]), 0)
+    return torch.where(lit, light[:-1], 0.0), light[-1]
 
 
 def composite_weights(
@@ -210,9 +209,6 @@ def composite_weights(
     optics: Optics,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """For one pose and the Gaussians in `order`: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
-    if len(means) == 0:
-        empty = means.new_zeros(0, grid.height * grid.width)
-        return empty, empty, means.new_ones(grid.height * grid.width)
     seen = project(means[order], quats[order], scales[order], pose, grid, optics)
     shapes = footprints(seen, grid, optics, shift[order])
     alpha, gamma = layers(seen, shapes, opacities[order], extinctions[order], optics)

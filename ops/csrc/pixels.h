@@ -35,21 +35,27 @@ template <class S> struct Tables {
     S turn, per_turn;                           // columns in a full circle and its inverse
 };
 
-// Fills numbers (3 (width + kLanes) + 2 height) and points the tables at them.
-template <class S> inline Tables<S> tables_of(const Lens<S>& lens, S* numbers) {
+template <class S> GSPARC_HD int64_t table_size(const Lens<S>& lens) { return 3 * int64_t(lens.width + kLanes) + 2 * lens.height; }
+
+// Tables over numbers (table_size) that `fill_tables` has filled.
+template <class S> inline Tables<S> tables_at(const Lens<S>& lens, const S* numbers) {
     const int padded = lens.width + kLanes;
-    S *cc = numbers, *sc = cc + padded, *column = sc + padded, *cr = column + padded, *sr = cr + lens.height;
+    const S turn = lens.periodic ? S(lens.width) : S(6.283185307179586) / lens.azimuth_step;
+    return {numbers, numbers + padded, numbers + 2 * padded, numbers + 3 * padded, numbers + 3 * padded + lens.height, turn, 1 / turn};
+}
+
+template <class S> inline void fill_tables(const Lens<S>& lens, S* numbers) {
+    const int padded = lens.width + kLanes;
     for (int j = 0; j < padded; ++j) {
         const double azimuth = double(lens.first_azimuth) + j * double(lens.azimuth_step);
         const bool real = j < lens.width;
-        cc[j] = real ? S(cos(azimuth)) : S(NAN), sc[j] = real ? S(sin(azimuth)) : S(NAN), column[j] = real ? S(j) : S(NAN);
+        numbers[j] = real ? S(cos(azimuth)) : S(NAN), numbers[padded + j] = real ? S(sin(azimuth)) : S(NAN);
+        numbers[2 * padded + j] = real ? S(j) : S(NAN);
     }
     for (int i = 0; i < lens.height; ++i) {
         const double elevation = double(lens.first_elevation) + i * double(lens.elevation_step);
-        cr[i] = S(cos(elevation)), sr[i] = S(sin(elevation));
+        numbers[3 * padded + i] = S(cos(elevation)), numbers[3 * padded + lens.height + i] = S(sin(elevation));
     }
-    const S turn = lens.periodic ? S(lens.width) : S(6.283185307179586) / lens.azimuth_step;
-    return {cc, sc, column, cr, sr, turn, 1 / turn};
 }
 
 template <class S, bool kTangent> struct RowView;

@@ -24,8 +24,8 @@ template <class S> struct GridTables {
     Buffer<S> numbers;
     Tables<S> tables;
 
-    explicit GridTables(const Lens<S>& lens) : numbers(3 * (lens.width + kLanes) + 2 * lens.height) {
-        tables = tables_of(lens, numbers.data);
+    explicit GridTables(const Lens<S>& lens) : numbers(table_size(lens)), tables(tables_at(lens, numbers.data)) {
+        fill_tables(lens, numbers.data);
     }
 };
 

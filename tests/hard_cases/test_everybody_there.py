@@ -1,0 +1,51 @@
+"""Everybody there: a Gaussian that covers every strip, and a million of them.
+
+Remedy: entries are counted before they are allocated, and refused with a clear line beyond a bound
+(native.py). Shown: one giant costs one entry per strip; a million huge ones stay within the stated bytes:
+entries (4 B each) + records, boxes and orders (under 200 B each) + as much again while planning.
+"""
+
+import resource
+
+import pytest
+import torch
+from rasters import one, origin, random_scene, render
+
+from gsparc.ops import SphereGrid, composite, make_plan, native
+
+GRID = SphereGrid.hemisphere()
+
+
+def test_one_giant_covers_every_strip():
+    scene = one([1.0, 0.0, 1.0], sigma=40.0, opacity=0.5)
+    plan = make_plan(scene.means, scene.quats, scene.scales, scene.opacities, origin(), GRID)
+    assert plan.buffers[6].numel() == native._strips(GRID.height)
+    image = render(scene, origin(), GRID)["image"]
+    assert torch.isfinite(image).all() and (image > 0.1).double().mean() > 0.8
+
+
+def test_too_many_entries_are_refused_before_allocation(monkeypatch):
+    scene = random_scene(n=300, size=4.0)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    plan = make_plan(*model, origin(), GRID)
+    entries = plan.buffers[6].numel()
+    monkeypatch.setattr(native, "MEMORY_BOUND", entries * 8 * 10)
+    leaf = scene.means.clone().requires_grad_()
+    raster = composite(plan, leaf, *model[1:], scene.features)
+    with pytest.raises(MemoryError, match="use fewer or smaller Gaussians"):
+        raster.image.sum().backward()
+
+
+@pytest.mark.slow
+def test_a_million_huge_ones():
+    n = 1_000_000
+    draw = torch.Generator().manual_seed(0)
+    means = torch.randn(n, 3, generator=draw) * 5
+    model = (means, torch.randn(n, 4, generator=draw), torch.full((n, 3), 3.0), torch.full((n,), 0.3))
+    features = torch.ones(n, 1)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    plan = make_plan(*model, origin(), GRID)
+    image = composite(plan, *model, features).image
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+    assert torch.isfinite(image).all()
+    assert grown < 4 * plan.buffers[6].numel() + 2 * 200 * n

@@ -1,0 +1,71 @@
+"""Nobody there: no Gaussians, all culled, all transparent.
+
+Remedy: empty plans are plans (csrc/plan.cpp); outputs and gradients are defined: zeros, transmittance 1.
+Exact: nothing is computed that could round.
+"""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from rasters import origin, poses, random_scene, render
+
+from gsparc.ops import SphereGrid, freeze, make_plan, mean_weights
+
+GRID = SphereGrid.hemisphere(10, 20)
+BACKENDS = pytest.mark.parametrize("backend", ["cpu", "reference"])
+
+
+def check(got):
+    assert (got["image"] == 0).all() and (got["transmittance"] == 1).all() and not got["visible"].any()
+    assert all((value == 0).all() for name, value in got.items() if name.startswith("d_"))
+
+
+@BACKENDS
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@pytest.mark.parametrize("hides", [False, True])
+@pytest.mark.parametrize("count", [0, 3])
+def test_no_gaussians(backend, projection, hides, count):
+    scene = random_scene(n=0, hides=hides)
+    got = render(scene, poses(count), GRID, backend, projection=projection)
+    assert got["image"].shape == (3, 2, 10, 20) and got["d_means"].shape == (0, 3)
+    check(got)
+
+
+@BACKENDS
+def test_all_below_the_horizon(backend):
+    scene = random_scene(n=20, size=0.1)
+    under = replace(scene, means=scene.means * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double())
+    check(render(under, origin(), GRID, backend))
+
+
+@BACKENDS
+def test_all_transparent(backend):
+    scene = random_scene(n=20)
+    check(render(replace(scene, opacities=0 * scene.opacities), origin(), GRID, backend))
+
+
+@BACKENDS
+def test_weights_and_frozen_views_of_nothing(backend):
+    scene = random_scene(n=0)
+    model = [getattr(scene, k).requires_grad_() for k in ("means", "quats", "scales", "opacities")]
+    plan = make_plan(*model, origin(), GRID, backend=backend)
+    seen = mean_weights(plan, *model)
+    assert seen.mean.shape == (1, 0) == seen.share.shape
+    image = freeze(plan, *model, version=0).render(torch.zeros(0, 2).double(), version=0)
+    assert image.shape == (2, 10, 20) and (image == 0).all()
+
+
+@BACKENDS
+def test_share_of_the_unseen_is_zero_and_harmless(backend):
+    """Naive: sum / sum is 0 / 0."""
+    scene = random_scene(n=20)
+    model = [getattr(scene, k).clone() for k in ("means", "quats", "scales", "opacities")]
+    model[0] = model[0] * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double()
+    model[3] = model[3].requires_grad_()
+    plan = make_plan(*model, origin(), GRID, backend=backend)
+    seen = mean_weights(plan, *model)
+    (seen.share.sum() + seen.mean.sum()).backward()
+    assert (seen.share == 0).all() and (model[3].grad == 0).all()
+    naive = torch.zeros(20) / torch.zeros(20)
+    assert naive.isnan().all()

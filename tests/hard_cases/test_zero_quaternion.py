@@ -1,0 +1,39 @@
+"""Zero quaternion: normalising divides by zero.
+
+Remedy: it means no rotation and has no gradient (csrc/footprint.h, reference.py). Exact.
+"""
+
+import pytest
+import torch
+from rasters import origin, random_scene, render
+
+from gsparc.ops import SphereGrid
+
+GRID = SphereGrid.full_sphere(12, 24)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_zero_means_no_rotation(backend, dtype):
+    scene, plain = random_scene(n=10).to(dtype), random_scene(n=10).to(dtype)
+    scene.quats[::2] = 0.0
+    plain.quats[::2] = torch.tensor([1.0, 0, 0, 0], dtype=dtype)
+    got, want = render(scene, origin(), GRID, backend), render(plain, origin(), GRID, backend)
+    assert torch.equal(got["image"], want["image"]) and torch.equal(got["d_means"], want["d_means"])
+    assert (got["d_quats"][::2] == 0).all() and torch.isfinite(got["d_quats"]).all()
+    assert (got["d_quats"][1::2] != 0).any()
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_length_does_not_matter(backend):
+    scene, long = random_scene(n=10), random_scene(n=10)
+    long.quats[:] *= 1e6
+    got, want = render(long, origin(), GRID, backend), render(scene, origin(), GRID, backend)
+    assert (got["image"] - want["image"]).abs().max() < 1e-12
+    assert ((got["d_quats"] * 1e6 - want["d_quats"]).abs() < 1e-9).all()
+
+
+def test_plain_normalising_breaks():
+    q = torch.zeros(4, requires_grad=True)
+    (q / q.norm()).sum().backward()
+    assert q.grad.isnan().any()
