@@ -4,6 +4,7 @@
 #include <array>
 #include <cstring>
 #include <memory>
+#include <memory>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -44,16 +45,17 @@ template <class S> void sort_by_depth(const S* depths, std::vector<int32_t>& ite
 
 template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     const int64_t count = a.count;
-    std::vector<S> records(a.poses * count * kRecord), depths(a.poses * count);
-    std::vector<Box> boxes(a.poses * count);
+    // Not vectors: those would write zeros first.
+    const std::unique_ptr<S[]> records(new S[a.poses * count * kRecord]), depths(new S[a.poses * count]);
+    const std::unique_ptr<Box[]> boxes(new Box[a.poses * count]);
     constexpr int chunk = 1024;
     const int chunks = int((count + chunk - 1) / chunk);
     std::vector<int64_t> wrong(std::max(chunks, 1), -1);
     auto project = [&](int task, int) {
         const int pose = task / chunks;
         const int64_t base = pose * count;
-        const ProjectArgs<S> one = {a.model, a.count, a.lens, records.data() + base * kRecord, depths.data() + base,
-                                    a.means2d + 2 * base, a.radii + base, boxes.data() + base, a.visible + base, pose};
+        const ProjectArgs<S> one = {a.model, a.count, a.lens, records.get() + base * kRecord, depths.get() + base,
+                                    a.means2d + 2 * base, a.radii + base, boxes.get() + base, a.visible + base, pose};
         const int begin = task % chunks * chunk;
         const int64_t bad = kernels<S>().project(one, begin, std::min(begin + chunk, a.count));
         if (pose == 0) wrong[task] = bad;
@@ -74,7 +76,7 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
         items.reserve(count);
         for (int32_t i : by_id) (a.visible[base + i] ? items : hidden).push_back(i);
         a.shown[pose] = int32_t(items.size());
-        sort_by_depth(depths.data() + base, items);
+        sort_by_depth(depths.get() + base, items);
         std::copy(items.begin(), items.end(), a.order + base);
         std::copy(hidden.begin(), hidden.end(), a.order + base + items.size());
         int64_t* slots = a.slots + pose * (count + 1);
@@ -83,21 +85,30 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
         int64_t total = 0;
         for (int64_t rank = 0; rank < count; ++rank) {
             slots[rank] = total;
-            if (rank >= a.shown[pose]) {
-                a.boxes[base + rank] = {0, 0, 0, 0};
-                std::fill_n(a.records + (base + rank) * kRecord, kRecord, S(0));
-                continue;
-            }
-            const int64_t i = base + a.order[base + rank];
-            const Box box = boxes[i];
-            a.boxes[base + rank] = box;
-            std::copy_n(records.data() + i * kRecord, kRecord, a.records + (base + rank) * kRecord);
+            if (rank >= a.shown[pose]) continue;
+            const Box box = boxes[base + a.order[base + rank]];
             for (int strip = box.row0 / kStripRows; strip <= (box.row1 - 1) / kStripRows; ++strip) ++starts[strip], ++total;
         }
         slots[count] = total;
         per_pose[pose] = total;
     };
     parallel_for(a.poses, a.threads, arrange);
+    auto copy = [&](int task, int) {
+        const int pose = task / chunks;
+        const int64_t base = pose * count, begin = int64_t(task % chunks) * chunk, end = std::min(begin + chunk, count);
+        for (int64_t rank = begin; rank < end; ++rank) {
+            const int64_t i = base + a.order[base + rank];
+            S* record = a.records + (base + rank) * kRecord;
+            if (rank < a.shown[pose]) {
+                a.boxes[base + rank] = boxes[i];
+                std::copy_n(records.get() + i * kRecord, kRecord, record);
+            } else {
+                a.boxes[base + rank] = {0, 0, 0, 0};
+                std::fill_n(record, kRecord, S(0));
+            }
+        }
+    };
+    parallel_for(a.poses * chunks, a.threads, copy);
     a.strip_starts[0] = 0;
     for (int64_t k = 0; k < int64_t(a.poses) * a.strips; ++k) a.strip_starts[k + 1] += a.strip_starts[k];
     int64_t before = 0;
