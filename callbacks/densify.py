@@ -81,13 +81,15 @@ class Densify(L.Callback):
             return
         model: GaussianModel = module.model
         with torch.no_grad():
-            edit = self.plan(model)
+            # Draws are a pure function of (seed, step): a resumed run makes the same children.
+            draws = torch.Generator().manual_seed(torch.initial_seed() + step)
+            edit = self.plan(model, draws)
             before = len(model.gaussians)
             surgery.apply(edit, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
         log.debug("step %d: %d -> %d Gaussians", step, before, len(model.gaussians))
 
-    def plan(self, model: GaussianModel) -> surgery.Edit:
+    def plan(self, model: GaussianModel, generator: torch.Generator) -> surgery.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
         field = model.gaussians
         mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
@@ -114,7 +116,7 @@ class Densify(L.Callback):
                 field.log_scales[splits] - torch.log(torch.tensor(0.8 * self.children)),
             ]
         )
-        spread = _sample_inside(field.scales[splits], field.quats[splits])
+        spread = _sample_inside(field.scales[splits], field.quats[splits], generator)
         means = torch.cat([field.means[clones], field.means[splits] + spread])
         return surgery.Edit(
             keep=~(prune | split),
@@ -149,11 +151,11 @@ class Densify(L.Callback):
         self.statistics = dict(state["statistics"])
 
 
-def _sample_inside(scales: Tensor, quats: Tensor) -> Tensor:
+def _sample_inside(scales: Tensor, quats: Tensor, generator: torch.Generator) -> Tensor:
     """Offsets (M, 3) [m] drawn from Gaussians with the given scales (M, 3) and rotations (M, 4)."""
     w, *v = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     axis = torch.stack(v, -1)
-    local = torch.randn_like(scales) * scales
+    local = torch.randn(scales.shape, generator=generator) * scales
     # Rotating by a unit quaternion: x + 2 w (v x x) + 2 v x (v x x).
     turned = torch.linalg.cross(axis, local)
     return local + 2 * w.unsqueeze(-1) * turned + 2 * torch.linalg.cross(axis, turned)

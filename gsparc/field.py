@@ -17,8 +17,8 @@ class FieldSettings:
     Attributes:
         count: initial number of Gaussians N.
         init: `uniform` in the scene box enlarged by `margin` (the paper), or `sphere`: evenly spread
-            directions around the static receiver at distances between `near` and `far`. `auto` (as everywhere)
-            is settled by `gsparc.resolve` before a field is made.
+            directions around the static receiver at distances between `near` and `far`. `auto` is
+            settled by `gsparc.resolve` before a field is made.
         margin: enlargement of the box on each side [m].
         near, far: range of distances of `sphere` [m].
         opacity: initial opacity in (0, 1).

@@ -50,10 +50,7 @@ def resolve(
         return choice
 
     still = "spectra of a static receiver"
-    if spectra:
-        why = still if static else "the receiver moves"
-    else:
-        why = f"the target is {site.kind}"
+    why = (still if static else "the receiver moves") if spectra else f"the target is {site.kind}"
     init = decide("init", settings.field.init, "sphere" if spectra and static else "uniform", why)
     encoding = decide(
         "encoding.kind",

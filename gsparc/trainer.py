@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as L
 from lightning.pytorch.loggers import Logger
@@ -60,6 +64,48 @@ class Training:
     config_yaml: str = ""
 
 
+class _Stopped(BaseException):
+    """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a word."""
+
+
+class StopBetweenSteps(L.Callback):
+    """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
+
+    A second interrupt does not wait, and leaves the checkpoint before.
+
+    Args:
+        file: the checkpoint written when stopped.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.requested = False
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Write the checkpoint and end training when asked to."""
+        if self.requested:
+            trainer.save_checkpoint(self.file)
+            raise _Stopped
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take interrupts while training runs; outside the main thread there are none to take."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def interrupted(signum: int, frame: Any) -> None:
+            if self.requested:
+                raise KeyboardInterrupt
+            self.requested = True
+
+        before = signal.signal(signal.SIGINT, interrupted)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+
 def run_stage(
     module: GaussianModule,
     data: Measurements,
@@ -80,15 +126,15 @@ def run_stage(
         filename="last",
         every_n_train_steps=settings.checkpoint_every,
         save_on_train_epoch_end=False,
-        save_on_exception=True,
         enable_version_counter=False,
     )
+    stop = StopBetweenSteps(folder / "last.ckpt")
     trainer = L.Trainer(
         accelerator=settings.accelerator,
         devices=1,
         max_steps=settings.max_steps,
         max_epochs=-1,
-        callbacks=[*training.callbacks(), last],
+        callbacks=[*training.callbacks(), stop, last],
         logger=list(training.loggers) or False,
         plugins=[checkpoints],
         gradient_clip_val=settings.gradient_clip,
@@ -102,18 +148,22 @@ def run_stage(
         default_root_dir=folder,
     )
     batches = MeasurementsModule(data, fold, settings.batch_size, training.seed)
-    trainer.fit(module, datamodule=batches, ckpt_path=resume, weights_only=True)
-    if trainer.interrupted:
-        raise KeyboardInterrupt(f"training was interrupted; go on with ckpt_path={folder / 'last.ckpt'}")
+    try:
+        with stop.listening():
+            trainer.fit(module, datamodule=batches, ckpt_path=resume, weights_only=True)
+    except (_Stopped, SystemExit):  # Lightning's answer to a KeyboardInterrupt is SystemExit
+        advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
+        raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     return module.train_seconds
 
 
 def _hush() -> None:
-    """Lightning advertises and repeats what the progress line says; its warnings stay, but for three."""
+    """Lightning advertises and repeats what the progress line says; its warnings stay, but for four."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     for pointless in (
         r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
         r".*does not have many workers.*",  # data this small is faster without
+        r".*The dirpath has changed.*",  # a resumed run may have a directory of its own
         r".*Checkpoint directory .* exists and is not empty.*",  # it is the run directory
     ):
         warnings.filterwarnings("ignore", pointless)

@@ -1,0 +1,73 @@
+"""Files of a user's own measurements, small enough to train on in a second."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.simulate.shoebox import Room, scatter, trace
+
+FREQUENCY_HZ = np.array([3.0e8, 3.1e8])  # a metre of wavelength: 100 places then tell something of the rest
+STILL = np.array([1.0, 1.0, 0.5])
+
+
+def spectra(path: Path, rows: int = 40, moving: str = "tx", origin: float = 0.0) -> Path:
+    """Smooth 16 x 32 images over a cube of 1 m; `moving` end `tx` or `rx`, `origin` [m] on every axis."""
+    rng = np.random.default_rng(0)
+    where = rng.uniform(-0.5, 0.5, (rows, 3)).round(3)
+    waves = 2 * rng.normal(size=(16 * 32, 3))
+    images = 0.5 + 0.5 * np.sin(where @ waves.T + rng.uniform(0, 6, 16 * 32))
+    still = "rx" if moving == "tx" else "tx"
+    places = {f"{moving}_position": where + origin, f"{still}_position": np.array([4.0, 0, 0]) + origin}
+    np.savez(path, spectrum=images.reshape(rows, 16, 32), **places)
+    return path
+
+
+def channels(path: Path, rows: int = 80, moving: str = "rx", shape: str = "SAK") -> Path:
+    """Image sources in a 4 x 3 x 2.5 m room; `shape` is S, SK or SAK (2 antennas, 2 subcarriers)."""
+    room = Room.uniform((4.0, 3.0, 2.5), -0.5)
+    array = np.array([[0.0, 0, 0], [0.3, 0, 0]])
+    where = scatter(room, rows, seed=0, margin=0.4)
+    ends = (STILL, where) if moving == "rx" else (where, STILL)
+    traced = trace(room, *ends, FREQUENCY_HZ, max_order=1, array=array, snr_db=30)
+    cut = {"S": traced.csi[:, 0, 0], "SK": traced.csi[:, 0], "SAK": traced.csi}[shape]
+    frequency = FREQUENCY_HZ[0] if shape == "S" else FREQUENCY_HZ
+    np.savez(path, tx_position=ends[0], rx_position=ends[1], csi=cut, frequency_hz=frequency)
+    return path
+
+
+def powers(path: Path, rows: int = 80) -> Path:
+    """Received power in the same room, in dB."""
+    with np.load(channels(path, rows, shape="S")) as stored:
+        power = 20 * np.log10(np.abs(stored["csi"]))
+        np.savez(path, tx_position=stored["tx_position"], rx_position=stored["rx_position"], rssi_db=power)
+    return path
+
+
+def compose(*overrides: str, config: str = "train"):
+    """The configuration that `train.py` would see, with the command line's overrides."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_module
+    from hydra.core.global_hydra import GlobalHydra
+
+    GlobalHydra.instance().clear()
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        return hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
+
+
+def brief(file: Path, *more: str) -> list[str]:
+    """Overrides for a training run of a second or two: few Gaussians, few steps, the mean beside it."""
+    return [
+        "dataset=own",
+        f"dataset.file={file}",
+        "model.field.count=40",
+        "trainer.max_steps=20",
+        "trainer.batch_size=8",
+        "trainer.val_every=10",
+        "callbacks.pictures.every=1000",
+        "baselines=[mean]",
+        "logger=none",
+        "threads=1",
+        *more,
+    ]
