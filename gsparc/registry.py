@@ -18,6 +18,7 @@ METHODS = {
     "nearest": "gsparc.peers.nearest.Nearest",
     "idw": "gsparc.peers.idw.InverseDistance",
     "gp": "gsparc.peers.gp.GaussianProcess",
+    "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "gsparc": "gsparc.learned.LearnedField",
 }
 

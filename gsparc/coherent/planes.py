@@ -1,0 +1,51 @@
+"""Mirror planes and the images they make of a transmitter.
+
+A plane is (n, b): all p with n.p = b, n normalised on use. A word (i, j, ...) is the transmitter mirrored in
+plane i, then in plane j, and so on: a plane costs three numbers and gives many sources.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise, product
+
+import torch
+from torch import Tensor
+
+Word = tuple[int, ...]
+
+
+def reflect(points: Tensor, planes: Tensor) -> Tensor:
+    """Mirror points (..., 3) [m] in planes (..., 4), broadcast against each other."""
+    length = torch.linalg.vector_norm(planes[..., :3], dim=-1, keepdim=True)
+    normal = planes[..., :3] / length
+    height = (points * normal).sum(-1, keepdim=True) - planes[..., 3:]
+    return points - 2 * height * normal
+
+
+def bisector(first: Tensor, second: Tensor) -> Tensor:
+    """The planes (..., 4) that mirror `first` (..., 3) into `second` (..., 3)."""
+    offset = second - first
+    normal = offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True)
+    return torch.cat([normal, (normal * (first + second) / 2).sum(-1, keepdim=True)], -1)
+
+
+def images(transmitter: Tensor, planes: Tensor, words: tuple[Word, ...] | list[Word]) -> Tensor:
+    """Positions (K, 3) [m] of the words; differentiable in transmitter (3,) and planes (P, 4)."""
+    order = max(map(len, words), default=0)
+    place = transmitter.expand(len(words), 3)
+    letters = torch.tensor([[*w, *[-1] * (order - len(w))] for w in words], dtype=torch.long)
+    for step in range(order):
+        index = letters[:, step]
+        mirrored = reflect(place, planes[index.clamp_min(0)])
+        place = torch.where((index >= 0)[:, None], mirrored, place)
+    return place
+
+
+def all_words(letters: list[int], order: int) -> list[Word]:
+    """Words of 1 to `order` letters in which no letter follows itself (a mirror twice is no mirror)."""
+    return [
+        word
+        for length in range(1, order + 1)
+        for word in product(letters, repeat=length)
+        if all(a != b for a, b in pairwise(word))
+    ]

@@ -1,0 +1,113 @@
+"""Measured channels as rows of one regression: a place, a frequency and what was measured there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.ops import Pose
+
+
+@dataclass(frozen=True)
+class Rows:
+    """n complex numbers per output, each at one place and one frequency.
+
+    Attributes:
+        position: (n, 3) float64 [m], local.
+        frequency: (n,) float64 [Hz].
+        target: (n, R) complex64; R outputs share sources and visibility but not gains.
+        receiver: (n,) int64, which measurement a row belongs to.
+    """
+
+    position: Tensor
+    frequency: Tensor
+    target: Tensor
+    receiver: Tensor
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+    def take(self, index: Tensor) -> Rows:
+        """The rows with these numbers."""
+        return Rows(self.position[index], self.frequency[index], self.target[index], self.receiver[index])
+
+    def moved(self, shift: Tensor) -> Rows:
+        """The same rows with (3,) [m] added to every place."""
+        return Rows(self.position + shift, self.frequency, self.target, self.receiver)
+
+    def scaled(self, factor: float) -> Rows:
+        """The same rows with targets times `factor`."""
+        return Rows(self.position, self.frequency, self.target * factor, self.receiver)
+
+
+def tones_of(site: Site) -> np.ndarray:
+    """Frequencies (K,) float64 [Hz] of a site's channel; `ValueError` when nothing names them."""
+    if site.subcarriers_hz is not None:
+        return np.asarray(site.subcarriers_hz, dtype=np.float64)
+    if site.carrier_hz is None:
+        raise ValueError(f"{site.name}: neither subcarriers_hz nor carrier_hz is known; phase needs them")
+    return np.array([site.carrier_hz], dtype=np.float64)
+
+
+def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
+    """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""
+    if site.array is None or antennas == 1:
+        return position[:, None, :]
+    return position[:, None, :] + np.einsum("sij,ej->sei", rotation, np.asarray(site.array, np.float64))
+
+
+def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> np.ndarray:
+    """The same for queries: `count` poses, or one shared by all."""
+    position = rx.position.detach().cpu().double().numpy().reshape(-1, 3)
+    rotation = rx.rotation.detach().cpu().double().numpy().reshape(-1, 3, 3)
+    places = elements(site, position, rotation, antennas)
+    return np.broadcast_to(places, (count, *places.shape[1:]))
+
+
+def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
+    """At most `limit` rows from the given measurements.
+
+    Every measurement gives as many tones as fit, as a comb over the band that starts elsewhere for each,
+    so that together they see all of it. When even one each is too much, some measurements stay out.
+
+    Args:
+        data: kind csi, static transmitter.
+        index: (S,) measurements to draw from.
+        limit: largest number of rows.
+        seed: of the draw.
+    """
+    rng = np.random.default_rng(seed)
+    index = np.asarray(index)
+    antennas, tones = data.target.shape[1:]
+    frequency = tones_of(data.site)
+    places = elements(data.site, data.rx_position[index], data.rx_rotation[index], antennas)
+    per = places.shape[1]
+    if len(index) * per > limit:
+        kept = np.sort(rng.permutation(len(index))[: max(limit // per, 1)])
+        index, places = index[kept], places[kept]
+    wanted = min(max(limit // max(len(index) * per, 1), 1), tones)
+    position, tone, target, receiver = [], [], [], []
+    for row, place in zip(index, places, strict=True):
+        values = data.target[row]  # (A, K)
+        measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
+        for e in range(per):
+            known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
+            count = min(wanted, len(known))
+            if count == 0:
+                continue
+            comb = np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)
+            chosen = known[comb]
+            tone.append(frequency[chosen])
+            position.append(np.repeat(place[e][None], count, 0))
+            target.append(values[e, chosen][:, None] if per > 1 else values[:, chosen].T)
+            receiver.append(np.full(count, row))
+    return Rows(
+        torch.from_numpy(np.concatenate(position)),
+        torch.from_numpy(np.concatenate(tone)),
+        torch.from_numpy(np.concatenate(target).astype(np.complex64)),
+        torch.from_numpy(np.concatenate(receiver)).long(),
+    )

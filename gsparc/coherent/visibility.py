@@ -1,0 +1,81 @@
+"""Who sees which source: laws of how a source's gain varies from place to place.
+
+A law is anything with `correlation`; the process and the search know nothing else of it. Sources never hide
+each other: each has its own visibility, and all share the law's few numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+
+class Visibility(Protocol):
+    """How strongly the gains of one source at two places are correlated."""
+
+    def correlation(self, first: View, second: View) -> Tensor:
+        """(n, m) float32 in [0, 1], one where both places are the same."""
+        ...
+
+
+@dataclass(frozen=True)
+class View:
+    """How n places look at one source.
+
+    Attributes:
+        place: (n, 3) float32 [m], relative to the middle of the scene.
+        direction: (n, 3) float32, unit vectors from the source to the places.
+    """
+
+    place: Tensor
+    direction: Tensor
+
+    @staticmethod
+    def of(places: Tensor, source: Tensor) -> View:
+        """From float64 places (n, 3) and a source (3,) [m]."""
+        offset = places - source
+        length = torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)
+        return View(places.float(), (offset / length).float())
+
+
+@dataclass(frozen=True)
+class KernelVisibility:
+    """`c + (1 - c) Matern-3/2(direction, place)`: seen from everywhere, plus what comes and goes smoothly.
+
+    Attributes:
+        constant: share of the gain's variance that is the same everywhere.
+        angle: length scale of the direction to the source [rad].
+        length: length scale of the place [m].
+    """
+
+    constant: float | Tensor = 0.8
+    angle: float | Tensor = 0.5
+    length: float | Tensor = 2.0
+
+    def correlation(self, first: View, second: View) -> Tensor:
+        """See `Visibility`."""
+        squared = _squared(first.direction, second.direction) / self.angle**2
+        squared = squared + _squared(first.place, second.place) / self.length**2
+        return self.constant + (1 - self.constant) * matern32(squared)
+
+
+@dataclass(frozen=True)
+class SeenByAll:
+    """Every source is seen from everywhere with one gain: the empty room."""
+
+    def correlation(self, first: View, second: View) -> Tensor:
+        """See `Visibility`."""
+        return first.place.new_ones(len(first.place), len(second.place))
+
+
+def matern32(squared: Tensor) -> Tensor:
+    """Matern-3/2 of a squared scaled distance."""
+    root = (3 * squared + 1e-9).sqrt()
+    return (1 + root) * torch.exp(-root)
+
+
+def _squared(a: Tensor, b: Tensor) -> Tensor:
+    return (a.square().sum(-1)[:, None] + b.square().sum(-1)[None] - 2 * a @ b.T).clamp_min(0)
