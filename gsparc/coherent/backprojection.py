@@ -19,7 +19,7 @@ from gsparc.coherent.phase import LIGHT, NEAR_M
 from gsparc.coherent.process import Factor, steering
 from gsparc.coherent.rows import Rows
 
-BLOCK = 2048  # candidates at a time, so that a block stays in cache
+BLOCK = 1024  # candidates at a time, so that a block stays in cache
 
 
 @dataclass(frozen=True)
@@ -45,15 +45,18 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     middle = rows.position.mean(0)
     places, points = (rows.position - middle).float(), (candidates - middle).float()
     length = places.square().sum(1)
-    wavenumber = (2 * math.pi * rows.frequency / LIGHT).float()
+    per_metre = (rows.frequency / LIGHT).float()
+    real, imag = alpha.real.contiguous(), alpha.imag.contiguous()
     scores = []
     for block in points.split(BLOCK):
         squared = torch.addmm(length, block, places.T, alpha=-2).add_(block.square().sum(1)[:, None])
         distance = squared.clamp_min_(NEAR_M**2).sqrt_()
-        loss = distance.reciprocal()
-        conjugate = torch.polar(loss, torch.remainder(distance * wavenumber, 2 * math.pi))
-        matched = (conjugate @ alpha).abs().square().sum(1)
-        scores.append(matched / loss.square().sum(1))
+        cycles = distance * per_metre
+        phase = cycles.sub_(cycles.round()).mul_(2 * math.pi)
+        loss = distance.reciprocal_()
+        cosine, sine = phase.cos().mul_(loss), phase.sin_().mul_(loss)
+        matched = (cosine @ real - sine @ imag).square() + (cosine @ imag + sine @ real).square()
+        scores.append(matched.sum(1) / loss.square_().sum(1))
     return torch.cat(scores)
 
 

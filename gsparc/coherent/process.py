@@ -2,8 +2,8 @@
 
     h(x, f) = sum_k g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   g_k ~ GP(0, s_k^2 visibility_k(x, x'))
 
-so two rows have covariance `sum_k s_k^2 a_k a_k'* C_k + noise`; the rest is Gaussian-process
-regression (C. E. Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), ch. 2, 5).
+so two rows have covariance `sum_k s_k^2 a_k a_k'* C_k + noise`; the rest is regression as in C. E. Rasmussen
+and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), chapters 2 and 5.
 """
 
 from __future__ import annotations
@@ -89,12 +89,12 @@ class Factor:
     """A factored covariance of n rows with R outputs.
 
     Attributes:
-        root: (n, n) complex64, inverse of the lower Cholesky factor: K^-1 = root^H root.
+        lower: (n, n) complex64, Cholesky factor.
         alpha: (n, R) complex64, K^-1 y.
         nll: negative log marginal likelihood up to a constant.
     """
 
-    root: Tensor
+    lower: Tensor
     alpha: Tensor
     nll: float
 
@@ -102,17 +102,21 @@ class Factor:
     def of(covariance: Tensor, target: Tensor) -> Factor:
         """From a positive definite covariance, noise included."""
         lower = torch.linalg.cholesky(covariance)
-        eye = torch.eye(len(lower), dtype=lower.dtype)
-        root = torch.linalg.solve_triangular(lower, eye, upper=False)
-        white = root @ target
+        alpha = torch.cholesky_solve(target, lower)
         determinant = 2 * lower.diagonal().real.double().log().sum()
-        nll = white.abs().double().square().sum() + target.shape[1] * determinant
-        return Factor(root, root.mH @ white, float(nll))
+        fit = (target.conj() * alpha).real.double().sum()
+        return Factor(lower, alpha, float(fit + target.shape[1] * determinant))
+
+    @cached_property
+    def root(self) -> Tensor:
+        """(n, n), inverse of `lower`: K^-1 = root^H root."""
+        eye = torch.eye(len(self.lower), dtype=self.lower.dtype)
+        return torch.linalg.solve_triangular(self.lower, eye, upper=False)
 
     @cached_property
     def inverse(self) -> Tensor:
         """K^-1 (n, n)."""
-        return self.root.mH @ self.root
+        return torch.cholesky_inverse(self.lower)
 
 
 class Posterior:

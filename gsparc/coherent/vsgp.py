@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.coherent.phase import ranges, wave_over_band
 from gsparc.coherent.process import Posterior, Scene
+from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows, gather, query_elements, tones_of
 from gsparc.coherent.search import Search, SearchSettings
 from gsparc.coherent.visibility import KernelVisibility
@@ -28,8 +28,6 @@ log = logging.getLogger(__name__)
 
 SECONDS_PER_MEASUREMENT = 0.4  # a conference room of 350 gets 140 s
 LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 480.0
-CHUNK = 1024  # query places at a time
-VARIANCE_TONES = 3  # the error hardly varies over a band; these stand for all of it
 
 
 @dataclass(frozen=True)
@@ -104,8 +102,7 @@ class VirtualSourceGP(Method):
         held = self.frame.inside(everything)
         scenes, notes = self._search_all(data, known, started)
         self.members = [Posterior(held, scene, self.noise_floor) for scene in scenes]
-        for member in self.members:
-            _ = member.factor
+        self.query = Query(self.members)
         return FitReport(time.monotonic() - started, tuple(notes))
 
     def _search_all(
@@ -161,11 +158,9 @@ class VirtualSourceGP(Method):
         count, per = places.shape[:2]
         flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
         tones = torch.from_numpy(tones_of(site))
-        means, variances = zip(*[self._member(m, flat, tones) for m in self.members], strict=True)
-        stack = torch.stack(means)  # (members, B E, R, K)
+        stack, variance = self.query.means(flat, tones)  # (members, B E, R, K)
         mean = stack.mean(0)
-        spread = (stack - mean).abs().square().mean(0).flatten(1).mean(1)
-        variance = torch.stack(variances).mean(0) + spread
+        variance = variance + (stack - mean).abs().square().mean(0).flatten(1).mean(1)
         loudness = (self.frame.carrier_hz / tones).float()
         mean = (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
         variance = variance.reshape(count, per).mean(1)
@@ -174,22 +169,6 @@ class VirtualSourceGP(Method):
             confidence=(1 - variance).clamp(0, 1),
             variance=variance * self.frame.scale**2,
         )
-
-    @staticmethod
-    def _member(member: Posterior, places: Tensor, tones: Tensor) -> tuple[Tensor, Tensor]:
-        """One search's mean (m, R, K) and variance (m,) at places (m, 3), in the search's units."""
-        means, variances = [], []
-        chosen = tones[:: max(len(tones) // VARIANCE_TONES, 1)][:VARIANCE_TONES]
-        for part in places.split(CHUNK):
-            gains = member.gains(part)
-            waves = wave_over_band(ranges(part, member.scene.sources), tones)
-            means.append(torch.einsum("mkr,mkf->mrf", gains, waves))
-            per_tone = [
-                member.variance(Rows(part, tone.expand(len(part)), gains[:, 0], torch.arange(len(part))))
-                for tone in chosen
-            ]
-            variances.append(torch.stack(per_tone).mean(0))
-        return torch.cat(means), torch.cat(variances)
 
     # ---- keeping ----
     def state(self) -> dict[str, Any]:
@@ -211,6 +190,7 @@ class VirtualSourceGP(Method):
         self.frame = Frame(*state["frame"])
         rows = Rows(*state["rows"])
         self.members = [Posterior(rows, _scene(stored), self.noise_floor) for stored in state["scenes"]]
+        self.query = Query(self.members)
 
     def size(self) -> int:
         """Sources of the largest scene."""

@@ -1,0 +1,119 @@
+"""Fitted processes packed for queries: the sources of all searches side by side, rows of one place summed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.coherent.phase import ranges, wave_over_band
+from gsparc.coherent.process import Posterior, Scene, steering
+from gsparc.coherent.rows import Rows
+from gsparc.coherent.visibility import KernelVisibility, matern32
+
+CHUNK = 128  # places at a time: sources x places x rows floats in memory
+
+
+@dataclass(frozen=True)
+class Pack:
+    """Sources of one or more processes over the same n places.
+
+    Attributes:
+        sources: (K, 3) float64 [m].
+        law: (K, 3) float32: constant, 1 / angle^2, 1 / length^2 of each source's visibility.
+        places: (n, 3) float64 [m].
+        directions: (K, n, 3) float32, unit vectors from source to place.
+    """
+
+    sources: Tensor
+    law: Tensor
+    places: Tensor
+    directions: Tensor
+
+    @staticmethod
+    def of(scenes: list[Scene], places: Tensor) -> Pack:
+        """All sources of the scenes, in order."""
+        sources = torch.cat([scene.sources for scene in scenes])
+        return Pack(sources, torch.cat([_numbers(s) for s in scenes]), places, _directions(sources, places))
+
+    def correlation(self, queries: Tensor) -> Tensor:
+        """Visibility correlations (K, m, n) between queries (m, 3) float64 [m] and the places."""
+        cosine = torch.bmm(_directions(self.sources, queries), self.directions.mT)
+        constant, by_angle, by_length = (self.law[:, i, None, None] for i in range(3))
+        apart = torch.cdist(queries, self.places).square().float()
+        squared = (2 - 2 * cosine).clamp_min(0) * by_angle + apart * by_length
+        return constant + (1 - constant) * matern32(squared)
+
+
+class Query:
+    """Means of every process, and the variance of one, at new places.
+
+    Args:
+        members: processes over the same rows.
+        variance_rows: of the process whose variance is given: fewer rows know less, so it errs high.
+    """
+
+    def __init__(self, members: list[Posterior], variance_rows: int = 700) -> None:
+        rows, scenes = members[0].rows, [member.scene for member in members]
+        places, self.place_of = torch.unique(rows.position, dim=0, return_inverse=True)
+        self.pack = Pack.of(scenes, places)
+        self.counts = [len(scene.words) for scene in scenes]
+        pulled = [_pulled(member) for member in members]
+        weight = torch.zeros(sum(self.counts), len(places), rows.target.shape[1], dtype=torch.complex64)
+        weight.index_add_(1, self.place_of, torch.cat(pulled))
+        self.real, self.imag = weight.real.contiguous(), weight.imag.contiguous()
+        few = torch.linspace(0, len(rows) - 1, min(variance_rows, len(rows))).long()
+        first = (
+            members[0]
+            if len(few) == len(rows)
+            else Posterior(rows.take(few), scenes[0], members[0].noise_floor)
+        )
+        self.scene, self.root, self.few = scenes[0], first.factor.root, few
+        self.row_waves = first.waves
+
+    def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor]:
+        """Means (M, m, R, F) of the processes at queries (m, 3) [m] and tones (F,) [Hz]; variance (m,).
+
+        The variance holds at the middle of the band; it hardly changes over it.
+        """
+        means, variances = [], []
+        middle = tones[len(tones) // 2]
+        for part in queries.split(CHUNK):
+            correlation = self.pack.correlation(part)
+            gains = torch.complex(correlation @ self.real, correlation @ self.imag)  # (K, m, R)
+            waves = wave_over_band(ranges(part, self.pack.sources), tones)  # (m, K, F)
+            split = zip(gains.split(self.counts), waves.split(self.counts, 1), strict=True)
+            means.append(torch.stack([torch.einsum("kmr,mkf->mrf", g, w) for g, w in split]))
+            variances.append(self._variance(part, middle, correlation[: self.counts[0]]))
+        return torch.cat(means, 1), torch.cat(variances)
+
+    def _variance(self, part: Tensor, tone: Tensor, correlation: Tensor) -> Tensor:
+        power = self.scene.log_amplitude.mul(2).exp()
+        none = torch.empty(len(part), 0, dtype=torch.complex64)
+        waves = steering(
+            Rows(part, tone.expand(len(part)), none, torch.arange(len(part))), self.scene.sources
+        )
+        seen = correlation[:, :, self.place_of[self.few]]
+        cross = torch.einsum("mk,kmn,nk->mn", waves * power, seen.to(waves.dtype), self.row_waves.conj())
+        prior = (waves.abs().square() * power).sum(1) + torch.tensor(self.scene.log_noise).exp()
+        return (prior - (self.root @ cross.mH).abs().square().sum(0)).clamp_min(0)
+
+
+def _pulled(member: Posterior) -> Tensor:
+    """What each row adds to each source's gain (K, n, R): s_k^2 conj(a_k) alpha."""
+    weights = member.waves.conj() * member.scene.log_amplitude.mul(2).exp()
+    return weights.T[:, :, None] * member.factor.alpha
+
+
+def _numbers(scene: Scene) -> Tensor:
+    law = scene.visibility
+    if not isinstance(law, KernelVisibility):
+        raise TypeError(f"queries know KernelVisibility, not {type(law).__name__}")
+    numbers = [float(law.constant), float(law.angle) ** -2, float(law.length) ** -2]
+    return torch.tensor(numbers).expand(len(scene.words), 3)
+
+
+def _directions(sources: Tensor, places: Tensor) -> Tensor:
+    offset = places[None] - sources[:, None]
+    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).float()
