@@ -7,6 +7,7 @@ register its own kernel under the same name.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,7 +88,8 @@ def plan_op(
     _check_memory(count, 4)
     entries = means.new_empty(count, dtype=torch.int32)
     _native.entries(twice, poses, n, threads, whole[0], _addresses(*buffers, entries))
-    return (*buffers, entries, means2d, radii, visible)
+    outputs: Any = (*buffers, entries, means2d, radii, visible)
+    return outputs
 
 
 @plan_op.register_fake
@@ -178,7 +180,8 @@ def composite_backward_op(
         *(means.dtype == torch.float64, poses, n, samples, channels, torch.get_num_threads(), whole, real),
         _addresses(*buffers, *model, *inputs, grad_transmittance, *grads, grad_features, grad_screen),
     )
-    return (*_filled(grads, means), grad_features, grad_screen)
+    outputs: Any = (*_filled(grads, means), grad_features, grad_screen)
+    return outputs
 
 
 @composite_backward_op.register_fake
@@ -450,7 +453,7 @@ def _gradients(means, quats, scales, opacities, extinctions) -> list[Tensor | No
     return [None if tensor is None else _like(tensor) for tensor in tensors]
 
 
-def _filled(grads: list[Tensor | None], means: Tensor) -> tuple[Tensor, ...]:
+def _filled(grads: list[Tensor | None], means: Tensor) -> Any:
     return tuple(means.new_empty(0) if grad is None else grad for grad in grads)
 
 

@@ -1,0 +1,47 @@
+"""The compiled kernels; see csrc/bindings.cpp. Tensors are passed as addresses, 0 for an absent one."""
+
+from collections.abc import Sequence
+
+RECORD: int
+MOMENTS: int
+STRIP_ROWS: int
+
+Ints = Sequence[int]
+Reals = Sequence[float]
+
+def plan(
+    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
+) -> int: ...
+def entries(twice: bool, poses: int, count: int, threads: int, height: int, tensors: Ints) -> None: ...
+def composite(
+    twice: bool,
+    poses: int,
+    count: int,
+    samples: int,
+    channels: int,
+    threads: int,
+    whole: Ints,
+    real: Reals,
+    tensors: Ints,
+) -> None: ...
+def composite_backward(
+    twice: bool,
+    poses: int,
+    count: int,
+    samples: int,
+    channels: int,
+    threads: int,
+    whole: Ints,
+    real: Reals,
+    tensors: Ints,
+) -> None: ...
+def weights(
+    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
+) -> None: ...
+def weights_backward(
+    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
+) -> None: ...
+def freeze(twice: bool, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints) -> int: ...
+def thaw(twice: bool, height: int, width: int, channels: int, threads: int, tensors: Ints) -> None: ...
+def instruction_set() -> str: ...
+def use_instruction_set(name: str) -> bool: ...
