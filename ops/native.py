@@ -88,8 +88,8 @@ def plan_op(
     _check_memory(count, 4)
     entries = means.new_empty(count, dtype=torch.int32)
     _native.entries(twice, poses, n, threads, whole[0], _addresses(*buffers, entries))
-    outputs: Any = (*buffers, entries, means2d, radii, visible)
-    return outputs
+    plan: Any = (*buffers, entries, means2d, radii, visible)
+    return plan
 
 
 @plan_op.register_fake
