@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import lightning.pytorch as L
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-SHOWN = {
-    "train/task_loss": "loss",
-    "val/ssim_gauss": "val ssim",
-    "val/psnr_db": "val dB",
-    "val/mse": "val mse",
+SHOWN = {  # all of it fits a terminal of 80 columns
+    "train/task_loss": "loss {:.4g}",
+    "val/ssim_gauss": "ssim {:.4f}",
+    "val/psnr_db": "{:.2f} dB",
+    "val/mse": "mse {:.4g}",
 }
 
 
@@ -24,11 +24,9 @@ class StepProgress(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Draw the bar."""
         self._bar = Progress(
-            TextColumn("step {task.completed:.0f}/{task.total:.0f}"),
-            BarColumn(bar_width=30),
-            TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            BarColumn(bar_width=8),
+            TimeRemainingColumn(elapsed_when_finished=True),
             TextColumn("{task.fields[figures]}"),
         )
         self._bar.start()
@@ -41,8 +39,8 @@ class StepProgress(L.Callback):
         task = self._bar.task_ids[0]
         self._bar.update(task, completed=trainer.global_step)
         if trainer.global_step % 20 == 0 or trainer.global_step == trainer.max_steps:
-            found = {name: trainer.callback_metrics.get(key) for key, name in SHOWN.items()}
-            figures = [f"{name} {float(value):.4g}" for name, value in found.items() if value is not None]
+            found = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
+            figures = [form.format(float(value)) for form, value in found.items() if value is not None]
             self._bar.update(task, figures=", ".join([*figures, f"{len(module.model.gaussians)} Gaussians"]))
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:

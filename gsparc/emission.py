@@ -77,12 +77,11 @@ class Emission(nn.Module):
         if not self.settings.hidden:
             count, width, channels = self.weight2.shape
             flat = self.weight2.permute(1, 0, 2).reshape(width, count * channels)
-            return (encoded @ flat).view(-1, count, channels) + self.bias2
+            return (encoded @ flat).view(len(encoded), count, channels) + self.bias2
         count, width, hidden = self.weight1.shape
         # One product for all Gaussians: the encoded position is the same for each of them.
-        inner = (encoded @ self.weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(
-            -1, count, hidden
-        )
+        flat = self.weight1.permute(1, 0, 2).reshape(width, count * hidden)
+        inner = (encoded @ flat).view(len(encoded), count, hidden)
         inner = torch.relu(inner + self.bias1)
         return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
 

@@ -9,6 +9,8 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
+
 
 @dataclass(frozen=True)
 class FieldSettings:
@@ -95,7 +97,8 @@ def initial_field(
     if settings.init == "uniform":
         low, high = box[0] - settings.margin, box[1] + settings.margin
         means = low + (high - low) * torch.rand(count, 3)
-        spacing = ((high - low).prod() / max(count, 1)) ** (1 / 3)
+        volume = (high - low).clamp_min(FLAT).prod()  # positions in one plane span none
+        spacing = (volume / max(count, 1)) ** (1 / 3)
         scales = torch.full((count, 3), float(settings.scale or spacing / 2))
         return GaussianField(means, scales, settings.opacity)
     if settings.init != "sphere":

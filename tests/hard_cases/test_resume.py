@@ -7,6 +7,7 @@ and so are the statistics of the last interval. Seconds, machine and memory diff
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -62,10 +63,8 @@ def kill_at(run: subprocess.Popen, file: Path, saves: int, after_s: float = 0.0)
     seen: set[int] = set()
     while len(seen) < saves:
         assert run.poll() is None, run.communicate()[0]
-        try:
+        with contextlib.suppress(FileNotFoundError):
             seen.add(file.stat().st_mtime_ns)
-        except FileNotFoundError:
-            pass
         time.sleep(0.001)
     time.sleep(after_s)
     run.send_signal(signal.SIGKILL)

@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from gsparc.callbacks import OpacityReset
+from gsparc.field import GaussianField
+
+
+@pytest.fixture
+def module():
+    field = GaussianField(torch.zeros(4, 3), torch.ones(4, 3), 0.5)
+    with torch.no_grad():
+        field.opacity_logits.copy_(torch.tensor([3.0, 0.0, -9.0, 5.0]))
+    return SimpleNamespace(model=SimpleNamespace(gaussians=field))
+
+
+def trainer(module, step: int) -> SimpleNamespace:
+    logits = module.model.gaussians.opacity_logits
+    optimizer = torch.optim.Adam([logits])
+    logits.grad = torch.ones_like(logits)
+    kept = logits.detach().clone()
+    optimizer.step()
+    with torch.no_grad():
+        logits.copy_(kept)
+    return SimpleNamespace(optimizers=[optimizer], global_step=step)
+
+
+def test_opaque_ones_are_lowered_and_forget_their_momentum(module):
+    run = trainer(module, 30)
+    OpacityReset(interval=30, stop=100, ceiling=0.01).on_train_batch_end(run, module)
+    field = module.model.gaussians
+    want = torch.tensor([0.01, 0.01, torch.sigmoid(torch.tensor(-9.0)), 0.01])
+    assert torch.allclose(field.opacities, want)
+    state = run.optimizers[0].state[field.opacity_logits]
+    assert state["exp_avg"].bool().tolist() == [False, False, True, False]
+    assert state["exp_avg_sq"].bool().tolist() == [False, False, True, False]
+    assert int(field.version) == 1  # frozen views are stale
+
+
+@pytest.mark.parametrize("step", [0, 29, 31, 120])
+def test_only_on_schedule(module, step):
+    before = module.model.gaussians.opacity_logits.detach().clone()
+    OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, step), module)
+    assert torch.equal(module.model.gaussians.opacity_logits, before)
+    assert int(module.model.gaussians.version) == 0

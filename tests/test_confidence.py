@@ -1,0 +1,59 @@
+from __future__ import annotations
+
+import torch
+
+from gsparc.confidence import Confidence, ConfidenceSettings, weighted
+from gsparc.encoding import EncodingSettings, PositionEncoding
+
+BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
+
+
+def confidence(**more) -> Confidence:
+    torch.manual_seed(0)
+    return Confidence(ConfidenceSettings(**more), PositionEncoding(EncodingSettings("raw"), BOX))
+
+
+def test_the_weighted_loss_is_the_papers():
+    loss, g = torch.rand(6), torch.randn(6)
+    c = 1 + g.exp()
+    assert torch.allclose(weighted(loss, g, 0.3), c * loss - 0.3 * c.log(), atol=1e-6)
+
+
+def test_the_best_confidence_is_alpha_over_loss():
+    g = torch.linspace(-9, 9, 20001)
+    for loss in (0.01, 0.05, 0.1):
+        best = 1 + g[weighted(torch.tensor(loss), g, 0.3).argmin()].exp()
+        assert abs(float(best) - 0.3 / loss) < 0.02 * 0.3 / loss
+    # Above alpha the floor C = 1 is best: a poor sample still counts once.
+    assert weighted(torch.tensor(0.5), g, 0.3).argmin() == 0
+
+
+def test_the_exponent_stays_within_the_clamp():
+    sure = confidence(clamp=2.0)
+    with torch.no_grad():
+        sure.network[2].bias.fill_(1e6)
+    assert torch.equal(sure.exponent(torch.rand(3, 3)), torch.full((3,), 2.0))
+
+
+def test_the_range_comes_from_calibration_and_is_not_moved_by_queries():
+    sure = confidence()
+    calibration = torch.rand(50, 3)
+    sure.calibrate(calibration)
+    own = sure.normalised(calibration)
+    assert own.min() == 0 and own.max() == 1
+    before = (sure.low.clone(), sure.high.clone())
+    anywhere = sure.normalised(100 * torch.randn(500, 3))
+    assert ((anywhere >= 0) & (anywhere <= 1)).all()
+    assert (sure.low, sure.high) == before
+
+
+def test_one_calibration_position_gives_a_range():
+    sure = confidence()
+    sure.calibrate(torch.zeros(1, 3))
+    assert torch.isfinite(sure.normalised(torch.randn(5, 3))).all()
+
+
+def test_a_surer_position_expects_a_smaller_error():
+    sure, where = confidence(), torch.randn(20, 3)
+    order = sure.exponent(where).argsort()
+    assert (sure.error_level(where)[order].diff() <= 0).all()

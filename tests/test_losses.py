@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from skimage.metrics import structural_similarity
+
+from gsparc.losses import channel_loss, spectrum_loss, ssim
+
+
+def images(batch: int = 3, height: int = 20, width: int = 31, seed: int = 0) -> torch.Tensor:
+    draw = torch.Generator().manual_seed(seed)
+    return torch.rand(batch, height, width, generator=draw, dtype=torch.float64)
+
+
+def test_ssim_is_scikit_images():
+    a, b = images(seed=0), images(seed=1)
+    want = [
+        structural_similarity(
+            x.numpy(), y.numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1
+        )
+        for x, y in zip(a, b, strict=True)
+    ]
+    assert torch.allclose(ssim(a, b), torch.tensor(want, dtype=torch.float64), atol=1e-12)
+
+
+def test_the_written_backward_is_the_derivative():
+    a, b = images(2, 13, 15).requires_grad_(), images(2, 13, 15, seed=1)
+    assert torch.autograd.gradcheck(lambda x: ssim(x, b), (a,))
+
+
+def test_an_image_is_like_itself():
+    a = images().float()
+    assert torch.allclose(ssim(a, a), torch.ones(3), atol=1e-5)
+    assert torch.allclose(spectrum_loss(a, a), torch.zeros(3), atol=1e-5)
+
+
+def test_too_small_an_image_is_refused():
+    with pytest.raises(ValueError, match="at least 11 x 11"):
+        ssim(images(1, 10, 30), images(1, 10, 30))
+
+
+def test_spectrum_loss_mixes_l1_and_ssim():
+    a, b = images(), images(seed=1)
+    absolute = (a - b).abs().mean((1, 2))
+    assert torch.allclose(spectrum_loss(a, b, 0.2), 0.8 * absolute + 0.2 * (1 - ssim(a, b)))
+    assert torch.equal(spectrum_loss(a, b, 0.0), absolute)
+
+
+def test_no_ssim_no_limit_on_the_size():
+    assert spectrum_loss(images(2, 3, 3), images(2, 3, 3), 0.0).shape == (2,)
+
+
+def test_channel_loss_is_the_mean_squared_error():
+    h, g = torch.randn(4, 2, 3, dtype=torch.complex64), torch.randn(4, 2, 3, dtype=torch.complex64)
+    assert torch.allclose(channel_loss(h, g), ((h - g).abs() ** 2).mean((1, 2)))
+    p, q = torch.rand(4, 1), torch.rand(4, 1)
+    assert torch.allclose(channel_loss(p, q), ((p - q) ** 2).mean(1))
+
+
+def test_channel_loss_counts_what_was_measured():
+    h, g = torch.randn(2, 2, 3, dtype=torch.complex64), torch.zeros(2, 2, 3, dtype=torch.complex64)
+    mask = torch.tensor([[[True, False, False], [True, False, False]], [[False] * 3, [False] * 3]])
+    got = channel_loss(h, g, mask)
+    assert torch.allclose(got[0], (h[0, :, 0].abs() ** 2).mean()) and got[1] == 0

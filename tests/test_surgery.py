@@ -1,0 +1,90 @@
+from __future__ import annotations
+
+import torch
+
+from gsparc import surgery
+from gsparc.field import GaussianField
+from gsparc.surgery import Edit, resize, row_parameters
+
+
+class Root(torch.nn.Module):
+    """A field, a per-Gaussian head and something that belongs to nobody in particular."""
+
+    def __init__(self, count: int = 6) -> None:
+        super().__init__()
+        self.gaussians = GaussianField(torch.arange(3.0 * count).reshape(count, 3), torch.ones(count, 3), 0.5)
+        self.head = torch.nn.Module()
+        self.head.per_gaussian = True
+        self.head.weight = torch.nn.Parameter(torch.randn(count, 2, 3))
+        self.shared = torch.nn.Parameter(torch.randn(count, 3))  # as many rows, but not the Gaussians'
+
+
+def stepped(root: Root) -> torch.optim.Adam:
+    optimizer = torch.optim.Adam([{"params": [p]} for p in root.parameters()], fused=True)
+    sum(p.square().sum() for p in root.parameters()).backward()
+    optimizer.step()
+    return optimizer
+
+
+def test_only_rows_of_gaussians_are_edited():
+    names = set(row_parameters(Root(), 6))
+    assert names == {f"gaussians.{n}" for n in ("means", "log_scales", "quats", "opacity_logits")} | {
+        "head.weight"
+    }
+
+
+def test_one_edit_moves_everything_together():
+    root = Root()
+    optimizer = stepped(root)
+    rows = {name: p.detach().clone() for name, p in row_parameters(root, 6).items()}
+    moments = {id(p): optimizer.state[p]["exp_avg"].clone() for p in root.parameters()}
+    old = {name: moments[id(p)] for name, p in row_parameters(root, 6).items()}
+    shared = root.shared
+    keep = torch.tensor([True, False, True, True, False, True])
+    replace = {"gaussians.means": torch.full((2, 3), 9.0)}
+    counted = {"seen": torch.arange(6.0)}
+    edited = surgery.apply(
+        Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer, counted
+    )
+    for name, parameter in row_parameters(root, 6).items():
+        assert torch.equal(parameter[:4], rows[name][keep])
+        wanted = replace.get(name, rows[name][[1, 3]])
+        assert torch.equal(parameter[4:], wanted)
+        state = optimizer.state[parameter]
+        assert torch.equal(state["exp_avg"][:4], old[name][keep]) and not state["exp_avg"][4:].any()
+        assert state["exp_avg_sq"].shape == parameter.shape and not state["exp_avg_sq"][4:].any()
+    assert edited["seen"].tolist() == [0, 2, 3, 5, 0, 0]
+    assert root.gaussians.ids.tolist() == [0, 2, 3, 5, 6, 7] and int(root.gaussians.next_id) == 8
+    assert int(root.gaussians.version) == 1 and root.shared is shared
+    held = {id(group["params"][0]) for group in optimizer.param_groups}
+    assert held == {id(p) for p in root.parameters()} and len(optimizer.state) == len(held)
+
+
+def test_the_optimizer_goes_on_after_an_edit():
+    root = Root()
+    optimizer = stepped(root)
+    surgery.apply(
+        Edit(torch.tensor([True] * 5 + [False]), torch.tensor([0])), root, root.gaussians, optimizer
+    )
+    before = root.gaussians.means.detach().clone()
+    optimizer.zero_grad()
+    sum(p.square().sum() for p in root.parameters()).backward()
+    optimizer.step()
+    assert (root.gaussians.means != before).any(0).all() and root.gaussians.means.isfinite().all()
+
+
+def test_an_edit_before_the_first_step_has_no_moments_to_move():
+    root = Root()
+    optimizer = torch.optim.Adam([{"params": [p]} for p in root.parameters()])
+    surgery.apply(Edit(torch.zeros(6, dtype=torch.bool), torch.tensor([0])), root, root.gaussians, optimizer)
+    assert len(root.gaussians) == 1 and root.gaussians.ids.tolist() == [6]
+    held = {id(group["params"][0]) for group in optimizer.param_groups}
+    assert held == {id(p) for p in root.parameters()}
+
+
+def test_resize_makes_room_for_a_state_dict():
+    larger, smaller = Root(9), Root(4)
+    smaller.shared = torch.nn.Parameter(torch.zeros(9, 3))
+    resize(smaller, smaller.gaussians, 9)
+    smaller.load_state_dict(larger.state_dict())
+    assert torch.equal(smaller.gaussians.means, larger.gaussians.means) and len(smaller.gaussians) == 9
