@@ -30,7 +30,7 @@ def named(name: str) -> ModuleType:
     if name == "cpu":
         return _cpu()
     if name == "cuda":
-        raise BackendUnavailable("there are no CUDA kernels in this version; move the tensors to the CPU")
+        return _cuda()
     raise ValueError(f"backend is 'reference', 'cpu' or 'cuda', got {name!r}")
 
 
@@ -43,3 +43,14 @@ def _cpu() -> ModuleType:
             "or pass backend='reference' for small scenes"
         ) from error
     return native
+
+
+def _cuda() -> ModuleType:
+    _cpu()  # defines the operators
+    from gsparc.ops import cuda, cuda_library
+
+    try:
+        cuda.load()
+    except cuda_library.LibraryUnavailable as error:
+        raise BackendUnavailable(f"backend 'cuda' is not available: {error}") from error
+    return cuda

@@ -10,9 +10,14 @@
 #include <cuda_runtime.h>
 #define GSPARC_HD __host__ __device__ __forceinline__
 #define GSPARC_INLINE __host__ __device__ __forceinline__
+#define GSPARC_UNROLL _Pragma("unroll")
+#define GSPARC_UNROLL_BY(n) _Pragma(GSPARC_TEXT(unroll n))
+#define GSPARC_TEXT(x) #x
 #else
 #define GSPARC_HD inline
 #define GSPARC_INLINE inline
+#define GSPARC_UNROLL
+#define GSPARC_UNROLL_BY(n)
 #include "host_shim.h"
 #endif
 
@@ -29,20 +34,23 @@ __device__ __forceinline__ void block_sync() { __syncthreads(); }
 __device__ __forceinline__ bool warp_any(bool x) { return __any_sync(kAll, x); }
 __device__ __forceinline__ bool block_any(bool x) { return __syncthreads_or(x); }
 
-// Lane m receives the sum over the warp of values[m]; kCount is a power of two up to 32, and lanes beyond it
-// repeat. Halving the array while the lanes pair up takes kCount - 1 shuffles instead of 5 kCount; the order of
-// the additions is fixed. The values are used up.
-template <class S, int kCount> __device__ __forceinline__ S warp_sums(S (&values)[kCount]) {
-    const unsigned lane = threadIdx.x % kWarp;
+// The upper half of the lanes keeps the upper half of the values, the lower half the lower: one fold of a sum.
+template <int kHalf, class S, int kCount> __device__ __forceinline__ void fold(S (&values)[kCount]) {
+    if constexpr (kHalf >= 1) {
+        const bool upper = threadIdx.x & kHalf;
 #pragma unroll
-    for (int half = kCount / 2; half >= 1; half /= 2) {
-        const bool upper = lane & half;
-#pragma unroll
-        for (int k = 0; k < half; ++k) {
-            const S mine = upper ? values[k + half] : values[k], other = upper ? values[k] : values[k + half];
-            values[k] = mine + __shfl_xor_sync(kAll, other, half);
+        for (int k = 0; k < kHalf; ++k) {
+            const S mine = upper ? values[k + kHalf] : values[k], other = upper ? values[k] : values[k + kHalf];
+            values[k] = mine + __shfl_xor_sync(kAll, other, kHalf);
         }
+        fold<kHalf / 2>(values);
     }
+}
+
+// Lane m receives the sum over the warp of values[m % kCount], kCount a power of two up to 32: kCount - 1 shuffles
+// and a few instead of 5 kCount. The order of the additions is fixed. The values are used up.
+template <class S, int kCount> __device__ __forceinline__ S warp_sums(S (&values)[kCount]) {
+    fold<kCount / 2>(values);
     S total = values[0];
 #pragma unroll
     for (int step = kCount; step < kWarp; step *= 2) total += __shfl_xor_sync(kAll, total, step);

@@ -21,7 +21,7 @@ namespace {
 constexpr size_t kStack = 256 * 1024;
 
 struct Fiber {
-    ucontext_t start;
+    ucontext_t start{};
     jmp_buf here;
     std::unique_ptr<char[]> stack;
     bool started = false, done = true;

@@ -1,0 +1,342 @@
+// Blending, forward and backward, and each Gaussian's weights. Without atomics: an entry (a Gaussian in a tile)
+// has a row of its own for its sums, rows of one Gaussian lie together and are added in their order.
+#include "cuda/walk.h"
+
+namespace gsparc {
+namespace GSPARC_ISA {
+namespace {
+
+constexpr int kThreads = 128;
+
+template <class S> struct Picture {
+    const S* features;  // (P, N, K), K channels per pose
+    int channels;
+    S *image, *transmittance;  // (P, K, H, W), (P, H, W); the second may be absent
+};
+
+template <class S> GSPARC_HD int64_t pixels_of(const Lens<S>& lens) { return int64_t(lens.height) * lens.width; }
+
+template <class S, bool kTangent, int kChannels>
+__global__ void __launch_bounds__(kBlock) composite_kernel(View<S> v, Model<S> model, Picture<S> out) {
+    __shared__ Desk<S, kChannels> desk;
+    Walk<S, kTangent, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
+    const int from = blockIdx.y * kChannels, used = out.channels - from < kChannels ? out.channels - from : kChannels;
+    const bool broken = v.overflows();
+    S sums[kChannels] = {};
+    while (!broken && walk.base < walk.end) {
+        walk.look(model, out.features, out.channels, from, used);
+        S light = walk.start;
+        if (walk.lit(light))
+            for (int j = 0; j < walk.taken; ++j) {
+                const S form = walk.form(j);
+                if (form < 0 || !walk.lit(light)) continue;
+                const Layer<S, true> layer = walk.layer(j, form);
+                const S weight = light * layer.alpha;
+                light *= S(1) - layer.gamma;
+                GSPARC_UNROLL
+                for (int k = 0; k < kChannels; ++k) sums[k] = fma(walk.entry(j).features[k], weight, sums[k]);
+            }
+        if (!walk.next(light, false)) break;
+    }
+    block_sync();
+    static_assert(kChannels <= kBatch<S>, "the sums take the place of the shapes");
+    for (int k = 0; k < kChannels; ++k) desk.forms[walk.warp][k][walk.lane] = sums[k];
+    block_sync();
+    if (!walk.pixel.real) return;
+    const int64_t pixels = pixels_of(v.lens), at = walk.pixel.place(v.lens);
+    for (int k = walk.warp; k < used; k += kWarps) {
+        S total = 0;
+        for (int w = 0; w < kWarps; ++w) total += desk.forms[w][k][walk.lane];
+        out.image[(int64_t(walk.pose) * out.channels + from + k) * pixels + at] = broken ? S(NAN) : total;
+    }
+    if (out.transmittance && blockIdx.y == 0 && walk.warp == 0)
+        out.transmittance[walk.pose * pixels + at] = broken ? S(NAN) : walk.light;
+}
+
+template <class S> struct Upstream {
+    const S *image, *transmittance;  // as above; the second may be absent: then the first is 1 everywhere
+    const S* per_alpha;              // (P, N), loss by the sum of alpha, lit or not; may be absent
+    S* rows;                         // (chunks, capacity, kMoments + kChannels)
+};
+
+constexpr int power_of_two(int least) { return least <= 16 ? 16 : 32; }
+
+template <class S, bool kTangent, int kChannels>
+__global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> model, Picture<S> forward, Upstream<S> up) {
+    constexpr int kRow = kMoments + kChannels;
+    __shared__ Desk<S, kChannels> desk;
+    if (v.overflows()) return;
+    Walk<S, kTangent, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
+    const int from = blockIdx.y * kChannels, used = forward.channels - from < kChannels ? forward.channels - from : kChannels;
+    const int64_t pixels = pixels_of(v.lens), at = walk.pixel.place(v.lens), row0 = int64_t(blockIdx.y) * v.capacity;
+    S g[kChannels] = {}, behind = 0;  // what is still to come of the loss, behind the batch's front
+    if (walk.pixel.real) {
+        for (int k = 0; k < used; ++k) {
+            const int64_t plane = (int64_t(walk.pose) * forward.channels + from + k) * pixels + at;
+            g[k] = up.image ? up.image[plane] : S(1);
+            behind += g[k] * forward.image[plane];
+        }
+        if (up.transmittance && blockIdx.y == 0)
+            behind += up.transmittance[walk.pose * pixels + at] * forward.transmittance[walk.pose * pixels + at];
+    }
+    while (walk.base < walk.end) {
+        walk.look(model, forward.features, forward.channels, from, used);
+        auto gain_of = [&](int j) {
+            S gain = 0;
+            GSPARC_UNROLL
+            for (int k = 0; k < kChannels; ++k) gain = fma(walk.entry(j).features[k], g[k], gain);
+            return gain;
+        };
+        S light = walk.start, spent = 0;
+        for (int j = 0; j < walk.taken && walk.lit(light); ++j) {
+            if (walk.form(j) < 0) continue;
+            const Layer<S, true> layer = walk.layer(j, walk.form(j));
+            spent += light * layer.alpha * gain_of(j);
+            light *= S(1) - layer.gamma;
+        }
+        const S after = light;
+        desk.spent[walk.warp][walk.lane] = spent;
+        block_sync();
+        S rest = behind;
+        for (int w = 0; w < kWarps; ++w) {
+            if (w == walk.warp) rest = behind;
+            behind -= desk.spent[w][walk.lane];
+        }
+        light = walk.start;
+        for (int j = 0; j < walk.taken; ++j) {
+            const S per_alpha = up.per_alpha ? up.per_alpha[int64_t(walk.pose) * v.count + walk.entry(j).gaussian] : S(0);
+            const bool inside = walk.form(j) >= 0, lit = inside && walk.lit(light), counts = lit || (inside && up.per_alpha);
+            S total = 0;
+            if (warp_any(counts)) {
+                S values[power_of_two(kRow)] = {};
+                if (counts) {
+                    S tau1, tau2, form;
+                    walk.pixel.offsets(walk.entry(j).record, v.lens, tau1, tau2, form);
+                    const Layer<S, true> layer = walk.layer(j, form);
+                    const S gain = lit ? gain_of(j) : S(0), weight = light * layer.alpha, through = S(1) - layer.gamma;
+                    if (lit) rest -= weight * gain;
+                    MomentSums<S, kTangent, true> sums;
+                    sums.add(layer, true, fma(light, gain, per_alpha), lit ? -rest / through : S(0), tau1, tau2, form, walk.alpha_max);
+                    sums.write(values);
+                    GSPARC_UNROLL
+                    for (int k = 0; k < kChannels; ++k) values[kMoments + k] = lit ? weight * g[k] : S(0);
+                    if (lit) light *= through;
+                }
+                total = warp_sums(values);
+            }
+            if (walk.lane < kRow) up.rows[(row0 + walk.entry(j).slot) * kRow + walk.lane] = total;
+        }
+        if (!walk.next(after, up.per_alpha != nullptr)) break;
+    }
+    for (int e = walk.base + walk.warp; e < walk.end; e += kWarps)  // behind the last light
+        if (walk.lane < kRow) up.rows[(row0 + v.slot_of[e]) * kRow + walk.lane] = 0;
+}
+
+template <class S> struct Weighed {
+    S* rows;        // (capacity, 2): sums of alpha T and of alpha over the pixels of a tile; or
+    S* blocks;      // (capacity, kWarp): alpha T by pixel, in the order of the entries
+    int32_t* ends;  // (tiles,): first entry of a tile that nobody sees
+};
+
+template <class S, bool kTangent>
+__global__ void __launch_bounds__(kBlock) weigh_kernel(View<S> v, Model<S> model, Weighed<S> out) {
+    __shared__ Desk<S, 1> desk;
+    if (v.overflows()) return;
+    Walk<S, kTangent, 1> walk(v, desk, blockIdx.x, threadIdx.x);
+    while (walk.base < walk.end) {
+        walk.look(model, nullptr, 0, 0, 0);
+        S light = walk.start;
+        for (int j = 0; j < walk.taken; ++j) {
+            S weight = 0, alpha = 0;
+            if (walk.form(j) >= 0) {
+                const Layer<S, true> layer = walk.layer(j, walk.form(j));
+                alpha = layer.alpha;
+                if (walk.lit(light)) weight = light * alpha, light *= S(1) - layer.gamma;
+            }
+            if (out.blocks) out.blocks[int64_t(walk.first + j) * kWarp + walk.lane] = weight;
+            if (!out.rows) continue;
+            S values[2] = {weight, alpha};
+            const S total = warp_sums(values);
+            if (walk.lane < 2) out.rows[int64_t(walk.entry(j).slot) * 2 + walk.lane] = total;
+        }
+        if (!walk.next(light, out.rows != nullptr)) break;
+    }
+    if (out.ends && threadIdx.x == 0) out.ends[blockIdx.x] = walk.base;
+}
+
+// Adds the rows of each Gaussian: value k of a row goes to first (.., split) or, from split on, to second (.., rest).
+template <class S>
+__global__ void add_rows(View<S> v, const S* rows, int width, int chunks, int split, S* first, S* second, int rest) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, all = int64_t(v.poses) * v.count;
+    if (at >= all * width * chunks) return;
+    const int k = int(at % width), chunk = int(at / width / all);
+    const int64_t ranked = at / width % all;
+    const int pose = int(ranked / v.count), rank = int(ranked % v.count), value = chunk * (width - split) + k - split;
+    if (k >= split && value >= rest) return;
+    const bool broken = v.overflows();
+    const int64_t begin = broken ? 0 : v.first_slot(pose, rank), end = broken ? 0 : v.first_slot(pose, rank + 1);
+    S total = 0;
+    for (int64_t slot = begin; slot < end; ++slot) total += rows[(int64_t(chunk) * v.capacity + slot) * width + k];
+    if (broken) total = S(NAN);
+    const int64_t row = int64_t(pose) * v.count + (broken ? rank : v.order[ranked]);
+    if (k < split)
+        first[(int64_t(chunk) * all + row) * split + k] = total;
+    else
+        second[row * rest + value] = total;
+}
+
+template <class S> struct Slopes {
+    S *means, *quats, *scales, *opacities, *extinctions, *screen;  // the last two may be absent; screen (P, N, 2)
+};
+
+// Chains the sums (chunks, P, N, kMoments) into the parameters; poses are added in order.
+template <class S>
+__global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunks, Slopes<S> out) {
+    const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (i >= v.count) return;
+    const bool broken = v.overflows();
+    Gradients<S> total{};
+    const Gaussian<S> g = gaussian(model, i);
+    const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : opacity;
+    for (int pose = 0; pose < v.poses; ++pose) {
+        const int64_t row = int64_t(pose) * v.count + i, all = int64_t(v.poses) * v.count;
+        if (out.screen) out.screen[2 * row] = out.screen[2 * row + 1] = broken ? S(NAN) : S(0);
+        if (broken || v.boxes[row].row1 <= v.boxes[row].row0) continue;
+        S m[kMoments] = {};
+        for (int chunk = 0; chunk < chunks; ++chunk)
+            for (int k = 0; k < kMoments; ++k) m[k] += sums[(chunk * all + row) * kMoments + k];
+        const S* rotation = model.rotations + 9 * pose;
+        const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, v.lens);
+        const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
+        const Gradients<S> one = project_backward(f, moments, opacity, extinction, rotation, v.lens);
+        for (int k = 0; k < 3; ++k) total.mean[k] += one.mean[k], total.scale[k] += one.scale[k];
+        for (int k = 0; k < 4; ++k) total.quat[k] += one.quat[k];
+        total.opacity += one.opacity, total.extinction += one.extinction;
+        if (out.screen) out.screen[2 * row] = one.screen[0], out.screen[2 * row + 1] = one.screen[1];
+    }
+    const S poison = broken ? S(NAN) : S(0);
+    for (int k = 0; k < 3; ++k) out.means[3 * i + k] = total.mean[k] + poison, out.scales[3 * i + k] = total.scale[k] + poison;
+    for (int k = 0; k < 4; ++k) out.quats[4 * i + k] = total.quat[k] + poison;
+    // What emits also hides unless extinctions are given apart.
+    out.opacities[i] = total.opacity + (out.extinctions ? S(0) : total.extinction) + poison;
+    if (out.extinctions) out.extinctions[i] = total.extinction + poison;
+}
+
+int64_t blocks_for(int64_t threads) { return (threads + kThreads - 1) / kThreads; }
+
+// Channels that a block blends at once. float64 serves tests and has one size.
+template <class S> int width_for(int channels) { return sizeof(S) == 8 ? 4 : (channels <= 1 ? 1 : (channels <= 4 ? 4 : 16)); }
+int chunks_for(int channels, int width) { return channels > width ? (channels + width - 1) / width : 1; }
+
+template <class S, bool kTangent> auto composite_of(int width) {
+    if constexpr (sizeof(S) == 8) return composite_kernel<S, kTangent, 4>;
+    else return width == 1 ? composite_kernel<S, kTangent, 1> : width == 4 ? composite_kernel<S, kTangent, 4> : composite_kernel<S, kTangent, 16>;
+}
+template <class S, bool kTangent> auto backward_of(int width) {
+    if constexpr (sizeof(S) == 8) return backward_kernel<S, kTangent, 4>;
+    else return width == 1 ? backward_kernel<S, kTangent, 1> : width == 4 ? backward_kernel<S, kTangent, 4> : backward_kernel<S, kTangent, 16>;
+}
+
+template <class S> int64_t blend(const View<S>& v, const Model<S>& model, const Picture<S>& picture, void* stream) {
+    const int width = width_for<S>(picture.channels), chunks = chunks_for(picture.channels, width);
+    const auto kernel = v.lens.tangent ? composite_of<S, true>(width) : composite_of<S, false>(width);
+    return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, picture);
+}
+
+template <class S> int64_t composite(const Call& call) {
+    Reader in{call};
+    const View<S> v = read_view<S>(in);
+    const Model<S> model = read_model<S>(in);
+    Picture<S> out;
+    out.features = in.next<const S>(), out.channels = call.channels, out.image = in.next<S>(), out.transmittance = in.next<S>();
+    if (!call.scratch) return 1;
+    return -blend(v, model, out, reinterpret_cast<void*>(uintptr_t(call.stream)));
+}
+
+// Backward of `composite`, or, where `weights`, of the weights: then features are the slopes of the sums of
+// alpha T, and the image they make is the total that the pass runs down from.
+template <class S> int64_t backward(const Call& call, bool weights) {
+    Reader in{call};
+    const View<S> v = read_view<S>(in);
+    const Model<S> model = read_model<S>(in);
+    Picture<S> forward{};
+    Upstream<S> up{};
+    forward.features = in.next<const S>(), forward.channels = call.channels;
+    if (weights) {
+        up.per_alpha = in.next<const S>();
+    } else {
+        forward.image = in.next<S>(), forward.transmittance = in.next<S>();
+        up.image = in.next<const S>(), up.transmittance = in.next<const S>();
+    }
+    Slopes<S> out;
+    out.means = in.next<S>(), out.quats = in.next<S>(), out.scales = in.next<S>(), out.opacities = in.next<S>();
+    out.extinctions = in.next<S>();
+    S* features = weights ? nullptr : in.next<S>();
+    out.screen = weights ? nullptr : in.next<S>();
+
+    const int64_t all = int64_t(v.poses) * v.count;
+    const int width = width_for<S>(call.channels), chunks = chunks_for(call.channels, width), row = kMoments + width;
+    Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
+    up.rows = arena.take<S>(int64_t(chunks) * v.capacity * row);
+    S* sums = arena.take<S>(int64_t(chunks) * all * kMoments);
+    if (weights) forward.image = arena.take<S>(v.poses * pixels_of(v.lens));
+    if (arena.measuring()) return arena.bytes();
+
+    void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
+    Steps steps;
+    if (weights) steps.then(blend(v, model, forward, stream));
+    const auto kernel = v.lens.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
+    steps.then(launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up));
+    steps.then(launch(add_rows<S>, blocks_for(all * row * chunks), 1, kThreads, stream, v, up.rows, row, chunks, kMoments, sums, features,
+                      weights ? 0 : call.channels));
+    steps.then(launch(chain_kernel<S>, blocks_for(v.count), 1, kThreads, stream, v, model, sums, chunks, out));
+    return steps.result();
+}
+
+template <class S> int64_t weigh(const Call& call) {
+    Reader in{call};
+    const View<S> v = read_view<S>(in);
+    const Model<S> model = read_model<S>(in);
+    Weighed<S> out{};
+    S* sums = in.next<S>();  // (P, N, 2), or absent for blocks
+    out.blocks = in.next<S>(), out.ends = in.next<int32_t>();
+    Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
+    if (sums) out.rows = arena.take<S>(int64_t(v.capacity) * 2);
+    if (arena.measuring()) return arena.bytes();
+
+    void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
+    Steps steps;
+    const auto kernel = v.lens.tangent ? weigh_kernel<S, true> : weigh_kernel<S, false>;
+    steps.then(launch(kernel, int64_t(v.poses) * v.tiles, 1, kBlock, stream, v, model, out));
+    if (sums)
+        steps.then(launch(add_rows<S>, blocks_for(int64_t(v.poses) * v.count * 2), 1, kThreads, stream, v, out.rows, 2, 1, 2, sums, nullptr, 0));
+    return steps.result();
+}
+
+}  // namespace
+}  // namespace GSPARC_ISA
+}  // namespace gsparc
+
+extern "C" {
+
+int64_t gsparc_composite(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return composite<decltype(zero)>(*call); });
+}
+
+int64_t gsparc_composite_backward(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return backward<decltype(zero)>(*call, false); });
+}
+
+int64_t gsparc_weights(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return weigh<decltype(zero)>(*call); });
+}
+
+int64_t gsparc_weights_backward(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return backward<decltype(zero)>(*call, true); });
+}
+
+}  // extern "C"

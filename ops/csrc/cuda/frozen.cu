@@ -1,0 +1,108 @@
+// A static receiver: its weights are frozen as blocks (an entry: one Gaussian, the 32 pixels of a tile), and a
+// batch of queries is a product of features and blocks, tile by tile.
+#include "cuda/view.h"
+
+namespace gsparc {
+namespace GSPARC_ISA {
+namespace {
+
+template <class S> struct Frozen {
+    int width, height, tiles_x, columns;  // columns: how many images
+    const int32_t *starts, *ends;         // (tiles + 1), (tiles,): entries of each tile, and where light ends
+    const int32_t* ranks;                 // (E,) rows of the features
+    const S *blocks, *features;           // (E, kWarp), (V, columns)
+    S* image;                             // (columns, H, W)
+
+    // Address of a pixel of the first image, or null beyond the edge.
+    GSPARC_HD S* pixel(int tile, int lane) const {
+        const int row = tile / tiles_x * kTileHeight + lane / kTileWidth, column = tile % tiles_x * kTileWidth + lane % kTileWidth;
+        return row < height && column < width ? image + int64_t(row) * width + column : nullptr;
+    }
+};
+
+// Few images: a lane is a pixel, the warps share the list, their sums are added in order.
+constexpr int kFew = 4;
+template <class S> __global__ void __launch_bounds__(kBlock) thaw_few(Frozen<S> f) {
+    __shared__ S parts[kWarps][kFew][kWarp];
+    const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, tile = blockIdx.x, from = blockIdx.y * kFew;
+    const int used = f.columns - from < kFew ? f.columns - from : kFew;
+    S sums[kFew] = {};
+    GSPARC_UNROLL_BY(4)
+    for (int e = f.starts[tile] + warp; e < f.ends[tile]; e += kWarps) {
+        const S weight = f.blocks[int64_t(e) * kWarp + lane];
+        const S* feature = f.features + int64_t(f.ranks[e]) * f.columns + from;
+        GSPARC_UNROLL
+        for (int k = 0; k < kFew; ++k) sums[k] = fma(k < used ? feature[k] : S(0), weight, sums[k]);
+    }
+    for (int k = 0; k < kFew; ++k) parts[warp][k][lane] = sums[k];
+    block_sync();
+    S* to = f.pixel(tile, lane);
+    for (int k = warp; to && k < used; k += kWarps) {
+        S total = 0;
+        for (int w = 0; w < kWarps; ++w) total += parts[w][k][lane];
+        to[int64_t(from + k) * f.width * f.height] = total;
+    }
+}
+
+// Many images: a product of a (kImages x entries) and an (entries x 32) matrix, 4 x 4 outputs a thread.
+constexpr int kImages = 64, kDepth = 16, kSide = 4;
+template <class S> __global__ void __launch_bounds__(kBlock) thaw_many(Frozen<S> f) {
+    alignas(16) __shared__ S features[kDepth][kImages];
+    alignas(16) __shared__ S weights[kDepth][kWarp];
+    const int tile = blockIdx.x, from = blockIdx.y * kImages, end = f.ends[tile];
+    const int group = threadIdx.x % (kWarp / kSide), part = threadIdx.x / (kWarp / kSide);
+    S sums[kSide][kSide] = {};
+    for (int base = f.starts[tile]; base < end; base += kDepth) {
+        for (int at = threadIdx.x; at < kDepth * kImages; at += kBlock) {
+            const int e = at / kImages, k = at % kImages;
+            const bool there = base + e < end && from + k < f.columns;
+            features[e][k] = there ? f.features[int64_t(f.ranks[base + e]) * f.columns + from + k] : S(0);
+        }
+        for (int at = threadIdx.x; at < kDepth * kWarp; at += kBlock)
+            weights[at / kWarp][at % kWarp] = base + at / kWarp < end ? f.blocks[int64_t(base) * kWarp + at] : S(0);
+        block_sync();
+        GSPARC_UNROLL
+        for (int e = 0; e < kDepth; ++e) {
+            S left[kSide], right[kSide];
+            GSPARC_UNROLL
+            for (int a = 0; a < kSide; ++a) left[a] = features[e][part * kSide + a], right[a] = weights[e][group * kSide + a];
+            GSPARC_UNROLL
+            for (int a = 0; a < kSide; ++a)
+                GSPARC_UNROLL
+                for (int b = 0; b < kSide; ++b) sums[a][b] = fma(left[a], right[b], sums[a][b]);
+        }
+        block_sync();
+    }
+    GSPARC_UNROLL
+    for (int b = 0; b < kSide; ++b) {
+        S* to = f.pixel(tile, group * kSide + b);
+        GSPARC_UNROLL
+        for (int a = 0; a < kSide; ++a) {
+            const int k = from + part * kSide + a;
+            if (to && k < f.columns) to[int64_t(k) * f.width * f.height] = sums[a][b];
+        }
+    }
+}
+
+template <class S> int64_t thaw(const Call& call) {
+    Reader in{call};
+    Frozen<S> f;
+    f.height = call.whole[0], f.width = call.whole[1], f.columns = call.channels;
+    f.tiles_x = (f.width + kTileWidth - 1) / kTileWidth;
+    f.starts = in.next<const int32_t>(), f.ends = in.next<const int32_t>(), f.ranks = in.next<const int32_t>();
+    f.blocks = in.next<const S>(), f.features = in.next<const S>(), f.image = in.next<S>();
+    if (!call.scratch) return 1;
+    const int tiles = f.tiles_x * ((f.height + kTileHeight - 1) / kTileHeight);
+    void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
+    if (f.columns <= 2 * kFew) return -launch(thaw_few<S>, tiles, (f.columns + kFew - 1) / kFew, kBlock, stream, f);
+    return -launch(thaw_many<S>, tiles, (f.columns + kImages - 1) / kImages, kBlock, stream, f);
+}
+
+}  // namespace
+}  // namespace GSPARC_ISA
+}  // namespace gsparc
+
+extern "C" int64_t gsparc_thaw(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return thaw<decltype(zero)>(*call); });
+}

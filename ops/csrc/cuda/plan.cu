@@ -1,0 +1,282 @@
+// Who is seen where: project, order by (depth, id), and list the Gaussians of every tile, front to back.
+#include "cuda/sort.h"
+#include "cuda/view.h"
+
+namespace gsparc {
+namespace GSPARC_ISA {
+namespace {
+
+constexpr unsigned long long kSound = ~0ull, kUnsoundPose = 1ull << 62;
+constexpr int kThreads = 128;
+
+template <class S> uint64_t GSPARC_HD depth_bits(S depth);
+template <> uint64_t GSPARC_HD depth_bits(float depth) {
+    union { float number; uint32_t bits; } both = {depth};
+    return both.bits;
+}
+template <> uint64_t GSPARC_HD depth_bits(double depth) {
+    union { double number; uint64_t bits; } both = {depth};
+    return both.bits;
+}
+
+// Keys in which hidden Gaussians come last. float32: (pose, depth) in one key; float64: a sort for each pose.
+template <class S> GSPARC_HD uint64_t depth_key(int pose, bool visible, S depth) {
+    if (sizeof(S) == 8) return visible ? depth_bits(depth) : ~0ull;
+    return (uint64_t(pose) << 32) | (visible ? depth_bits(depth) : 0xffffffffull);
+}
+template <class S> GSPARC_HD bool hidden_key(uint64_t key) { return sizeof(S) == 8 ? key == ~0ull : (key & 0xffffffffull) == 0xffffffffull; }
+
+template <class S> struct Outputs {
+    S *means2d, *radii, *depths;
+    bool* visible;
+    uint64_t* keys;
+    int32_t* values;
+    unsigned long long* wrong;
+};
+
+template <class S> __global__ void project_kernel(View<S> v, Model<S> model, Outputs<S> out) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (at >= int64_t(v.poses) * v.count) return;
+    const int pose = int(at / v.count);
+    const int64_t i = at % v.count, base = int64_t(pose) * v.count;
+    const ProjectArgs<S> one = {model, v.count, v.lens, v.records + base * kRecord, out.depths + base, out.means2d + 2 * base,
+                                out.radii + base, v.boxes + base, out.visible + base, pose};
+    const int wrong = project_one(one, i);
+    if (wrong >= 0) {
+        atomicMin(out.wrong, static_cast<unsigned long long>(4 * i + wrong));
+        one.visible[i] = false, one.depths[i] = 0;
+    }
+    if (i == 0) {
+        bool finite = true;
+        for (int k = 0; k < 3; ++k) finite &= fabs(model.positions[3 * pose + k]) <= S(3e38);
+        for (int k = 0; k < 9; ++k) finite &= fabs(model.rotations[9 * pose + k]) <= S(3e38);
+        if (!finite) atomicMin(out.wrong, kUnsoundPose);
+    }
+    if (one.visible[i])
+        atomicAdd(v.shown + pose, 1);
+    else
+        v.boxes[at] = {0, 0, 0, 0};
+    out.keys[at] = depth_key<S>(pose, one.visible[i], one.depths[i]), out.values[at] = int32_t(i);
+}
+
+__global__ void look_for_disorder(const int64_t* ids, int count, int* unsorted) {
+    const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (i > 0 && i < count && ids[i] < ids[i - 1]) *unsorted = 1;
+}
+
+// Heap sort of a run of equal depths by id: rare, so one thread does it, in place.
+GSPARC_HD void sort_run(int32_t* run, int64_t length, const int64_t* ids) {
+    auto sink = [&](int64_t at, int64_t end) {
+        for (;;) {
+            int64_t child = 2 * at + 1;
+            if (child >= end) return;
+            if (child + 1 < end && ids[run[child + 1]] > ids[run[child]]) ++child;
+            if (ids[run[child]] <= ids[run[at]]) return;
+            const int32_t kept = run[at];
+            run[at] = run[child], run[child] = kept, at = child;
+        }
+    };
+    for (int64_t at = length / 2; at-- > 0;) sink(at, length);
+    for (int64_t end = length - 1; end > 0; --end) {
+        const int32_t kept = run[0];
+        run[0] = run[end], run[end] = kept;
+        sink(0, end);
+    }
+}
+
+// The sort was stable by row; where ids are not in the order of the rows, equal depths go by id.
+template <class S> __global__ void break_ties(int32_t* order, const uint64_t* keys, const int64_t* ids, const int* unsorted, int poses, int count) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (at >= int64_t(poses) * count || !*unsorted) return;
+    const int64_t base = at / count * count, end = base + count;
+    if (hidden_key<S>(keys[at]) || (at > base && keys[at - 1] == keys[at])) return;
+    int64_t last = at + 1;
+    while (last < end && keys[last] == keys[at]) ++last;
+    if (last - at > 1) sort_run(order + at, last - at, ids);
+}
+
+// Tiles that a box touches, each once, also where it wraps around the circle.
+struct TileRange {
+    int row0, rows, column0, columns, wrap;
+
+    template <class S> GSPARC_HD TileRange(const Box& box, const View<S>& v) {
+        row0 = box.row0 / kTileHeight;
+        rows = box.row1 > box.row0 ? (box.row1 - 1) / kTileHeight - row0 + 1 : 0;
+        column0 = box.column0 / kTileWidth, wrap = v.tiles_x;
+        const int end = box.column0 + box.columns;
+        if (end <= v.lens.width)
+            columns = (end - 1) / kTileWidth - column0 + 1;
+        else
+            columns = v.tiles_x - column0 + (end - v.lens.width - 1) / kTileWidth + 1;
+        columns = columns < v.tiles_x ? columns : v.tiles_x;
+    }
+    GSPARC_HD int count() const { return rows * columns; }
+    GSPARC_HD int tile(int k) const { return (row0 + k / columns) * wrap + (column0 + k % columns) % wrap; }
+};
+
+// A tile counts if at least one of its pixels lies inside the footprint: the test the compositing will make.
+// Writing is a second run of the same: `first` null counts.
+template <class S, bool kTangent>
+__global__ void list_tiles(View<S> v, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
+    const int lane = threadIdx.x % kWarp;
+    const int64_t at = int64_t(blockIdx.x) * (kThreads / kWarp) + threadIdx.x / kWarp;
+    if (at >= int64_t(v.poses) * v.count) return;
+    const int pose = int(at / v.count), rank = int(at % v.count);
+    int64_t found = 0;
+    if (rank < v.shown[pose]) {
+        const int32_t i = v.order[at];
+        const int64_t row = int64_t(pose) * v.count + i;
+        const S* record = v.records + row * kRecord;
+        const TileRange range(v.boxes[row], v);
+        const int64_t slot = counts ? 0 : v.slots[int64_t(pose) * (v.count + 1) + rank];
+        for (int k = 0; k < range.count(); ++k) {
+            const int tile = range.tile(k);
+            const Pixel<S, kTangent> pixel(v, tile, lane);
+            S tau1, tau2, form;
+            if (!warp_any(pixel.offsets(record, v.lens, tau1, tau2, form))) continue;
+            if (!counts && lane == 0 && slot + found < v.capacity)
+                keys[slot + found] = uint32_t(pose) * v.tiles + tile, gaussians[slot + found] = i;
+            ++found;
+        }
+    }
+    if (counts && lane == 0) counts[at] = found;
+}
+
+// slots (P, N + 1) from the running sums; the total, or more than any capacity where something is unsound.
+__global__ void write_slots(const int64_t* sums, const unsigned long long* wrong, int poses, int count, int64_t* slots,
+                            int64_t* total, int64_t* verdict) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, all = int64_t(poses) * count;
+    if (at >= int64_t(poses) * (count + 1)) return;
+    const int64_t before = at / (count + 1) * count + at % (count + 1);  // ranks before this one, over all poses
+    slots[at] = before ? sums[before - 1] : 0;
+    if (at > 0) return;
+    verdict[0] = *wrong == kSound ? -1 : int64_t(*wrong), verdict[1] = sums[all - 1];
+    *total = *wrong == kSound ? sums[all - 1] : INT64_MAX;
+}
+
+__global__ void number_slots(int32_t* values, uint32_t* keys, const int64_t* total, int capacity, uint32_t beyond) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (at >= capacity) return;
+    values[at] = int32_t(at);
+    if (at >= *total) keys[at] = beyond;
+}
+
+// Entries in the order of the tiles, and where each tile begins.
+__global__ void write_entries(const uint32_t* keys, const int32_t* slot_of, const int32_t* by_slot, int capacity, int tiles,
+                              int32_t* starts, int32_t* gaussians, int32_t* slots) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+    if (at > capacity) return;
+    const int64_t before = at > 0 ? int64_t(keys[at - 1]) : -1, here = at < capacity ? int64_t(keys[at]) : tiles;
+    for (int64_t tile = before + 1; tile <= here && tile <= tiles; ++tile) starts[tile] = int32_t(at);
+    if (at == capacity || here >= tiles) return;
+    gaussians[at] = by_slot[slot_of[at]], slots[at] = slot_of[at];
+}
+
+int64_t blocks_for(int64_t threads) { return (threads + kThreads - 1) / kThreads; }
+
+template <class S> int64_t plan(const Call& call) {
+    Reader in{call};
+    View<S> v = read_view<S>(in);
+    const Model<S> model = read_model<S>(in);
+    const auto* ids = in.next<const int64_t>();
+    Outputs<S> out;
+    out.means2d = in.next<S>(), out.radii = in.next<S>(), out.visible = in.next<bool>();
+    auto* verdict = in.next<int64_t>();
+
+    const int64_t all = int64_t(v.poses) * v.count;
+    const bool together = sizeof(S) == 4;
+    const int64_t sorted_at_once = together ? all : v.count;
+    const int bits = together ? 32 + bits_for(v.poses - 1) : 64, sorts = together ? 1 : v.poses;
+    Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
+    out.wrong = arena.take<unsigned long long>(1);
+    int* unsorted = arena.take<int>(1);
+    out.depths = arena.take<S>(all), out.keys = arena.take<uint64_t>(all), out.values = arena.take<int32_t>(all);
+    uint64_t* keys = arena.take<uint64_t>(all);
+    int64_t *counts = arena.take<int64_t>(all), *sums = arena.take<int64_t>(all);
+    size_t sort_bytes = 0, sum_bytes = 0;
+    Steps steps;
+    steps.then(sort_pairs<uint64_t>(nullptr, sort_bytes, out.keys, keys, out.values, v.order, sorted_at_once, bits, nullptr));
+    steps.then(running_sums(nullptr, sum_bytes, counts, sums, all, nullptr));
+    size_t bytes = sort_bytes > sum_bytes ? sort_bytes : sum_bytes;
+    char* temp = arena.take<char>(bytes);
+    if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
+
+    void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
+    steps.then(clear(out.wrong, 0xff, sizeof *out.wrong, stream)).then(clear(unsorted, 0, sizeof *unsorted, stream));
+    steps.then(clear(v.shown, 0, v.poses * sizeof *v.shown, stream));
+    steps.then(launch(project_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, out));
+    for (int pose = 0; pose < sorts; ++pose) {
+        const int64_t at = pose * sorted_at_once;
+        steps.then(sort_pairs<uint64_t>(temp, sort_bytes, out.keys + at, keys + at, out.values + at, v.order + at, sorted_at_once, bits, stream));
+    }
+    if (ids) {
+        steps.then(launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, unsorted));
+        steps.then(launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, unsorted, v.poses, v.count));
+    }
+    const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
+    steps.then(launch(list, blocks_for(all * kWarp), 1, kThreads, stream, v, counts, nullptr, nullptr));
+    steps.then(running_sums(temp, sum_bytes, counts, sums, all, stream));
+    steps.then(launch(write_slots, blocks_for(all + v.poses), 1, kThreads, stream, sums, out.wrong, v.poses, v.count, v.slots, v.total, verdict));
+    return steps.result();
+}
+
+template <class S> int64_t bin(const Call& call) {
+    Reader in{call};
+    const View<S> v = read_view<S>(in);
+    const int64_t capacity = v.capacity;
+    const int tiles = v.poses * v.tiles, bits = bits_for(tiles);
+    Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
+    uint32_t *keys = arena.take<uint32_t>(capacity), *sorted_keys = arena.take<uint32_t>(capacity);
+    int32_t *numbers = arena.take<int32_t>(capacity), *slots = arena.take<int32_t>(capacity), *gaussians = arena.take<int32_t>(capacity);
+    size_t bytes = 0;
+    Steps steps;
+    steps.then(sort_pairs<uint32_t>(nullptr, bytes, keys, sorted_keys, numbers, slots, capacity, bits, nullptr));
+    char* temp = arena.take<char>(bytes);
+    if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
+
+    void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
+    const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
+    steps.then(launch(number_slots, blocks_for(capacity), 1, kThreads, stream, numbers, keys, v.total, v.capacity, tiles));
+    steps.then(launch(list, blocks_for(int64_t(v.poses) * v.count * kWarp), 1, kThreads, stream, v, nullptr, keys, gaussians));
+    if (capacity > 0) steps.then(sort_pairs<uint32_t>(temp, bytes, keys, sorted_keys, numbers, slots, capacity, bits, stream));
+    steps.then(launch(write_entries, blocks_for(capacity + 1), 1, kThreads, stream, sorted_keys, slots, gaussians, v.capacity, tiles,
+                      v.starts, v.gaussians, v.slot_of));
+    return steps.result();
+}
+
+}  // namespace
+}  // namespace GSPARC_ISA
+}  // namespace gsparc
+
+extern "C" {
+
+// Each call first with scratch 0: returns the bytes of scratch it needs. Then 0, or minus a CUDA error.
+int64_t gsparc_plan(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return plan<decltype(zero)>(*call); });
+}
+
+int64_t gsparc_bin(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) { return bin<decltype(zero)>(*call); });
+}
+
+// Fills the grid's tables (host memory); with none, returns how many numbers they hold.
+int64_t gsparc_tables(const gsparc::GSPARC_ISA::Call* call) {
+    using namespace gsparc::GSPARC_ISA;
+    return with_scalar(*call, [&](auto zero) -> int64_t {
+        using S = decltype(zero);
+        if (call->tensors[0]) fill_tables(lens_of<S>(*call), reinterpret_cast<S*>(uintptr_t(call->tensors[0])));
+        return call->tensors[0] ? 0 : table_size(lens_of<S>(*call));
+    });
+}
+
+const char* gsparc_error(int64_t code) {
+#ifdef __CUDACC__
+    return cudaGetErrorString(cudaError_t(code));
+#else
+    return code ? "a barrier was not met by all threads" : "";
+#endif
+}
+
+}  // extern "C"

@@ -1,0 +1,300 @@
+"""CUDA kernels for the operators that native.py and networks.py define, on torch's current stream.
+
+A plan's buffers have the shapes of the CPU's, with contents of their own: records, boxes and entries go by
+Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
+tiles' starts (P tiles + 1), then for each entry its Gaussian and its slot.
+
+Inside a captured CUDA graph nothing may wait for the GPU, so a plan takes as many entries as plans of this
+size have needed before, and some more; should it need more, its images and gradients are NaN, never wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import cuda_library, door, native, networks
+
+TILE_WIDTH, TILE_HEIGHT = 8, 4
+HEADROOM = 1.25  # of a captured plan over the largest seen
+BYTES_PER_ENTRY = 28  # entries and what sorting them takes
+
+libraries: dict[str, cuda_library.Library] = {}
+"""By device type; tests put the host shim under "cpu"."""
+
+_capacities: dict[tuple, int] = {}
+
+
+def tiles(whole: Sequence[int]) -> int:
+    """Tiles of one pose's image."""
+    return -(-whole[0] // TILE_HEIGHT) * -(-whole[1] // TILE_WIDTH)
+
+
+def _capturing(tensor: Tensor) -> bool:
+    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
+def run(
+    name: str,
+    like: Tensor,
+    *tensors: Tensor | None,
+    whole: Sequence[int] = (),
+    real: Sequence[float] = (),
+    **sizes: int,
+) -> None:
+    """Call a kernel with addresses of tensors and scratch memory, on the stream of `like`'s device."""
+    library, device = libraries[like.device.type], like.device
+    call = cuda_library.Call(twice=like.dtype == torch.float64, **sizes)
+    call.whole[: len(whole)], call.real[: len(real)] = list(whole), list(real)
+    addresses = [0 if t is None else t.data_ptr() for t in tensors]
+    call.tensors[: len(addresses)] = addresses
+    with torch.cuda.device(device) if like.is_cuda else nullcontext():
+        needed = library.run(name, call)
+        scratch = torch.empty(needed, dtype=torch.uint8, device=device)
+        call.scratch = scratch.data_ptr()
+        call.stream = torch.cuda.current_stream(device).cuda_stream if like.is_cuda else 0
+        library.run(name, call)
+
+
+@lru_cache(maxsize=32)
+def _tables(device: torch.device, dtype: torch.dtype, whole: tuple, real: tuple) -> Tensor:
+    """Sines and cosines of the grid's rows and columns."""
+    library = libraries[device.type]
+    call = cuda_library.Call(twice=dtype == torch.float64)
+    call.whole[:], call.real[:] = list(whole), list(real)
+    numbers = torch.empty(library.run("tables", call), dtype=dtype)
+    call.tensors[0] = numbers.data_ptr()
+    library.run("tables", call)
+    return numbers.to(device)
+
+
+def view_of(means: Tensor, buffers: Sequence[Tensor], whole: Sequence[int], real: Sequence[float]) -> list:
+    """The addresses of `read_view`."""
+    tables = _tables(means.device, means.dtype, tuple(whole), tuple(real))
+    return [tables, *buffers[:5], buffers[5][-1:], buffers[6] if len(buffers) > 6 else None]
+
+
+def capacity_of(buffers: Sequence[Tensor], poses: int, whole: Sequence[int]) -> int:
+    """How many entries a plan has room for."""
+    return (buffers[6].numel() - poses * tiles(whole) - 1) // 2
+
+
+def plan(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    strongest: Tensor,
+    ids: Tensor | None,
+    positions: Tensor,
+    rotations: Tensor,
+    whole: Sequence[int],
+    real: Sequence[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`gsparc::plan`."""
+    poses, n = positions.shape[0], means.shape[0]
+    tensors = native._plan_tensors(means, poses, whole[0])
+    starts = poses * tiles(whole) + 1
+    if n == 0:
+        return (*(t.zero_() for t in tensors[:6]), tensors[3].new_zeros(starts), *tensors[6:])
+    *buffers, means2d, radii, visible = tensors
+    model = [t.contiguous() for t in (means, quats, scales, strongest)]
+    view = [positions.contiguous(), rotations.contiguous()]
+    verdict = means.new_empty(2, dtype=torch.int64)
+    names = {"whole": whole, "real": real, "poses": poses, "count": n}
+    outputs = (None if ids is None else ids.contiguous(), means2d, radii, visible, verdict)
+    run("plan", means, *view_of(means, buffers, whole, real), *model, None, *view, *outputs, **names)
+    key = (poses, n, tuple(whole))
+    if _capturing(means):
+        if key not in _capacities:
+            raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
+        capacity = int(_capacities[key] * HEADROOM) + 1024
+    else:
+        wrong, capacity = verdict.tolist()
+        if wrong == 1 << 62:
+            raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
+        if wrong >= 0:
+            door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)
+        _capacities[key] = max(capacity, _capacities.get(key, 0))
+    native._check_memory(capacity, BYTES_PER_ENTRY)
+    buffers.append(means.new_empty(starts + 2 * capacity, dtype=torch.int32))
+    run("bin", means, *view_of(means, buffers, whole, real), capacity=capacity, **names)
+    return (*buffers, means2d, radii, visible)
+
+
+def _by_gaussian(features: Tensor, poses: int) -> Tensor:
+    """Features (B, N, C) as (P, N, K) with the K channels of a pose side by side."""
+    if poses != 1:
+        return features.contiguous()
+    samples, n, channels = features.shape
+    return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
+
+
+def _channels(features: Tensor, poses: int) -> int:
+    return features.shape[2] * (features.shape[0] if poses == 1 else 1)
+
+
+def composite(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+    features: Tensor,
+    means2d: Tensor,
+    positions: Tensor,
+    rotations: Tensor,
+    buffers: Sequence[Tensor],
+    whole: Sequence[int],
+    real: Sequence[float],
+) -> tuple[Tensor, Tensor]:
+    """`gsparc::composite`."""
+    poses = positions.shape[0]
+    image = features.new_empty(features.shape[0], features.shape[2], *whole[:2])
+    transmittance = means.new_empty(poses, *whole[:2])
+    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
+    rows = _by_gaussian(features, poses)
+    tensors = [*view_of(means, buffers, whole, real), *model, rows, image, transmittance]
+    sizes = {"poses": poses, "count": means.shape[0], "channels": _channels(features, poses)}
+    run(
+        "composite",
+        means,
+        *tensors,
+        whole=whole,
+        real=real,
+        capacity=capacity_of(buffers, poses, whole),
+        **sizes,
+    )
+    return image, transmittance
+
+
+def composite_backward(
+    grad_image: Tensor,
+    grad_transmittance: Tensor | None,
+    image: Tensor,
+    transmittance: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+    features: Tensor,
+    positions: Tensor,
+    rotations: Tensor,
+    buffers: Sequence[Tensor],
+    whole: Sequence[int],
+    real: Sequence[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`gsparc::composite_backward`."""
+    poses, n, capacity = positions.shape[0], means.shape[0], capacity_of(buffers, positions.shape[0], whole)
+    channels = _channels(features, poses)
+    native._check_memory(capacity, means.element_size() * (native._native.MOMENTS + channels))
+    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
+    grads = native._gradients(means, quats, scales, opacities, extinctions)
+    rows = _by_gaussian(features, poses)
+    slopes, screen = torch.empty_like(rows), means.new_empty(poses, n, 2)
+    behind = None if grad_transmittance is None else grad_transmittance.contiguous()
+    inputs = [rows, image.contiguous(), transmittance.contiguous(), grad_image.contiguous(), behind]
+    tensors = [*view_of(means, buffers, whole, real), *model, *inputs, *grads, slopes, screen]
+    sizes = {"poses": poses, "count": n, "channels": channels, "capacity": capacity}
+    if n > 0:
+        run("composite_backward", means, *tensors, whole=whole, real=real, **sizes)
+    if poses == 1:
+        samples, _, width = features.shape
+        slopes = slopes.reshape(n, samples, width).permute(1, 0, 2).contiguous()
+    return (*native._filled(grads, means), slopes, screen)
+
+
+def weights(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+    positions: Tensor,
+    rotations: Tensor,
+    buffers: Sequence[Tensor],
+    whole: Sequence[int],
+    real: Sequence[float],
+) -> tuple[Tensor, Tensor]:
+    """`gsparc::weights`."""
+    poses, n = positions.shape[0], means.shape[0]
+    sums = means.new_empty(poses, n, 2)
+    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
+    tensors = [*view_of(means, buffers, whole, real), *model, sums, None, None]
+    if n > 0:
+        sizes = {"poses": poses, "count": n, "capacity": capacity_of(buffers, poses, whole)}
+        run("weights", means, *tensors, whole=whole, real=real, **sizes)
+    return sums[..., 0].clone(), sums[..., 1].clone()
+
+
+def weights_backward(
+    grad_seen: Tensor,
+    grad_total: Tensor,
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    extinctions: Tensor | None,
+    positions: Tensor,
+    rotations: Tensor,
+    buffers: Sequence[Tensor],
+    whole: Sequence[int],
+    real: Sequence[float],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """`gsparc::weights_backward`."""
+    poses, n, capacity = positions.shape[0], means.shape[0], capacity_of(buffers, positions.shape[0], whole)
+    native._check_memory(capacity, means.element_size() * (native._native.MOMENTS + 1))
+    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
+    grads = native._gradients(means, quats, scales, opacities, extinctions)
+    slopes = [grad_seen.contiguous(), grad_total.contiguous()]
+    tensors = [*view_of(means, buffers, whole, real), *model, *slopes, *grads]
+    if n > 0:
+        sizes = {"poses": poses, "count": n, "channels": 1, "capacity": capacity}
+        run("weights_backward", means, *tensors, whole=whole, real=real, **sizes)
+    return native._filled(grads, means)
+
+
+def evaluate(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+    """`gsparc::networks`."""
+    inputs = [t.contiguous() for t in (encoded, weight1, bias1, weight2, bias2)]
+    samples, (count, width, hidden), channels = encoded.shape[0], weight1.shape, weight2.shape[2]
+    out = encoded.new_empty(samples, count, channels)
+    sizes = {"samples": samples, "count": count, "channels": channels}
+    if out.numel():
+        run("networks", encoded, *inputs, out, whole=(width, hidden), **sizes)
+    return out
+
+
+def evaluate_backward(
+    slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`gsparc::networks_backward`."""
+    inputs = [t.contiguous() for t in (encoded, weight1, bias1, weight2, bias2, slope)]
+    samples, (count, width, hidden), channels = encoded.shape[0], weight1.shape, weight2.shape[2]
+    grads = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs[1:5]]
+    sizes = {"samples": samples, "count": count, "channels": channels}
+    if slope.numel():
+        run("networks_backward", encoded, *inputs, *grads, whole=(width, hidden), **sizes)
+    return grads[0], grads[1], grads[2], grads[3]
+
+
+KERNELS = (
+    (native.plan_op, plan),
+    (native.composite_op, composite),
+    (native.composite_backward_op, composite_backward),
+    (native.weights_op, weights),
+    (native.weights_backward_op, weights_backward),
+    (networks.networks_op, evaluate),
+    (networks.networks_backward_op, evaluate_backward),
+)
+"""Operators and what computes them here."""
+
+
+def register(device: str) -> None:
+    """Let these kernels serve tensors on `device`."""
+    for operator, kernel in KERNELS:
+        operator.register_kernel(device)(kernel)

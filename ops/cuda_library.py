@@ -1,0 +1,156 @@
+"""The CUDA kernels as a shared library: found or built when first asked for, or a line that says why not.
+
+The library is plain C (no Python, no libtorch): addresses of tensors go in, and torch's own stream.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import logging
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import torch
+
+SOURCES = Path(__file__).parent / "csrc"
+UNITS = ("plan", "composite", "frozen", "networks")
+FLAGS = ("-std=c++17", "-O3", "-fmad=false", "--expt-relaxed-constexpr", "-Xcompiler=-fPIC", "-shared", "-t0")
+LOG = logging.getLogger(__name__)
+
+
+class LibraryUnavailable(RuntimeError):
+    """There are no CUDA kernels here; the message says why in one line."""
+
+
+class Call(ctypes.Structure):
+    """One call into the library; `Call` of csrc/cuda/view.h."""
+
+    _fields_ = (
+        ("twice", ctypes.c_int32),
+        ("poses", ctypes.c_int32),
+        ("count", ctypes.c_int32),
+        ("samples", ctypes.c_int32),
+        ("channels", ctypes.c_int32),
+        ("capacity", ctypes.c_int32),
+        ("whole", ctypes.c_int32 * 6),
+        ("real", ctypes.c_double * 10),
+        ("tensors", ctypes.c_uint64 * 32),
+        ("scratch", ctypes.c_uint64),
+        ("stream", ctypes.c_uint64),
+    )
+
+
+class Library:
+    """A loaded library of kernels.
+
+    Args:
+        path: shared library with the functions `gsparc_*` of csrc/cuda.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._loaded = ctypes.CDLL(str(path))
+        self._loaded.gsparc_error.restype = ctypes.c_char_p
+        self._loaded.gsparc_error.argtypes = [ctypes.c_int64]
+        self._functions: dict[str, ctypes._NamedFuncPointer] = {}
+
+    def run(self, name: str, call: Call) -> int:
+        """Call `gsparc_<name>`: its result, if that is not an error (RuntimeError)."""
+        function = self._functions.get(name)
+        if function is None:
+            function = self._functions[name] = getattr(self._loaded, f"gsparc_{name}")
+            function.restype, function.argtypes = ctypes.c_int64, [ctypes.POINTER(Call)]
+        result = function(ctypes.byref(call))
+        if result < 0:
+            raise RuntimeError(f"CUDA kernel {name}: {self._loaded.gsparc_error(-result).decode()}")
+        return result
+
+
+def load() -> Library:
+    """The library for the current GPU, built if need be (LibraryUnavailable)."""
+    reason = missing_device()
+    if reason:
+        raise LibraryUnavailable(reason)
+    path = library_path(architecture())
+    if not path.exists():
+        build(path, architecture())
+    return Library(path)
+
+
+def missing_device() -> str | None:
+    """Why this process cannot use a GPU, or None."""
+    if torch.version.cuda is None:
+        return f"this PyTorch ({torch.__version__}) was built without CUDA; install a CUDA build of torch"
+    if torch.cuda.is_available():
+        return None
+    try:
+        torch.cuda.init()
+    except RuntimeError as error:  # no driver, too old a driver, no device: torch says which
+        return f"PyTorch finds no usable NVIDIA GPU: {str(error).splitlines()[0]}"
+    return "PyTorch finds no usable NVIDIA GPU"
+
+
+def architecture() -> str:
+    """Compute capability of the current GPU, as in `sm_90` without the prefix."""
+    return "{}{}".format(*torch.cuda.get_device_capability())
+
+
+def compiler() -> str | None:
+    """Path of nvcc, or None."""
+    homes = [os.environ.get(name) for name in ("CUDA_HOME", "CUDA_PATH")]
+    for home in [*homes, "/usr/local/cuda"]:
+        if home and (Path(home) / "bin" / "nvcc").exists():
+            return str(Path(home) / "bin" / "nvcc")
+    return shutil.which("nvcc")
+
+
+def library_path(arch: str) -> Path:
+    """Where the library of these sources for `arch` is kept between runs."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return cache / "gsparc" / f"cuda-{arch}-{fingerprint(*FLAGS)}.so"
+
+
+def fingerprint(*also: str) -> str:
+    """Hash of the sources and of whatever else decides what comes out."""
+    digest = hashlib.sha256(repr(also).encode())
+    for source in sorted([*SOURCES.glob("*.h"), *(SOURCES / "cuda").glob("*")]):
+        digest.update(source.name.encode() + source.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def units() -> list[str]:
+    """The sources to compile."""
+    return [str(SOURCES / "cuda" / f"{unit}.cu") for unit in UNITS]
+
+
+def build(path: Path, *architectures: str) -> None:
+    """Compile the library for compute capabilities such as "90" (LibraryUnavailable)."""
+    nvcc = compiler()
+    if nvcc is None:
+        raise LibraryUnavailable(
+            "the CUDA kernels are not built and there is no nvcc to build them; install the CUDA toolkit or "
+            "set CUDA_HOME"
+        )
+    targets = [f"-gencode=arch=compute_{arch},code=sm_{arch}" for arch in architectures]
+    LOG.info("building the CUDA kernels for sm_%s (about a minute, once)", ", sm_".join(architectures))
+    started = time.perf_counter()
+    compile_to(path, [nvcc, *FLAGS, *targets, f"-I{SOURCES}", *units()])
+    LOG.info("built in %.0f s: %s", time.perf_counter() - started, path)
+
+
+def compile_to(path: Path, command: list[str]) -> None:
+    """Run a compiler whose output appears at `path` whole or not at all (LibraryUnavailable)."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(f".{os.getpid()}")
+    done = subprocess.run([*command, "-o", str(unfinished)], capture_output=True, text=True, check=False)
+    if done.returncode:
+        unfinished.unlink(missing_ok=True)
+        lines = (done.stderr or done.stdout).strip().splitlines()
+        first = next(
+            (line for line in lines if "error" in line or "fatal" in line), lines[0] if lines else ""
+        )
+        raise LibraryUnavailable(f"the CUDA kernels do not compile with {command[0]}: {first}")
+    unfinished.replace(path)

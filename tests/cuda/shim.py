@@ -1,0 +1,71 @@
+"""The CUDA kernels in the place of the CPU's, so that every test of the rasterizer can run on them.
+
+`shim` executes the CUDA sources on this CPU; `gpu` copies each call's tensors to the GPU and back.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import torch
+
+from gsparc.ops import backends, cuda, cuda_kernels, cuda_library
+
+KEPT = Path(__file__).parents[2] / "build" / "shim"
+FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-x", "c++")
+
+
+def library() -> cuda_library.Library:
+    """The sources of the kernels, executed by fibers; built when they have changed."""
+    path = KEPT / f"{cuda_library.fingerprint(*FLAGS)}.so"
+    if not path.exists():
+        sources = [*cuda_library.units(), str(cuda_library.SOURCES / "cuda" / "host_shim.cpp")]
+        cuda_library.compile_to(path, ["g++", *FLAGS, f"-I{cuda_library.SOURCES}", *sources])
+    return cuda_library.Library(path)
+
+
+def gpu() -> cuda_library.Library:
+    """The library on this machine's GPU, or skip the test with the reason."""
+    reason = cuda_library.missing_device()
+    if reason:
+        pytest.skip(reason)
+    cuda.load()
+    return cuda_kernels.libraries["cuda"]
+
+
+def on_gpu(run: Callable) -> Callable:
+    """`run` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
+
+    def there(name, like, *tensors, **sizes):
+        moved = [None if t is None else t.cuda() for t in tensors]
+        run(name, torch.empty(0, dtype=like.dtype, device="cuda"), *moved, **sizes)
+        torch.cuda.synchronize()
+        for tensor, copy in zip(tensors, moved, strict=True):
+            if tensor is not None:
+                tensor.copy_(copy)
+
+    return there
+
+
+@contextmanager
+def serving(where: str) -> Iterator[cuda_library.Library]:
+    """CPU tensors go through the CUDA kernels, on the `shim` or on the `gpu`."""
+    kernels = library() if where == "shim" else gpu()
+    before = [operator._backend_fns["cpu"] for operator, _ in cuda_kernels.KERNELS]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(cuda_kernels.libraries, "cpu", kernels)
+        patch.setattr(backends, "_cpu", lambda: cuda)
+        patch.setattr(backends, "_cuda", lambda: cuda)
+        if where == "gpu":
+            patch.setattr(cuda_kernels, "run", on_gpu(cuda_kernels.run))
+        cuda_kernels._tables.cache_clear()
+        cuda_kernels.register("cpu")
+        try:
+            yield kernels
+        finally:
+            for (operator, _), kernel in zip(cuda_kernels.KERNELS, before, strict=True):
+                operator.register_kernel("cpu")(kernel)
+            cuda_kernels._tables.cache_clear()
