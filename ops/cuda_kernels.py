@@ -20,7 +20,6 @@ from torch import Tensor
 from gsparc.ops import cuda_library, door, native, networks
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
-HEADROOM = 1.25  # of a captured plan over the largest seen
 BYTES_PER_ENTRY = 28  # entries and what sorting them takes
 
 libraries: dict[str, cuda_library.Library] = {}
@@ -32,6 +31,11 @@ _capacities: dict[tuple, int] = {}
 def tiles(whole: Sequence[int]) -> int:
     """Tiles of one pose's image."""
     return -(-whole[0] // TILE_HEIGHT) * -(-whole[1] // TILE_WIDTH)
+
+
+def _roomy(entries: int) -> int:
+    """Room of a captured plan where the largest seen had so many entries."""
+    return entries + entries // 4 + 1024
 
 
 def _capturing(tensor: Tensor) -> bool:
@@ -111,11 +115,11 @@ def plan(
     if _capturing(means):
         if key not in _capacities:
             raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
-        capacity = int(_capacities[key] * HEADROOM) + 1024
+        capacity = _roomy(_capacities[key])
     else:
         wrong, capacity = verdict.tolist()
         if wrong == 1 << 62:
-            raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
+            door.raise_for_pose()
         if wrong >= 0:
             door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)
         _capacities[key] = max(capacity, _capacities.get(key, 0))

@@ -53,6 +53,11 @@ def raise_for(name: str, index: int) -> None:
     raise ValueError(f"Gaussian {index} has {name} that are not {wanted}; find where they come from")
 
 
+def raise_for_pose() -> None:
+    """The error for a pose that no direction can be told from (ValueError)."""
+    raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
+
+
 def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
     """Features (N, C) or (B, N, C) as (B, N, C), checked against the Gaussians and the poses (ValueError)."""
     _same_kind("features", values, means)
@@ -72,8 +77,10 @@ def poses(pose: Pose, means: Tensor) -> Pose:
     """Poses (P,) in the Gaussians' dtype and on their device, always batched; ValueError if not finite."""
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
+    if position.is_cuda:  # looking would wait for the GPU; the plan looks there
+        return Pose(position, rotation)
     if not bool(torch.isfinite(position).all()) or not bool(torch.isfinite(rotation).all()):
-        raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
+        raise_for_pose()
     return Pose(position, rotation)
 
 

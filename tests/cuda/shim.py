@@ -15,7 +15,7 @@ import torch
 from gsparc.ops import backends, cuda, cuda_kernels, cuda_library
 
 KEPT = Path(__file__).parents[2] / "build" / "shim"
-FLAGS = ("-std=c++17", "-O1", "-ffp-contract=off", "-fPIC", "-shared", "-x", "c++")
+FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-x", "c++")
 
 
 def library() -> cuda_library.Library:

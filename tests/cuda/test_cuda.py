@@ -1,0 +1,137 @@
+"""What only the CUDA kernels do: long lists, graphs, frozen blocks, networks; on the shim, and on a GPU."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+
+import pytest
+import torch
+from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
+
+from gsparc.ops import SphereGrid, cuda_kernels, freeze, make_plan, native, networks, rasterize
+
+BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
+
+
+def crowd(n: int = 700) -> Scene:
+    """Wide Gaussians on a few tiles: a block walks its list several times, and light ends inside."""
+    scene = random_scene(n=n, seed=12, size=1.5, hides=True)
+    scene.opacities[:] *= 0.3
+    return scene
+
+
+@BOTH
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+def test_long_lists_equal_the_reference(where, dtype, projection):
+    scene, grid = crowd(), SphereGrid.full_sphere(8, 24)
+    want = render(scene, poses(3), grid, "reference", projection=projection)
+    assert want["transmittance"].min() < 1e-4 < want["transmittance"].max()
+    got = render(scene.to(dtype), poses(3), grid, projection=projection)
+    assert_close(got, want, 1e-9 if dtype == torch.float64 else 1e-4)
+
+
+def test_order_of_the_threads_does_not_matter(where):
+    """A missing barrier shows when a block's threads run in the opposite order; on a GPU, run it twice."""
+    scene = crowd(200).to(torch.float32)
+    first = render(scene, poses(3), GRIDS["hemisphere"])
+    turned = (
+        cuda_kernels.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
+    )
+    turned(1)
+    second = render(scene, poses(3), GRIDS["hemisphere"])
+    turned(0)
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
+
+
+@BOTH
+@pytest.mark.parametrize("channels", [1, 3, 8, 9, 70])
+def test_frozen_view_is_the_image(where, dtype, channels):
+    scene = crowd(150).to(dtype)
+    model, grid = (scene.means, scene.quats, scene.scales, scene.opacities), GRIDS["patch"]
+    features = torch.randn(150, channels, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(
+        dtype
+    )
+    plan = make_plan(*model, origin(), grid, extinctions=scene.extinctions)
+    view = freeze(plan, *model, version=3, extinctions=scene.extinctions)
+    want = rasterize(*model, features, origin(), grid, extinctions=scene.extinctions).image[0]
+    assert torch.allclose(
+        view.render(features, version=3), want, atol=1e-12 if dtype == torch.float64 else 1e-5
+    )
+
+
+@pytest.mark.parametrize("samples", [1, 5, 37])
+@pytest.mark.parametrize("inputs,hidden,channels", [(3, 16, 2), (33, 40, 1), (256, 32, 4)])
+def test_networks_equal_matrix_products(where, samples, inputs, hidden, channels):
+    draw = torch.Generator().manual_seed(samples)
+    count, shapes = 9, [(9, inputs, hidden), (9, hidden), (9, hidden, channels), (9, channels)]
+    encoded = torch.randn(samples, inputs, generator=draw)
+    weights = [torch.randn(shape, generator=draw).requires_grad_() for shape in shapes]
+    exact = [weight.detach().double().requires_grad_() for weight in weights]
+    out, want = networks.networks_op(encoded, *weights), networks.products(encoded.double(), *exact)
+    assert out.shape == (samples, count, channels)
+    slope = torch.randn(want.shape, generator=draw)
+    got, truth = torch.autograd.grad(out, weights, slope), torch.autograd.grad(want, exact, slope.double())
+    for a, b in [(out, want), *zip(got, truth, strict=True)]:
+        assert (a.double() - b).abs().max() < 1e-5 * (1 + b.abs().max())
+
+
+def test_captured_plan_with_headroom_is_the_plan(where, monkeypatch):
+    scene = random_scene(n=40).to(torch.float32)
+    want = render(scene, poses(3), GRIDS["hemisphere"])
+    monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
+    got = render(scene, poses(3), GRIDS["hemisphere"])
+    for name, value in want.items():
+        assert torch.equal(value, got[name]), name
+
+
+def test_captured_plan_without_room_is_nan_never_wrong(where, monkeypatch):
+    scene, grid = random_scene(n=40).to(torch.float32), GRIDS["hemisphere"]
+    render(scene, poses(0), grid)
+    monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda_kernels, "_roomy", lambda entries: 5)
+    got = render(scene, poses(0), grid)
+    for name in ("image", "transmittance", "d_means", "d_quats", "d_scales", "d_opacities", "d_features"):
+        assert torch.isnan(got[name]).all(), name
+
+
+def test_captured_plan_needs_an_earlier_one(where, monkeypatch):
+    monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda_kernels, "_capacities", {})
+    scene = random_scene(n=4)
+    with pytest.raises(RuntimeError, match="plan once before capturing"):
+        make_plan(scene.means, scene.quats, scene.scales, scene.opacities, origin(), GRIDS["patch"])
+
+
+def test_unsound_input_is_named(where):
+    scene, optics = (
+        random_scene(n=40),
+        ([30, 120, 1, 1, 1, 0], [0.0, 0.0, 0.05, 0.05, 0.3, 0.01, 0.004, 1e-4, 0.99, 0.01]),
+    )
+    model = [scene.means, scene.quats, scene.scales, scene.opacities]
+    place, turn = torch.zeros(1, 3).double(), torch.eye(3).double()[None]
+    for part, (name, row) in enumerate([("means", 7), ("quats", 39), ("scales", 0), ("opacities", 12)]):
+        wrong = [tensor.clone() for tensor in model]
+        wrong[part][row] = math.nan
+        with pytest.raises(ValueError, match=f"Gaussian {row} has {name}"):
+            native.plan_op(*wrong, None, place, turn, *optics)
+    with pytest.raises(ValueError, match="pose is not finite"):
+        native.plan_op(*model, None, place * math.nan, turn, *optics)
+
+
+def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
+    scene = crowd(60)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    plan = make_plan(*model, origin(), GRIDS["patch"])
+    leaf = scene.means.clone().requires_grad_()
+    image = rasterize(leaf, *model[1:], scene.features, origin(), GRIDS["patch"]).image
+    monkeypatch.setattr(native, "MEMORY_BOUND", plan.buffers[6].numel())
+    with pytest.raises(MemoryError, match="use fewer or smaller Gaussians"):
+        image.sum().backward()
+    with pytest.raises(MemoryError, match="footprint entries need"):
+        make_plan(*model, origin(), GRIDS["patch"])
+
+
+def test_call_has_the_layout_of_the_kernels(where):
+    assert ctypes.sizeof(cuda_kernels.cuda_library.Call) == 6 * 4 + 6 * 4 + 10 * 8 + 32 * 8 + 2 * 8
