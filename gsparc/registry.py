@@ -19,6 +19,7 @@ METHODS = {
     "idw": "gsparc.peers.idw.InverseDistance",
     "gp": "gsparc.peers.gp.GaussianProcess",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
+    "array": "gsparc.array.field.ArrayField",
     "gsparc": "gsparc.learned.LearnedField",
 }
 

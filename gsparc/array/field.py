@@ -1,0 +1,155 @@
+"""Spectra of a static array as a method: vectors recovered, a process taught, packets asked."""
+
+from __future__ import annotations
+
+import logging
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.array.packets import PacketSettings, WavePackets, distil
+from gsparc.array.process import learn_process, mirror_elements
+from gsparc.array.render import SpectrumRenderer
+from gsparc.array.response import site_problem, steering
+from gsparc.array.store import recovered, report
+from gsparc.array.tuning import tune
+from gsparc.baselines import platform_cache
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.method import FitReport, Method, Prediction
+from gsparc.ops import Pose
+from gsparc.peers.encoding import to_real, training_targets
+
+log = logging.getLogger(__name__)
+
+QUERY_CHUNK = 256  # bounds the memory of one prediction call
+
+
+class ArrayField(Method):
+    """The complex field at a static array, as wave packets of the transmitter's position.
+
+    Args:
+        packets: number and shape of the packets.
+        rows: largest number of training spectra whose vectors are learned from; drawn with the seed.
+        refit: learn from validation rows too (settings are chosen by leaving out samples, not on them).
+        cache: keep recovered vectors on disk.
+        seed: of every random choice.
+        name: as it appears in tables.
+    """
+
+    effects = "array"
+
+    def __init__(
+        self,
+        packets: PacketSettings | None = None,
+        rows: int = 3000,
+        refit: bool = True,
+        cache: bool = True,
+        seed: int = 0,
+        name: str = "array",
+    ) -> None:
+        self.packets = packets or PacketSettings()
+        self.rows, self.refit, self.cache, self.seed, self.name = rows, refit, cache, seed, name
+        self.site: Site | None = None
+        self.field: WavePackets | None = None
+        self.renderer: SpectrumRenderer | None = None
+        self.background: Tensor | None = None
+        self.error = (0.0, 0.0)
+        self.seen = 0
+
+    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+        """Recover the vectors of the training rows, learn them, distil.
+
+        The seconds include the recovery, also when it was found on disk (then as it was first measured).
+
+        Raises:
+            ValueError: the site's spectra have no array to go through, or there is nothing to learn from.
+        """
+        problem = site_problem(data.site)
+        if problem is not None:
+            raise ValueError(f"{self.name}: {problem}")
+        rows = np.sort(np.concatenate([fold.train, fold.val])) if self.refit else fold.train
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        begin = time.perf_counter()
+        if len(rows) > self.rows:
+            rows = np.sort(np.random.default_rng([self.seed, 5]).permutation(rows)[: self.rows])
+            log.info("%s: learning from %d of the training spectra", self.name, len(rows))
+        found, recovery_s = recovered(data, rows, platform_cache() if self.cache else None, self.seed)
+        waited = time.perf_counter() - begin
+        report(found, data, rows, run_dir / "array_recovery.csv")
+        begin = time.perf_counter()
+        self._learn(data, rows, found.vectors)
+        seconds = recovery_s + time.perf_counter() - begin
+        notes = [
+            f"{self.name}: recovery {recovery_s:.1f} s (this time {waited:.1f} s), learning "
+            f"{seconds - recovery_s:.1f} s, {int(found.suspect.sum())} suspect spectra"
+        ]
+        return FitReport(seconds, tuple(notes))
+
+    def _learn(self, data: Measurements, rows: np.ndarray, vectors: np.ndarray) -> None:
+        site = data.site
+        assert site.grid is not None and site.array is not None and site.wavelength is not None
+        images = to_real(training_targets(data, rows), "spectrum")
+        matrix = steering(site.array, site.grid, site.wavelength).numpy()
+        partner, places = mirror_elements(site.array), data.tx[rows]
+        tuned = tune(vectors, places, images, matrix, site.wavelength, partner, self.seed)
+        log.info(
+            "%s: length %.3g m, noise %.2g of the field's variance",
+            self.name, tuned.kernel.length, tuned.kernel.noise,
+        )  # fmt: skip
+        teacher = learn_process(vectors, places, partner, tuned.kernel)
+        self.site, self.seen, self.error = site, len(rows), tuned.error_model()
+        self.field = distil(teacher, self.packets, self.seed).requires_grad_(False)
+        self.background = torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width)
+        self.renderer = SpectrumRenderer(site, self.background)
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """Predict at tx (B, 3) [m]; the receiver is the one that was measured with.
+
+        Raises:
+            RuntimeError: before `fit` or `restore`.
+        """
+        if self.field is None or self.renderer is None:
+            raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
+        if len(tx) > QUERY_CHUNK:
+            parts = [self._predict(part) for part in tx.split(QUERY_CHUNK)]
+            return Prediction(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
+        return Prediction(*self._predict(tx))
+
+    def _predict(self, tx: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        assert self.field is not None and self.renderer is not None
+        vectors, unknown = self.field(tx)
+        left = unknown[:, 0].square()
+        return self.renderer(vectors, unknown).clamp_(max=1), 1 - left, self.error[0] + self.error[1] * left
+
+    def state(self) -> dict[str, Any]:
+        """Packets, background, error model."""
+        assert self.field is not None
+        return {
+            "packets": self.field.state_dict(),
+            "elements": self.field.elements,
+            "background": self.background,
+            "error": list(self.error),
+            "seen": self.seen,
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        stored = state["packets"]
+        count = len(stored["gains"]) // 2
+        blank = (torch.zeros(count, 3), torch.ones(count), torch.zeros(count, 3), torch.zeros(3))
+        self.field = WavePackets(*blank, elements=int(state["elements"])).requires_grad_(False)
+        self.field.load_state_dict(stored)
+        self.site, self.background, self.seen = site, state["background"], int(state["seen"])
+        self.error = (float(state["error"][0]), float(state["error"][1]))
+        self.renderer = SpectrumRenderer(site, self.background)
+
+    def size(self) -> int:
+        """Number of packets."""
+        return 0 if self.field is None else len(self.field.gains) // 2

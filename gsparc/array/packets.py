@@ -1,0 +1,119 @@
+"""A field of wave packets around the transmitter: what a query evaluates.
+
+`h(x) = sum_i G_i(x) (a_i cos w_i.x + b_i sin w_i.x)` with Gaussians G_i and complex a_i, b_i per element: a
+packet is what is left of a departing plane wave where it is seen and coherent. Away from all packets nothing
+of the field is known, and so the field says: every feature vanishes there. Centres, widths and wave vectors
+are drawn once; gains come from a teacher by ridge regression.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.linalg import cho_factor, cho_solve
+from torch import Tensor, nn
+
+from gsparc.array.process import VectorProcess
+
+MOST_PACKETS = 2048
+FEWEST_PACKETS = 256
+
+
+@dataclass(frozen=True)
+class PacketSettings:
+    """Number and shape of the packets, and where the teacher is asked. Lengths are in the teacher's lengths.
+
+    Attributes:
+        count: number of packets; None takes 8 per sample, at least 256 and at most 2,048.
+        widths: standard deviations of the Gaussians, in equal numbers.
+        jitter: distance of centres from samples, in widths.
+        pitch: wave vectors are of size `pitch / width`.
+        samples: queries put to the teacher besides its samples; `near` and `far` are their least and largest
+            distance from one.
+        ridge: relative to a feature's mean square.
+    """
+
+    count: int | None = None
+    widths: tuple[float, ...] = (0.5, 1.0, 2.0)
+    jitter: float = 0.3
+    pitch: float = 1.0
+    samples: int = 5000
+    near: float = 0.02
+    far: float = 4.0
+    ridge: float = 1e-6
+
+
+class WavePackets(nn.Module):
+    """Packets and their gains.
+
+    Args:
+        centres: (N, 3) [m].
+        widths: (N,) [m].
+        waves: (N, 3) [rad/m].
+        origin: (3,) [m], subtracted from positions first: float32 then keeps the digits.
+        elements: M.
+    """
+
+    form: Tensor
+    origin: Tensor
+
+    def __init__(self, centres: Tensor, widths: Tensor, waves: Tensor, origin: Tensor, elements: int) -> None:
+        super().__init__()
+        self.elements = elements
+        c, w, s = (centres - origin).double(), waves.double(), widths.double()
+        # Exponent and phase are linear in (x, |x|^2, 1): one small product gives both.
+        exponent = torch.cat(
+            [(c / s[:, None] ** 2).T, -0.5 / s[None] ** 2, -0.5 * (c**2).sum(1)[None] / s**2]
+        )
+        phase = torch.cat([w.T, torch.zeros(1, len(w)), -(c * w).sum(1)[None]])
+        self.register_buffer("form", torch.cat([exponent, phase], 1).float().contiguous())
+        self.register_buffer("origin", origin.float())
+        self.gains = nn.Parameter(torch.zeros(2 * len(centres), 2 * elements + 1))
+
+    def features(self, x: Tensor) -> Tensor:
+        """(B, 2 N) of positions (B, 3) [m]."""
+        x = x - self.origin.to(x.dtype)
+        lifted = torch.cat([x, x.square().sum(1, keepdim=True), torch.ones_like(x[:, :1])], 1)
+        exponent, phase = (lifted @ self.form.to(x.dtype)).chunk(2, 1)
+        window = exponent.exp()
+        return torch.cat([window * phase.cos(), window * phase.sin()], 1)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Array vectors (B, M) complex and the unknown share of the amplitude (B, 1) in [0, 1]."""
+        out = self.features(x) @ self.gains.to(x.dtype)
+        m = self.elements
+        return torch.complex(out[:, :m], out[:, m : 2 * m]), (1 + out[:, 2 * m :]).clamp(0, 1)
+
+
+def student_t(count: int, rng: np.random.Generator) -> np.ndarray:
+    """(count, 3) draws from the spectral density of Matern-3/2 of length 1: Student's t, 3 degrees."""
+    return rng.standard_normal((count, 3)) / np.sqrt(rng.chisquare(3, (count, 1)) / 3)
+
+
+def distil(teacher: VectorProcess, settings: PacketSettings, seed: int) -> WavePackets:
+    """The packets that answer like the teacher at and around its samples, by ridge regression."""
+    rng = np.random.default_rng([seed, 7])
+    places, length = teacher.positions, teacher.kernel.length
+    n, m = teacher.vectors.shape
+    count = settings.count or int(np.clip(8 * n, FEWEST_PACKETS, MOST_PACKETS))
+    widths = length * np.resize(settings.widths, count)
+    centres = places[rng.integers(0, n, count)]
+    centres = centres + settings.jitter * widths[:, None] * rng.standard_normal((count, 3))
+    waves = settings.pitch / widths[:, None] * student_t(count, rng)
+    field = WavePackets(
+        *(torch.from_numpy(part) for part in (centres, widths, waves, places.mean(0))), elements=m
+    )
+    reach = np.exp(rng.uniform(np.log(settings.near), np.log(settings.far), (settings.samples, 1))) * length
+    around = places[rng.integers(0, n, settings.samples)] + reach * rng.standard_normal((settings.samples, 3))
+    asked = np.concatenate([places, places, around])
+    mean, left = teacher.posterior(asked)
+    wanted = np.concatenate([mean.real, mean.imag, np.sqrt(left)[:, None] - 1], 1)
+    with torch.no_grad():
+        features = field.features(torch.from_numpy(asked)).numpy()
+        gram = features.T @ features
+        gram[np.diag_indices_from(gram)] += settings.ridge * np.trace(gram) / len(gram)
+        gains = cho_solve(cho_factor(gram, lower=True, overwrite_a=True), features.T @ wanted)
+        field.gains.copy_(torch.from_numpy(gains))
+    return field

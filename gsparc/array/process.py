@@ -1,0 +1,159 @@
+"""A complex Gaussian process on array vectors whose phases and twins are unknown; used while training only.
+
+Each spectrum gives its vector up to a global phase and a twin. Both are free parameters of every sample: by
+turns each takes the value under which its vector is most likely given all others (coordinate ascent of the
+likelihood). The likely spectrum at a query is the mean amplitude of a Rice distribution, nearly the root of a
+coherent part `|A^H mu|^2` and an incoherent one that grows with the variance until, far from all data, the
+mean image is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from gsparc.peers.gp import Kernel
+
+SWEEPS = 30
+SETTLED = 1e-3  # mean change per vector and sweep, relative to its length
+TWIN_MARGIN = 1.02  # a twin must be this much likelier to be taken
+
+
+def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
+    """The vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
+
+    Args:
+        partner: (M,) index of each element's mirror element.
+    """
+    return vectors.conj()[..., partner]
+
+
+def mirror_elements(array: np.ndarray) -> np.ndarray | None:
+    """(M,) index of each element's reflection through the array's centre; None when the array has no such."""
+    centred = array - array.mean(0)
+    distance = cdist(centred, -centred)
+    partner = distance.argmin(1)
+    spacing = cdist(array, array)[~np.eye(len(array), dtype=bool)].min()
+    symmetric = distance[np.arange(len(array)), partner].max() < 1e-3 * spacing
+    return partner if symmetric else None
+
+
+def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
+    """Vectors (n, M) with twins chosen and phases turned to agree with their nearest neighbours, one by one.
+
+    Walks a minimum spanning tree of the positions (n, 3) [m]; each sample is compared with its four nearest
+    predecessors.
+    """
+    n = len(vectors)
+    order = _walk(positions)
+    aligned = np.array(vectors, dtype=np.complex128)
+    tree = cKDTree(positions)
+    done = np.zeros(n, dtype=bool)
+    done[order[0]] = True
+    for i in order[1:]:
+        near = _nearest_done(tree, positions, i, done, 4)
+        distance = np.linalg.norm(positions[near] - positions[i], axis=1)
+        weight = np.exp(-distance / max(distance[0], 1e-6)) / np.maximum(
+            np.linalg.norm(aligned[near], axis=1), 1e-12
+        )
+        choices = [aligned[i]] if partner is None else [aligned[i], twin(aligned[i], partner)]
+        overlaps = [aligned[near].conj() @ choice for choice in choices]
+        best = int(np.argmax([(weight * np.abs(overlap)).sum() for overlap in overlaps]))
+        turn = overlaps[best][0]
+        aligned[i] = choices[best] * (np.conj(turn) / abs(turn) if abs(turn) > 0 else 1.0)
+        done[i] = True
+    return aligned
+
+
+def _walk(positions: np.ndarray) -> np.ndarray:
+    """Rows from the first along a spanning tree of short steps."""
+    if len(positions) == 1:
+        return np.zeros(1, dtype=np.int64)
+    distance = cdist(positions, positions) + 1e-9  # zero would mean no edge
+    tree = minimum_spanning_tree(distance)
+    return breadth_first_order(tree + tree.T, 0, directed=False, return_predecessors=False)
+
+
+def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray, count: int) -> np.ndarray:
+    reach = 4 * count
+    while True:
+        found = np.atleast_1d(tree.query(positions[i], k=min(reach, len(positions)))[1])
+        near = found[done[found]]
+        if len(near) >= count or reach >= len(positions):
+            return near[:count]
+        reach *= 4
+
+
+@dataclass(frozen=True)
+class VectorProcess:
+    """Posterior of the array vector as a function of the transmitter's position.
+
+    Attributes:
+        kernel: Matern-3/2 and noise; amplitude is the variance per element.
+        positions: (n, 3) [m].
+        vectors: (n, M) complex128, phases and twins settled.
+        inverse: (n, n) inverse of the correlation matrix with noise.
+    """
+
+    kernel: Kernel
+    positions: np.ndarray
+    vectors: np.ndarray
+    inverse: np.ndarray
+
+    def posterior(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (B, M) complex and remaining share of the variance (B,) in [0, 1] at (B, 3) [m]."""
+        cross = self.kernel.cross(queries, self.positions)
+        explained = np.einsum("ij,ij->i", cross @ self.inverse, cross)
+        return cross @ (self.inverse @ self.vectors), np.clip(1 - explained, 0.0, 1.0)
+
+
+def settle(
+    vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
+) -> np.ndarray:
+    """Phases and twins (n, M) of largest likelihood, one sample at a time given all others.
+
+    The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams 2006,
+    eq. 5.12).
+    """
+    settled = vectors.copy()
+    diagonal = np.diag(inverse)
+    size = np.linalg.norm(vectors, axis=1).sum()
+    for _ in range(sweeps):
+        change = 0.0
+        for i in range(len(settled)):
+            old = settled[i]
+            expected = old - (inverse[i] @ settled) / diagonal[i]
+            new, overlap = old, np.vdot(old, expected)
+            if partner is not None:
+                other = twin(old, partner)
+                its = np.vdot(other, expected)
+                if abs(its) > TWIN_MARGIN * abs(overlap):
+                    new, overlap = other, its
+            if abs(overlap) > 0:
+                new = new * (overlap / abs(overlap))
+            change += float(np.linalg.norm(new - old))
+            settled[i] = new
+        if change < SETTLED * size:
+            break
+    return settled
+
+
+def learn_process(
+    vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
+) -> VectorProcess:
+    """The process whose phases and twins agree with each other.
+
+    Args:
+        vectors: (n, M) complex, phases and twins arbitrary.
+        positions: (n, 3) [m].
+        partner: of `mirror_elements`.
+        kernel: length and noise; its amplitude is set here.
+    """
+    inverse = np.linalg.inv(kernel.gram(positions))
+    settled = settle(align(vectors, positions, partner), inverse, partner)
+    amplitude = float(np.einsum("im,ij,jm->", settled.conj(), inverse, settled).real) / settled.size
+    return VectorProcess(replace(kernel, amplitude=amplitude), positions, settled, inverse)

@@ -1,0 +1,173 @@
+"""What a static antenna array makes of arriving waves: `h = A z`, the Bartlett spectrum `|A^H h|`, its lags.
+
+The squared spectrum of M elements is a trigonometric polynomial: `|A^H h|^2 = B r`, where the columns of B
+are the cosines and sines of the array's distinct element differences (its co-array; 49 columns for a 4 x 4
+grid) and r the sums of `h_m conj(h_n)` over the pairs with that difference. Van Trees 2002, "Optimum array
+processing", ch. 2 and 3.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Site
+from gsparc.ops import SphereGrid
+
+SAME_LAG = 1e-4  # two element differences closer than this many wavelengths are one lag
+
+
+def steering(array: np.ndarray, grid: SphereGrid, wavelength: float) -> Tensor:
+    """Steering matrix A (M, H * W) complex128: `exp(+j k u.a_m)`.
+
+    Args:
+        array: (M, 3) [m], receiver frame.
+        grid: directions u.
+        wavelength: [m].
+    """
+    turns = torch.from_numpy(np.asarray(array, dtype=np.float64)) @ grid.directions().reshape(-1, 3).T
+    return torch.exp(2j * math.pi / wavelength * turns)
+
+
+def element_pattern(grid: SphereGrid, exponent: float) -> Tensor:
+    """Amplitude (H, W) float64 of an element: cos^exponent of the angle off boresight, 0 behind it."""
+    return grid.directions()[..., 2].clamp_min(0) ** exponent
+
+
+def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tensor | None = None) -> Tensor:
+    """`h = A z` (B, M): what the elements measure of complex amplitudes z (B, H, W) per steradian.
+
+    Args:
+        waves: arriving field per direction, complex.
+        matrix: A of `steering`, same precision as `waves`.
+        grid: its solid angles are the weights of the sum.
+        pattern: (H, W) element amplitude; None for isotropic elements.
+    """
+    weight = grid.solid_angles() if pattern is None else grid.solid_angles() * pattern
+    return (waves * weight.to(waves.real.dtype)).flatten(1) @ matrix.T
+
+
+def bartlett(vectors: Tensor, matrix: Tensor) -> Tensor:
+    """`|A^H h|` (B, H * W) of array vectors (B, M); its slope where it vanishes is taken as 0."""
+    return _SafeAbsolute.apply(vectors @ matrix.conj())
+
+
+def normalised(image: Tensor, how: str) -> Tensor:
+    """The spectrum (B, P) as a dataset publishes it: `max`, `minmax`, `power` (unit mean square) or `none`.
+
+    Raises:
+        ValueError: another name.
+    """
+    if how == "none":
+        return image
+    low = image.amin(1, keepdim=True) if how == "minmax" else image.new_zeros(len(image), 1)
+    if how in ("max", "minmax"):
+        high = image.amax(1, keepdim=True)
+    elif how == "power":
+        high = image.square().mean(1, keepdim=True).sqrt()
+    else:
+        raise ValueError(f"normalisation {how!r} is none of max, minmax, power, none")
+    return (image - low) / (high - low).clamp_min(1e-12)
+
+
+class _SafeAbsolute(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, value: Tensor) -> Tensor:
+        size = value.abs()
+        ctx.save_for_backward(value, size)
+        return size
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> Tensor:
+        value, size = ctx.saved_tensors
+        unit = torch.where(size > 0, value / size.clamp_min(torch.finfo(size.dtype).tiny), 0)
+        return upstream * unit
+
+
+@dataclass(frozen=True)
+class Lags:
+    """The distinct element differences of an array, one of each pair +-d, the zero lag first.
+
+    Attributes:
+        difference: (L, 3) [m], `difference[0]` is 0.
+        real_pairs, imag_pairs: (M * M, 2 L - 1) float64, which lag numbers the real and imaginary parts of
+            the products `h_m conj(h_n)` add to.
+        elements: M.
+    """
+
+    difference: np.ndarray
+    real_pairs: Tensor
+    imag_pairs: Tensor
+    elements: int
+
+    @property
+    def count(self) -> int:
+        """Real numbers that determine a squared spectrum: 2 L - 1."""
+        return 2 * len(self.difference) - 1
+
+    def of(self, vectors: Tensor) -> Tensor:
+        """Lag numbers r (B, 2 L - 1) of vectors (B, M): the zero lag, real parts, imaginary parts."""
+        products = (vectors[:, :, None] * vectors[:, None, :].conj()).flatten(1)
+        real, imag = (pairs.to(products.real.dtype) for pairs in (self.real_pairs, self.imag_pairs))
+        return torch.addmm(products.real @ real, products.imag, imag)
+
+    def basis(self, grid: SphereGrid, wavelength: float) -> Tensor:
+        """B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`."""
+        phase = grid.directions().reshape(-1, 3) @ torch.from_numpy(self.difference[1:].T)
+        phase = 2 * math.pi / wavelength * phase
+        return torch.cat([torch.ones(len(phase), 1, dtype=torch.float64), phase.cos(), phase.sin()], 1)
+
+    def forms(self) -> Tensor:
+        """Symmetric S (2 L - 1, 2 M, 2 M) float64 with `r_i = v^T S_i v`, v = (Re h, Im h)."""
+        m = self.elements
+        real = self.real_pairs.T.reshape(-1, m, m)
+        imag = self.imag_pairs.T.reshape(-1, m, m)
+        # Re(h_m conj(h_n)) = a_m a_n + b_m b_n, Im = b_m a_n - a_m b_n.
+        whole = torch.cat([torch.cat([real, -imag], 2), torch.cat([imag, real], 2)], 1)
+        return (whole + whole.transpose(1, 2)) / 2
+
+
+def lags(array: np.ndarray, wavelength: float) -> Lags:
+    """The co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one."""
+    array = np.asarray(array, dtype=np.float64)
+    m = len(array)
+    difference = array[:, None] - array[None]
+    cell = np.round(difference / (SAME_LAG * wavelength)).astype(np.int64).reshape(-1, 3)
+    # One half-space of differences: the first nonzero coordinate is positive.
+    lead = np.where(cell[:, 0] != 0, cell[:, 0], np.where(cell[:, 1] != 0, cell[:, 1], cell[:, 2]))
+    sign = np.sign(lead)
+    unique, which = np.unique(cell * np.where(sign == 0, 1, sign)[:, None], axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    zero = int(np.flatnonzero((unique == 0).all(1))[0])
+    order = np.concatenate([[zero], np.delete(np.arange(len(unique)), zero)])
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    which = rank[which]
+    size = 2 * len(unique) - 1
+    real, imag = np.zeros((m * m, size)), np.zeros((m * m, size))
+    every = np.arange(m * m)
+    real[every, which] = 1.0
+    moved = which > 0
+    # h_m conj(h_n) e^{-j k d.u}: Re cos + Im sin, and its conjugate twin sits at -d.
+    imag[every[moved], len(unique) - 1 + which[moved]] = sign[moved]
+    kept = np.stack(
+        [difference.reshape(-1, 3)[(which == i) & (sign >= 0)].mean(0) for i in range(len(unique))]
+    )
+    return Lags(kept, torch.from_numpy(real), torch.from_numpy(imag), m)
+
+
+def site_problem(site: Site) -> str | None:
+    """Why a site's spectra cannot be modelled through its array; None when they can."""
+    if site.kind != "spectrum" or site.grid is None:
+        return f"targets are {site.kind}, not spectra on a grid"
+    if site.static_end != "rx":
+        return "the receiver moves; its array must be static"
+    if site.array is None or len(site.array) < 2:
+        return "the dataset declares no antenna array"
+    if site.wavelength is None:
+        return "the carrier is unknown"
+    return None

@@ -1,0 +1,113 @@
+"""Recovered vectors kept on disk by dataset: a sweep recovers each spectrum once."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import logging
+import os
+import tempfile
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.array.recovery import Recovered, recover
+from gsparc.data.schema import Measurements, Site
+from gsparc.peers.encoding import training_targets
+
+log = logging.getLogger(__name__)
+
+VERSION = 1  # raise it when the recovery changes its answers
+NAMED = 8  # suspect images named in a log line
+
+
+def recovered(
+    data: Measurements, rows: np.ndarray, cache: Path | None, seed: int = 0
+) -> tuple[Recovered, float]:
+    """Array vectors of the given rows, from disk where known, and the seconds they cost when made [s].
+
+    Only the asked rows are looked at: vectors of a test set are never made for a training run.
+
+    Args:
+        data: spectra of a static array.
+        rows: (n,) sorted.
+        cache: folder; None keeps nothing.
+        seed: of the random starts.
+    """
+    path = None if cache is None else Path(cache) / f"array-v{VERSION}" / f"{_key(data.site)}.npz"
+    known = _read(path, len(data))
+    have = np.zeros(len(data), dtype=bool) if known is None else known["seconds"] >= 0
+    missing = rows[~have[rows]]
+    if len(missing):
+        begin = time.perf_counter()
+        found = recover(data.site, training_targets(data, missing), data.tx[missing], seed)
+        spent = time.perf_counter() - begin
+        known = known or _empty(len(data), found)
+        for name, values in known.items():
+            values[missing] = spent / len(missing) if name == "seconds" else getattr(found, name)
+        if path is not None:
+            _write(path, known)
+    assert known is not None
+    result = Recovered(**{f.name: known[f.name][rows] for f in fields(Recovered)})
+    return result, float(known["seconds"][rows].sum())
+
+
+def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) -> None:
+    """Write the residual of each image as CSV and name the bad ones in the log."""
+    names = data.row_names or [f"row {i}" for i in range(len(data))]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["row", "name", "residual", "outside_the_array", "quantisation", "suspect"])
+        for i, row in enumerate(rows):
+            figures = (result.residual[i], result.floor[i], result.expected[i])
+            writer.writerow([row, names[row], *(f"{v:.3e}" for v in figures), int(result.suspect[i])])
+    bad = rows[result.suspect]
+    log.info(
+        "array vectors of %d spectra, residual %.1e (median) against %.1e of quantisation",
+        len(rows), np.median(result.residual), np.median(result.expected),
+    )  # fmt: skip
+    if len(bad):
+        more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
+        log.warning(
+            "%d spectra are not what this array measures (see %s): %s%s",
+            len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
+        )  # fmt: skip
+
+
+def _key(site: Site) -> str:
+    assert site.array is not None
+    facts = f"{site.sha256} {site.wavelength!r} {site.normalisation} {site.grid} "
+    return hashlib.sha256(
+        facts.encode() + np.ascontiguousarray(site.array, dtype="<f8").tobytes()
+    ).hexdigest()[:24]
+
+
+def _empty(count: int, like: Recovered) -> dict[str, np.ndarray]:
+    arrays = {f.name: getattr(like, f.name) for f in fields(Recovered)}
+    return {
+        **{k: np.zeros((count, *v.shape[1:]), dtype=v.dtype) for k, v in arrays.items()},
+        "seconds": np.full(count, -1.0),
+    }
+
+
+def _read(path: Path | None, count: int) -> dict[str, np.ndarray] | None:
+    if path is None or not path.exists():
+        return None
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            known = {name: file[name] for name in (*(f.name for f in fields(Recovered)), "seconds")}
+    except Exception as error:  # whatever a damaged archive raises: it is only a cache
+        log.warning("stored array vectors are not usable and are made anew: %s (%s)", path, error)
+        return None
+    return known if all(len(values) == count for values in known.values()) else None
+
+
+def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial = tempfile.mkstemp(suffix=".npz", dir=path.parent)
+    with os.fdopen(handle, "wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)
+    os.replace(partial, path)

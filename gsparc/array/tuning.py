@@ -1,0 +1,156 @@
+"""Length and noise of the vector process, chosen for queries near and far: leave-out with gaps.
+
+Plain leave-one-out sees neighbours millimetres away only and picks a length that knows nothing beyond them.
+Here each sample is predicted without all others within a gap, for several gaps; what counts is the logarithm
+of the spectra's mean squared error, averaged over the gaps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+from gsparc.array.process import align, settle
+from gsparc.peers.gp import Kernel
+
+GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths
+PIXELS = 600  # drawn from the grid
+ROWS = 384  # neighbouring samples the choice is made on
+CENTRES = 160  # of them predicted
+STEPS = 36
+STARTS = ((0.2, 0.02), (0.35, 0.02))  # length [wavelengths], noise
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The chosen kernel and how wrong it was.
+
+    Attributes:
+        kernel: length and noise.
+        left: (k,) unknown share of the variance at each prediction made in passing.
+        error: (k,) mean squared error of its spectrum.
+    """
+
+    kernel: Kernel
+    left: np.ndarray
+    error: np.ndarray
+
+    def error_model(self) -> tuple[float, float]:
+        """(a, b), both at least 0: the expected squared error of a pixel is about a + b * left."""
+        design = np.stack([np.ones_like(self.left), self.left], 1)
+        a, b = np.linalg.lstsq(design, self.error, rcond=None)[0]
+        return max(float(a), float(self.error.min())), max(float(b), 0.0)
+
+
+def tune(
+    vectors: np.ndarray,
+    positions: np.ndarray,
+    images: np.ndarray,
+    matrix: np.ndarray,
+    wavelength: float,
+    partner: np.ndarray | None,
+    seed: int = 0,
+) -> Tuned:
+    """Choose a kernel.
+
+    Args:
+        vectors: (n, M) complex, phases and twins arbitrary.
+        positions: (n, 3) [m].
+        images: (n, P) in [0, 1].
+        matrix: (M, P) steering.
+        wavelength: [m].
+        partner: of `mirror_elements`.
+        seed: of the neighbourhood, the predicted samples and the pixels.
+    """
+    rng = np.random.default_rng([seed, 3])
+    background = images.mean(0, dtype=np.float64)
+    if len(positions) > ROWS:
+        centre = positions[rng.integers(len(positions))]
+        rows = np.argsort(np.linalg.norm(positions - centre, axis=1))[:ROWS]
+        vectors, positions, images = vectors[rows], positions[rows], images[rows]
+    pixels = rng.choice(images.shape[1], min(PIXELS, images.shape[1]), replace=False)
+    looks = _Looks(
+        positions=positions,
+        images=images[:, pixels].astype(np.float64),
+        matrix=matrix[:, pixels].conj(),
+        background=background[pixels] ** 2,
+        centres=np.sort(rng.permutation(len(positions))[:CENTRES]),
+        gaps=np.array(GAPS) * wavelength,
+        distance=cdist(positions, positions),
+    )
+    aligned = align(vectors, positions, partner)
+
+    def kernel_at(parameters: np.ndarray) -> Kernel:
+        length, noise = np.exp(np.clip(parameters, np.log([0.02, 1e-4]), np.log([5.0, 1.0])))
+        return Kernel(float(length * wavelength), float(noise))
+
+    def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
+        kernel = kernel_at(parameters)
+        inverse = np.linalg.inv(kernel.gram(positions))
+        return looks.score(kernel, inverse, settle(start, inverse, partner, sweeps))
+
+    if len(positions) < 4:
+        return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
+    first = min((np.log(start) for start in STARTS), key=objective)
+    settled = settle(aligned, np.linalg.inv(kernel_at(first).gram(positions)), partner)
+    found = minimize(
+        objective, first, args=(settled,), method="Nelder-Mead",
+        options={
+            "maxfev": STEPS, "xatol": 0.03, "fatol": 1e-3,
+            "initial_simplex": first + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, -1.0]]),
+        },
+    )  # fmt: skip
+    kernel = kernel_at(found.x)
+    inverse = np.linalg.inv(kernel.gram(positions))
+    left, error = looks.predictions(kernel, inverse, settle(settled, inverse, partner))
+    seen = ~np.isnan(error)
+    return Tuned(kernel, left[seen], error[seen])
+
+
+@dataclass(frozen=True)
+class _Looks:
+    positions: np.ndarray
+    images: np.ndarray
+    matrix: np.ndarray
+    background: np.ndarray
+    centres: np.ndarray
+    gaps: np.ndarray
+    distance: np.ndarray
+
+    def predictions(
+        self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Unknown share and squared error (gaps, centres) of left-out predictions; NaN where nothing is left.
+
+        Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
+        `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
+        """
+        weighted = inverse @ vectors
+        left = np.full((len(self.gaps), len(self.centres)), np.nan)
+        error = left.copy()
+        for g, gap in enumerate(self.gaps):
+            mean = np.zeros((len(self.centres), vectors.shape[1]), dtype=np.complex128)
+            for c, i in enumerate(self.centres):
+                near = self.distance[i] <= gap
+                near[i] = True
+                if near.all():
+                    continue
+                rows = np.flatnonzero(near)
+                own = int(np.searchsorted(rows, i))
+                unit = np.zeros(len(rows))
+                unit[own] = 1.0
+                share = np.linalg.solve(inverse[np.ix_(rows, rows)], unit)
+                mean[c] = vectors[i] - share @ weighted[rows]
+                left[g, c] = min(max(share[own] - kernel.noise, 0.0), 1.0)
+            power = np.abs(mean @ self.matrix) ** 2 + left[g][:, None] * self.background
+            error[g] = ((np.sqrt(power) - self.images[self.centres]) ** 2).mean(1)
+        return left, error
+
+    def score(self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray) -> float:
+        """Mean over gaps of the log of the mean squared error."""
+        error = self.predictions(kernel, inverse, vectors)[1]
+        usable = ~np.isnan(error).all(1)
+        return float(np.log(np.nanmean(error[usable], axis=1) + 1e-12).mean()) if usable.any() else 0.0
