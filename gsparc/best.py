@@ -1,0 +1,99 @@
+"""`model=gsparc`: the field with the effects that the site calls for, and nothing else computed."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.effects import (
+    Decision,
+    EffectSettings,
+    decide_array,
+    decide_phase,
+    probe_array,
+    probe_phase,
+)
+from gsparc.learned import LearnedField
+from gsparc.method import FitReport, Method, Prediction
+from gsparc.ops import Pose
+from gsparc.peers.gp import GaussianProcess
+
+log = logging.getLogger(__name__)
+
+
+class Gsparc(LearnedField):
+    """The splatted field, or sources with carrier phase, or sources seen through an array.
+
+    Args:
+        effects: switches; `auto` decides from the site and a probe on training data.
+        phase_model: what predicts where `phase` is on.
+        phase_probe: the same with a small budget, for the probe.
+        array_model: what predicts where `array` is on.
+        **field: see `LearnedField`.
+    """
+
+    def __init__(
+        self, effects: EffectSettings, phase_model: Method, phase_probe: Method, array_model: Method, **field: Any
+    ) -> None:
+        super().__init__(**field)
+        self.switches = effects
+        self._models = {"phase": phase_model, "array": array_model}
+        self._probe = phase_probe
+        self._chosen: str | None = None
+        self.decisions: tuple[Decision, ...] = ()
+
+    @property
+    def effects(self) -> str:
+        """The effects that are computed, for `summary.json`."""
+        return self._chosen or "none"
+
+    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+        """Decide, then train what was decided on; the probe's time is part of the bill."""
+        self.site = data.site
+        self.decisions = self._decide(data, fold)
+        for decision in self.decisions:
+            log.info("%s", decision)
+        self._chosen = next((d.effect for d in self.decisions if d.on), None)
+        if self._chosen is None:
+            report = super().fit(data, fold, run_dir)
+        else:
+            log.info("settings of the splatted field (emission, raster, trainer) are not used")
+            report = self._models[self._chosen].fit(data, fold, run_dir)
+        return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
+
+    def _decide(self, data: Measurements, fold: Fold) -> tuple[Decision, ...]:
+        hidden = self.settings.emission.hidden
+        splatting = f"emission.hidden={hidden}" if hidden else None
+        phase = decide_phase(self.switches.phase, data.site)
+        array = decide_array(self.switches.array, data.site, splatting)
+        if phase.on and self.switches.phase == "auto":
+            phase = probe_phase(self._probe, GaussianProcess(), data, fold, self.training.seed)
+        if array.on and self.switches.array == "auto":
+            array = probe_array(data, fold, self.training.seed)
+        return phase, array
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        return super().predict(tx, rx) if self._chosen is None else self._models[self._chosen].predict(tx, rx)
+
+    def state(self) -> dict[str, Any]:
+        """What was chosen, and its state."""
+        inner = super().state() if self._chosen is None else self._models[self._chosen].state()
+        return {"chosen": self._chosen, "inner": inner}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self._chosen = site, state["chosen"]
+        if self._chosen is None:
+            super().restore(site, state["inner"])
+        else:
+            self._models[self._chosen].restore(site, state["inner"])
+
+    def size(self) -> int:
+        """Number of Gaussians or sources."""
+        return super().size() if self._chosen is None else self._models[self._chosen].size()

@@ -1,0 +1,158 @@
+"""Which coherent effects a site calls for: decided from what it measures and a quick probe, and said."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.array.recovery import recover
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.method import Method
+
+Switch = bool | Literal["auto"]
+
+DENSE = 0.25  # neighbours closer than this many wavelengths can be interpolated without a carrier
+PROBE_IMAGES = 12
+ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
+
+
+@dataclass(frozen=True)
+class EffectSettings:
+    """Switches; off means not computed.
+
+    Attributes:
+        phase: carrier phase from source positions (channels of a moving receiver).
+        array: array response (spectra of a static receiver with a declared array).
+    """
+
+    phase: Switch = "auto"
+    array: Switch = "auto"
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One effect, settled.
+
+    Attributes:
+        effect: its switch's name.
+        on: whether it is computed.
+        reason: one clause, with the measurement that decided.
+        seconds: what deciding cost [s].
+    """
+
+    effect: str
+    on: bool
+    reason: str
+    seconds: float = 0.0
+
+    def __str__(self) -> str:
+        cost = f" ({self.seconds:.1f} s to find out)" if self.seconds >= 0.1 else ""
+        return f"effects.{self.effect} -> {'on' if self.on else 'off'}: {self.reason}{cost}"
+
+
+def decide_phase(switch: Switch, site: Site) -> Decision:
+    """Whether the channels' phase is to come from source positions.
+
+    Raises:
+        ValueError: asked for where it has no meaning.
+    """
+    obstacle = None
+    if site.kind != "csi":
+        obstacle = f"the target is {site.kind}, which carries no phase"
+    elif site.static_end != "tx":
+        obstacle = "the transmitter moves; carrier phase is modelled for a moving receiver"
+    elif site.carrier_hz is None and site.subcarriers_hz is None:
+        obstacle = "the dataset declares no frequency"
+    return _settle("phase", switch, obstacle)
+
+
+def decide_array(switch: Switch, site: Site, splatting: str | None) -> Decision:
+    """Whether spectra are to be explained by the array's complex vectors, before any probe.
+
+    Args:
+        switch: as configured.
+        site: what the dataset declares.
+        splatting: setting that asks for the splatted field, or None.
+
+    Raises:
+        ValueError: asked for where it has no meaning.
+    """
+    obstacle = None
+    if site.kind != "spectrum":
+        obstacle = f"the target is {site.kind}, not a spectrum"
+    elif site.static_end != "rx":
+        obstacle = "the receiver moves; array response is modelled for a static array"
+    elif site.array is None or len(site.array) < 2 or site.wavelength is None:
+        obstacle = "the dataset declares no array or no carrier"
+    elif switch == "auto" and splatting is not None:
+        obstacle = f"{splatting} asks for the splatted field"
+    return _settle("array", switch, obstacle)
+
+
+def _settle(effect: str, switch: Switch, obstacle: str | None) -> Decision:
+    if switch not in ("auto", True, False):
+        raise ValueError(f"model.effects.{effect}={switch!r}: choose auto, true or false")
+    if switch is True and obstacle is not None:
+        raise ValueError(f"model.effects.{effect}=true is not possible: {obstacle}")
+    if obstacle is not None:
+        return Decision(effect, False, obstacle)
+    return Decision(effect, switch is not False, "possible" if switch == "auto" else "as configured")
+
+
+def spacing_in_wavelengths(data: Measurements, rows: np.ndarray) -> float:
+    """Median distance from a training position to the nearest other one, in wavelengths."""
+    positions = data.moving[rows]
+    if len(positions) < 2 or data.site.wavelength is None:
+        return float("inf")
+    nearest = cKDTree(positions).query(positions, k=2)[0][:, 1]
+    return float(np.median(nearest)) / data.site.wavelength
+
+
+def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
+    """Let a small coherent search and the Gaussian process predict a held-out fifth of the training rows.
+
+    Args:
+        trial: an unfitted coherent method with a small budget.
+        rival: an unfitted interpolator.
+        data, fold: only training rows are looked at.
+        seed: of the draw.
+    """
+    started = time.perf_counter()
+    dense = spacing_in_wavelengths(data, fold.train)
+    rows = np.random.default_rng(seed).permutation(fold.train)
+    held, known = rows[: max(len(rows) // 5, 1)], np.sort(rows[max(len(rows) // 5, 1) :])
+    inner = Fold(known, held[:0], held)
+    errors = {}
+    for name, method in (("coherent", trial), ("interpolation", rival)):
+        method.fit(data, inner, Path())
+        batch = data.batch(held)
+        miss = (method.predict(batch.tx, batch.rx).mean - batch.target).abs().square().sum()
+        errors[name] = float(miss / batch.target.abs().square().sum())
+    better = errors["coherent"] < errors["interpolation"]
+    reason = (
+        f"neighbours are {dense:.2f} wavelengths apart"
+        f"{' (dense enough to interpolate)' if dense < DENSE else ''}; on a held-out fifth of the training "
+        f"data a short search leaves NMSE {errors['coherent']:.3f}, the Gaussian process "
+        f"{errors['interpolation']:.3f}"
+    )
+    return Decision("phase", better, reason, time.perf_counter() - started)
+
+
+def probe_array(data: Measurements, fold: Fold, seed: int) -> Decision:
+    """Can the declared array have measured a few of the training images?"""
+    started = time.perf_counter()
+    spread = np.linspace(0, len(fold.train) - 1, min(PROBE_IMAGES, len(fold.train))).astype(int)
+    rows = np.unique(fold.train[spread])
+    found = recover(data.site, data.target[rows], data.moving[rows], seed=seed)
+    share = 1 - float(found.suspect.mean())
+    assert data.site.array is not None
+    reason = (
+        f"{share:.0%} of {len(rows)} probed images are explained by {len(data.site.array)} complex numbers each"
+    )
+    return Decision("array", share >= ARRAY_SHARE, reason, time.perf_counter() - started)
