@@ -75,6 +75,7 @@ class LearnedField(Method):
         self.site: Site | None = None
         self.choices: Choices | None = None
         self._ends: dict[str, Tensor] = {}
+        self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
         self._frozen: FrozenPlan | None = None
 
@@ -88,6 +89,8 @@ class LearnedField(Method):
         """
         training = self.training
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
+        if data.site.kind == "csi":
+            self._shape = (data.target.shape[1], data.target.shape[2])
         self.choices, reasons = resolve(self.settings, self.warm_start, data.site)
         for reason in reasons:
             log.info("%s", reason)
@@ -153,7 +156,7 @@ class LearnedField(Method):
         assert self.choices is not None
         settings = settled(self.settings, self.choices)
         transmitter = self._ends.get("tx_position")
-        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior)
+        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
 
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
         model = self.fitted()
@@ -213,13 +216,16 @@ class LearnedField(Method):
         prior = None if self._prior is None else vars(self._prior)
         choices = None if self.choices is None else vars(self.choices)
         model = self.fitted().state_dict()
-        return {"choices": choices, "ends": self._ends, "prior": prior, "model": model}
+        return {
+            "choices": choices, "ends": self._ends, "prior": prior, "shape": self._shape, "model": model
+        }  # fmt: skip
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
         self.site = site
         self.choices = Choices(**state["choices"])
         self._ends = dict(state["ends"])
+        self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
         self.model = self._new_model(site)
         surgery.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))

@@ -105,7 +105,13 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
 
 
 def channel_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,)."""
+    """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,).
+
+    Raises:
+        ValueError: shapes differ; broadcasting would hide an antenna that is not modelled.
+    """
+    if prediction.shape != target.shape:
+        raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
     error = (
         (prediction - target).abs().square() if prediction.is_complex() else (prediction - target).square()
     )

@@ -100,6 +100,7 @@ class GaussianModel(nn.Module):
         receiver: the static receiver's pose, or None when it moves.
         transmitter: (3,) [m], the static transmitter, or None when it moves.
         prior: smoothness found on training data, for `encoding.kind=kernel`.
+        shape: (antennas A, subcarriers K) of a channel; None for one of each.
     """
 
     def __init__(
@@ -109,6 +110,7 @@ class GaussianModel(nn.Module):
         receiver: Pose | None = None,
         transmitter: Tensor | None = None,
         prior: Prior | None = None,
+        shape: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
         if site.kind == "csi" and settings.emission.activation != "linear":
@@ -139,7 +141,7 @@ class GaussianModel(nn.Module):
             torch.tensor(math.log(settings.attenuation.gain)), requires_grad=settings.attenuation.learn_gain
         )
         if site.kind == "csi":
-            self.response = ChannelResponse(len(self.gaussians), site)
+            self.response = ChannelResponse(len(self.gaussians), *(shape or (1, 1)))
 
     @property
     def channels(self) -> int:
@@ -214,16 +216,15 @@ class ChannelResponse(nn.Module):
 
     Args:
         count: number of Gaussians N.
-        site: declares antennas A and subcarriers K.
+        antennas, subcarriers: A and K.
     """
 
     per_gaussian = True
 
-    def __init__(self, count: int, site: Site) -> None:
+    def __init__(self, count: int, antennas: int, subcarriers: int) -> None:
         super().__init__()
-        self.antennas = 1 if site.array is None else len(site.array)
-        self.subcarriers = 1 if site.subcarriers_hz is None else len(site.subcarriers_hz)
-        width = self.antennas * self.subcarriers
+        self.antennas, self.subcarriers = antennas, subcarriers
+        width = antennas * subcarriers
         self.real = nn.Parameter(torch.ones(count, width))
         self.imaginary = nn.Parameter(torch.zeros(count, width))
 

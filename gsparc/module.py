@@ -71,7 +71,12 @@ class GaussianModule(L.LightningModule):
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Confidence-weighted loss of a batch."""
-        self.rendered = self.model(batch.tx, batch.rx)
+        try:
+            self.rendered = self.model(batch.tx, batch.rx)
+        except ValueError as refused:  # the rasterizer makes no footprint of a NaN
+            if self._offender() is None:
+                raise
+            raise self._stop(batch, int(batch.index[0])) from refused
         task = self.task_loss(self.rendered.mean, batch)
         confidence = self.model.confidence
         if confidence is None:
@@ -80,7 +85,8 @@ class GaussianModule(L.LightningModule):
             exponent = confidence.exponent(self.model.moving(batch.tx, batch.rx))
             loss = weighted(task, exponent, confidence.settings.alpha).mean()
         if not torch.isfinite(loss):
-            raise NonFiniteLoss(self._leave_evidence(batch, task))
+            bad = ~torch.isfinite(task)
+            raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
         self.log("train/task_loss", task.detach().mean(), prog_bar=True)
         self.log("model/num_gaussians", float(len(self.model.gaussians)), prog_bar=True)
         return loss
@@ -111,37 +117,34 @@ class GaussianModule(L.LightningModule):
         count = len(checkpoint["state_dict"]["model.gaussians.ids"])
         surgery.resize(self.model, self.model.gaussians, count)
 
-    def _leave_evidence(self, batch: Batch, task: Tensor) -> str:
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """A poisoned state never replaces a good checkpoint."""
+        offender = self._offender()
+        if offender is not None:
+            raise NonFiniteLoss(f"the step before {self.global_step} left a NaN or an infinity: {offender}")
+
+    def _offender(self) -> str | None:
+        """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
+        rows = surgery.row_parameters(self.model, len(self.model.gaussians))
+        for name, parameter in self.model.named_parameters():
+            bad = ~torch.isfinite(parameter)
+            if not bad.any():
+                continue
+            if name not in rows:
+                return name
+            row = int(bad.nonzero()[0, 0])
+            return f"Gaussian id {int(self.model.gaussians.ids[row])}, {name}"
+        return None
+
+    def _stop(self, batch: Batch, sample: int) -> NonFiniteLoss:
+        """Leave batch and parameters on disk; the error that says so."""
         path = self.run_dir / "nonfinite.pt"
         path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(
-            {
-                "index": batch.index,
-                "tx": batch.tx,
-                "target": batch.target,
-                "state_dict": self.model.state_dict(),
-                "step": self.global_step,
-            },
-            path,
-        )
-        rows = surgery.row_parameters(self.model, len(self.model.gaussians))
-        culprit = "every parameter is finite: look at the batch"
-        for name, parameter in rows.items():
-            bad = (
-                ~torch.isfinite(parameter).flatten(1).all(1)
-                if parameter.dim() > 1
-                else ~torch.isfinite(parameter)
-            )
-            if bad.any():
-                row = int(bad.nonzero()[0])
-                culprit = f"first offender: Gaussian id {int(self.model.gaussians.ids[row])}, {name}"
-                break
-        sample = (
-            int(batch.index[~torch.isfinite(task)][0])
-            if not torch.isfinite(task).all()
-            else int(batch.index[0])
-        )
-        return (
+        evidence = {"index": batch.index, "tx": batch.tx, "target": batch.target, "step": self.global_step}
+        torch.save({**evidence, "state_dict": self.model.state_dict()}, path)
+        offender = self._offender()
+        culprit = f"first offender: {offender}" if offender else "all parameters are finite, see the batch"
+        return NonFiniteLoss(
             f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "
             f"batch and parameters are in {path}"
         )

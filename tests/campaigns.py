@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, scatter, trace
 
 FREQUENCY_HZ = np.array([3.0e8, 3.1e8])  # a metre of wavelength: 100 places then tell something of the rest
@@ -13,11 +14,15 @@ STILL = np.array([1.0, 1.0, 0.5])
 
 
 def spectra(path: Path, rows: int = 40, moving: str = "tx", origin: float = 0.0) -> Path:
-    """Smooth 16 x 32 images over a cube of 1 m; `moving` end `tx` or `rx`, `origin` [m] on every axis."""
+    """Six lobes that come and go over a cube of 1 m, 16 x 32; `moving` end `tx` or `rx`, `origin` [m]."""
     rng = np.random.default_rng(0)
     where = rng.uniform(-0.5, 0.5, (rows, 3)).round(3)
-    waves = 2 * rng.normal(size=(16 * 32, 3))
-    images = 0.5 + 0.5 * np.sin(where @ waves.T + rng.uniform(0, 6, 16 * 32))
+    centres = rng.normal(size=(6, 3)) * [1, 1, 0.3] + [0, 0, 0.5]
+    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
+    directions = SphereGrid.hemisphere(16, 32).directions().numpy().reshape(-1, 3)
+    strength = 0.5 + 0.5 * np.sin(3 * where @ rng.normal(size=(3, 6)) + rng.uniform(0, 6, 6))
+    images = strength @ np.exp(12 * (centres @ directions.T - 1))
+    images = (images / images.max()).astype(np.float32)
     still = "rx" if moving == "tx" else "tx"
     places = {f"{moving}_position": where + origin, f"{still}_position": np.array([4.0, 0, 0]) + origin}
     np.savez(path, spectrum=images.reshape(rows, 16, 32), **places)
@@ -60,7 +65,7 @@ def brief(file: Path, *more: str) -> list[str]:
     """Overrides for a training run of a second or two: few Gaussians, few steps, the mean beside it."""
     return [
         "dataset=own",
-        f"dataset.file={file}",
+        f"dataset.file='{file}'",
         "model.field.count=40",
         "trainer.max_steps=20",
         "trainer.batch_size=8",

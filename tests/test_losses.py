@@ -57,6 +57,12 @@ def test_channel_loss_is_the_mean_squared_error():
     assert torch.allclose(channel_loss(p, q), ((p - q) ** 2).mean(1))
 
 
+def test_antennas_that_are_not_modelled_are_refused():
+    """A file of several antennas without their positions was once fitted by one, broadcast to all."""
+    with pytest.raises(ValueError, match=r"\(4, 1, 3\) channels predicted, \(4, 2, 3\) measured"):
+        channel_loss(torch.zeros(4, 1, 3), torch.zeros(4, 2, 3))
+
+
 def test_channel_loss_counts_what_was_measured():
     h, g = torch.randn(2, 2, 3, dtype=torch.complex64), torch.zeros(2, 2, 3, dtype=torch.complex64)
     mask = torch.tensor([[[True, False, False], [True, False, False]], [[False] * 3, [False] * 3]])

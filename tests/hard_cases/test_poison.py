@@ -1,0 +1,104 @@
+"""Poison: a NaN in a target or a parameter during training.
+
+Remedy: the loss is looked at before the step; a run that meets a NaN or an infinity stops, names sample or
+Gaussian, leaves batch and parameters on disk, and keeps the last good checkpoint. Never silently zeroed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import lightning.pytorch as L
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, compose, spectra
+
+from gsparc import checkpoint
+from gsparc.learned import LearnedField
+from gsparc.module import NonFiniteLoss
+from gsparc.registry import build
+from gsparc.trainer import TrainerSettings, Training
+
+
+class Spoil(L.Callback):
+    """Writes a NaN into one Gaussian in the middle of training."""
+
+    def __init__(self, step: int, name: str, row: int) -> None:
+        self.step, self.name, self.row = step, name, row
+
+    def on_train_batch_start(self, trainer, module, *unused):
+        if trainer.global_step == self.step:
+            with torch.no_grad():
+                dict(module.model.named_parameters())[self.name][self.row] = float("nan")
+
+
+def field(file, callbacks=()) -> LearnedField:
+    method = build(compose(*brief(file, "model.refit=false")).model)
+    settings = TrainerSettings(max_steps=20, batch_size=8, checkpoint_every=5)
+    method.training = Training(settings, callbacks=lambda: list(callbacks))
+    return method
+
+
+@pytest.fixture
+def data(tmp_path):
+    from gsparc.data.load import load
+
+    return load({"name": "own", "file": str(spectra(tmp_path / "own.npz"))})
+
+
+@pytest.mark.parametrize(
+    "name", ["gaussians.means", "gaussians.opacity_logits", "emission.weight2", "emission.bias2"]
+)
+def test_a_spoilt_parameter_stops_the_run_and_is_named(data, folds, tmp_path, name):
+    method = field(tmp_path / "own.npz", [Spoil(7, name, 3)])
+    with pytest.raises(NonFiniteLoss, match=rf"at step 7 .*Gaussian id 3, {name}"):
+        method.fit(data, folds(len(data)).folds[0], tmp_path)
+    left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
+    assert left["step"] == 7 and left["state_dict"][name][3].isnan().any() and len(left["index"])
+    good = checkpoint.read(tmp_path / "last.ckpt")
+    assert good.extra["trainer"]["global_step"] == 5
+    assert all(t.isfinite().all() for t in good.state["model"].values())
+
+
+def test_a_poisoned_state_replaces_no_checkpoint(data, folds, tmp_path):
+    """A NaN that a step itself makes is met one step later; a checkpoint must not be written in between."""
+
+    class SpoilAfter(Spoil):
+        def on_train_batch_start(self, *unused):
+            pass
+
+        def on_train_batch_end(self, trainer, module, *unused):
+            Spoil.on_train_batch_start(self, trainer, module)
+
+    method = field(tmp_path / "own.npz", [SpoilAfter(10, "log_gain", ...)])
+    with pytest.raises(NonFiniteLoss, match="log_gain"):
+        method.fit(data, folds(len(data)).folds[0], tmp_path)
+    assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
+
+
+def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_path):
+    fold = folds(len(data)).folds[0]
+    target = data.target.astype(np.float32).copy()
+    bad = int(fold.train[4])
+    target[bad, 3, 3] = np.nan
+    method = build(compose(*brief(tmp_path / "own.npz", "model.warm_start=false")).model)
+    method.settings = dataclasses.replace(
+        method.settings,
+        emission=dataclasses.replace(
+            method.settings.emission,
+            encoding=dataclasses.replace(method.settings.emission.encoding, kind="raw"),
+        ),
+    )
+    method.training = Training(TrainerSettings(max_steps=20, batch_size=8))
+    with pytest.raises(NonFiniteLoss, match=rf"sample {bad}; all parameters are finite"):
+        method.fit(dataclasses.replace(data, target=target), fold, tmp_path)
+    assert (tmp_path / "nonfinite.pt").exists()
+
+
+def test_zeroing_the_gradient_hides_it():
+    """Naive (the published implementation): NaN gradients of the means become 0 and training goes on."""
+    mean = torch.tensor([1.0], requires_grad=True)
+    loss = (mean * float("nan")).sum()
+    loss.backward()
+    assert torch.nan_to_num(mean.grad).item() == 0 and not torch.isfinite(loss)

@@ -1,0 +1,158 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, channels, compose, powers, spectra
+from omegaconf import OmegaConf
+
+from gsparc import checkpoint, load
+from gsparc.data.load import load as load_data
+from gsparc.data.load import split_for
+from gsparc.learned import QUERY_CHUNK, LearnedField
+from gsparc.ops import Pose
+from gsparc.registry import build
+from gsparc.trainer import TrainerSettings, Training
+
+
+def learned(file, *more: str, steps: int = 15) -> LearnedField:
+    method = build(compose(*brief(file, *more)).model)
+    settings = TrainerSettings(max_steps=steps, batch_size=8, val_every=10, checkpoint_every=5)
+    method.training = Training(settings, config_yaml="")
+    return method
+
+
+def fitted(file, run_dir, *more: str, steps: int = 15):
+    data = load_data({"name": "own", "file": str(file)})
+    fold = split_for({"name": "random"}, data).folds[0]
+    method = learned(file, *more, steps=steps)
+    method.fit(data, fold, run_dir)
+    return method, data, fold
+
+
+MAKERS = {
+    "spectra": lambda path: spectra(path),
+    "spectra, receiver moves": lambda path: spectra(path, moving="rx"),
+    "csi S": lambda path: channels(path, shape="S"),
+    "csi SK, transmitter moves": lambda path: channels(path, moving="tx", shape="SK"),
+    "csi SAK": lambda path: channels(path),
+    "rssi": lambda path: powers(path),
+}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_every_kind_of_file_trains_predicts_and_reads_back(tmp_path, name):
+    """The default model, nothing said about the data."""
+    file = MAKERS[name](tmp_path / "own.npz")
+    method, data, fold = fitted(file, tmp_path)
+    batch = data.batch(fold.test)
+    said = method.predict(batch.tx, batch.rx)
+    assert said.mean.shape == batch.target.shape and said.mean.dtype == batch.target.dtype
+    assert torch.isfinite(torch.view_as_real(said.mean) if said.mean.is_complex() else said.mean).all()
+    assert ((said.confidence >= 0) & (said.confidence <= 1)).all()
+    checkpoint.save(
+        tmp_path / "model.ckpt", method, OmegaConf.to_yaml({"model": compose(*brief(file)).model})
+    )
+    again, _ = checkpoint.load(tmp_path / "model.ckpt")
+    two = again.predict(batch.tx, batch.rx)
+    assert torch.equal(said.mean, two.mean) and torch.equal(said.confidence, two.confidence)
+    asked = load(tmp_path / "model.ckpt")
+    where = {data.site.moving_end: data.moving[fold.test[0]] + data.site.origin}
+    answer = getattr(asked, data.site.kind)(**where)
+    scale = data.site.target_scale
+    assert np.allclose(answer / scale, said.mean[0], atol=1e-3 * float(said.mean.abs().max()))
+
+
+def test_a_loaded_field_predicts_new_poses(tmp_path):
+    """The receiver moves and turns: turning it about its boresight rolls the image."""
+    method, data, _ = fitted(spectra(tmp_path / "own.npz", moving="rx"), tmp_path)
+    where = torch.tensor([[0.1, 0.2, -0.1]])
+    quarter = torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
+    still = torch.from_numpy(data.tx[:1]).float()
+    straight = method.predict(still, Pose.identity(where)).mean
+    turned = method.predict(still, Pose(where, quarter)).mean
+    assert torch.allclose(turned.roll(8, -1), straight, atol=1e-3)
+    assert (turned - straight).abs().max() > 0.05
+
+
+def test_many_queries_are_answered_in_chunks(tmp_path):
+    for moving in ("tx", "rx"):
+        folder = tmp_path / moving
+        folder.mkdir()
+        method, data, _ = fitted(spectra(folder / "own.npz", moving=moving), folder)
+        rows = np.resize(np.arange(len(data)), QUERY_CHUNK + 7)
+        batch = data.batch(rows)
+        together = method.predict(batch.tx, batch.rx)
+        last = data.batch(rows[-3:])
+        assert len(together.mean) == QUERY_CHUNK + 7 == len(together.confidence)
+        assert torch.allclose(together.mean[-3:], method.predict(last.tx, last.rx).mean, atol=1e-4)
+
+
+def test_a_static_receiver_is_frozen_and_another_pose_is_not(tmp_path):
+    method, data, _ = fitted(spectra(tmp_path / "own.npz"), tmp_path)
+    batch = data.batch(np.arange(4))
+    quick = method.predict(batch.tx, batch.rx).mean
+    slow = method.fitted()(batch.tx, batch.rx).mean.clamp(0, 1).detach()
+    assert torch.allclose(quick, slow, atol=1e-5)
+    moved = Pose(batch.rx.position + 0.5, batch.rx.rotation)
+    assert not torch.allclose(method.predict(batch.tx, moved).mean, quick, atol=1e-3)
+
+
+def test_an_edit_after_a_prediction_is_seen_by_the_next(tmp_path):
+    method, data, _ = fitted(spectra(tmp_path / "own.npz"), tmp_path)
+    batch = data.batch(np.arange(4))
+    before = method.predict(batch.tx, batch.rx).mean
+    with torch.no_grad():
+        method.model.gaussians.opacity_logits.fill_(-9.0)
+        method.model.gaussians.version += 1
+    assert method.predict(batch.tx, batch.rx).mean.sum() < 0.1 * before.sum()
+
+
+def test_refit_learns_from_validation_rows_too_and_keeps_the_confidence(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    seen = {}
+    for refit in ("false", "true"):
+        method, data, fold = fitted(file, tmp_path / refit, f"model.refit={refit}")
+        batch = data.batch(fold.val)
+        said = method.predict(batch.tx, batch.rx)
+        seen[refit] = float((said.mean - batch.target).square().mean()), said.confidence
+    assert seen["true"][0] < 0.8 * seen["false"][0]
+    assert torch.equal(seen["true"][1], seen["false"][1])
+
+
+def test_the_test_rows_are_never_looked_at(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    data = load_data({"name": "own", "file": str(file)})
+    fold = split_for({"name": "random"}, data).folds[0]
+    poisoned = data.target.astype(np.float32).copy()
+    poisoned[fold.test] = np.nan
+    states = []
+    for target in (data.target, poisoned):
+        method = learned(file)
+        method.fit(dataclasses.replace(data, target=target), fold, tmp_path)
+        states.append(method.state()["model"])
+    assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
+
+
+def test_seeds_repeat_and_differ(tmp_path):
+    file, found = spectra(tmp_path / "own.npz"), []
+    data = load_data({"name": "own", "file": str(file)})
+    fold = split_for({"name": "random"}, data).folds[0]
+    for seed in (0, 0, 1):
+        method = learned(file)
+        method.training.seed = seed
+        method.fit(data, fold, tmp_path / str(len(found)))
+        found.append(method.state()["model"]["gaussians.means"])
+    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
+
+
+def test_untrained_says_so():
+    with pytest.raises(RuntimeError, match="has not been trained"):
+        LearnedField().fitted()
+
+
+def test_a_closed_form_start_that_cannot_be_says_what_it_needs(tmp_path):
+    with pytest.raises(ValueError, match="needs spectra, a static receiver"):
+        fitted(channels(tmp_path / "own.npz"), tmp_path, "model.warm_start=true")

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.emission import EmissionSettings
+from gsparc.encoding import EncodingSettings
+from gsparc.field import FieldSettings
+from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
+from gsparc.ops import Pose, StalePlan
+
+RAW = EncodingSettings("raw")
+LINEAR = EmissionSettings(RAW, hidden=3, activation="linear", log_distance=False)
+RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
+
+
+def model(data, count: int = 20, **more) -> GaussianModel:
+    torch.manual_seed(0)
+    moving = data.site.static_end == "tx"
+    settings = ModelSettings(
+        **{"field": FieldSettings(count=count, init="uniform", opacity=0.5), "emission": LINEAR, **more}
+    )
+    transmitter = torch.from_numpy(data.tx[0]).float() if moving else None
+    return GaussianModel(settings, data.site, None if moving else RECEIVER, transmitter)
+
+
+@pytest.mark.parametrize("static_end", ["rx", "tx"])
+@pytest.mark.parametrize(("kind", "shape"), [("spectrum", (12, 24)), ("csi", (1, 1)), ("rssi", (1,))])
+def test_a_prediction_has_the_shape_of_a_target(campaign, kind, shape, static_end):
+    data = campaign(kind, static_end=static_end)
+    batch = data.batch(np.arange(5))
+    rendered = model(data)(batch.tx, batch.rx)
+    assert rendered.mean.shape == (5, *shape) and rendered.mean.is_complex() == (kind == "csi")
+    assert (rendered.raster is None) == (kind != "spectrum")
+    rendered.mean.abs().sum().backward()
+
+
+def test_antennas_and_subcarriers_are_factored(campaign):
+    data = campaign("csi")
+    batch = data.batch(np.arange(5))
+    wide = GaussianModel(model(data).settings, data.site, RECEIVER, shape=(4, 3))
+    assert wide(batch.tx, batch.rx).mean.shape == (5, 4, 3)
+    assert wide.emission.channels == 2  # one complex gain, however many channels
+
+
+def test_signed_channels_refuse_an_activation_of_powers(campaign):
+    with pytest.raises(ValueError, match="channels are signed, choose linear"):
+        model(campaign("csi"), emission=EmissionSettings(RAW, activation="sigmoid"))
+
+
+def test_attenuation_is_gain_over_distance_and_can_be_off(campaign):
+    data = campaign("spectrum")
+    batch = data.batch(np.arange(4))
+    on = model(data, attenuation=AttenuationSettings(gain=3.0, d_ref=2.0, d_min=0.1))
+    off = model(data, attenuation=AttenuationSettings(inverse_distance=False))
+    apart = (batch.tx[:, None] - on.gaussians.means).square().sum(-1).add(0.01).sqrt() / 2.0
+    assert torch.allclose(on.distances(batch.tx), apart, atol=1e-6)
+    plain = off.features(batch.tx, batch.rx)
+    assert off.attenuation(apart) is None
+    assert torch.allclose(on.features(batch.tx, batch.rx), plain * (3.0 / apart)[..., None], rtol=1e-4)
+
+
+def test_the_reference_distance_is_from_the_still_end_to_the_moving_box(campaign):
+    assert model(campaign("spectrum")).d_ref == pytest.approx(4.0)
+    assert model(campaign("spectrum", static_end="tx")).d_ref == pytest.approx(4.0)
+    assert model(campaign("spectrum"), attenuation=AttenuationSettings(d_ref=7.0)).d_ref == 7.0
+
+
+def test_the_emission_reads_the_end_that_moves(campaign):
+    for end in ("rx", "tx"):
+        data = campaign("spectrum", static_end=end)
+        batch = data.batch(np.arange(3))
+        where = model(data).moving(batch.tx, batch.rx)
+        assert torch.allclose(where, torch.from_numpy(data.moving[:3]).float())
+
+
+def test_a_frozen_view_equals_the_forward_pass_until_the_next_edit(campaign):
+    data = campaign("spectrum")
+    batch = data.batch(np.arange(6))
+    field = model(data, field=FieldSettings(count=60, near=1, far=4))
+    frozen = field.freeze(batch.rx)
+    image = frozen.render(field.features(batch.tx, batch.rx).detach(), int(field.gaussians.version))
+    assert torch.allclose(image.squeeze(1), field(batch.tx, batch.rx).mean, atol=1e-5)
+    with torch.no_grad():
+        field.gaussians.version += 1
+    with pytest.raises(StalePlan):
+        frozen.render(field.features(batch.tx, batch.rx).detach(), int(field.gaussians.version))
+
+
+def test_poses_of_a_batch_are_seen_each_for_itself(campaign):
+    data = campaign("spectrum", static_end="tx")
+    field, batch = model(data), data.batch(np.arange(4))
+    together = field(batch.tx, batch.rx).mean
+    for i in range(4):
+        alone = field(batch.tx[i : i + 1], batch.rx[i : i + 1]).mean
+        assert torch.allclose(together[i], alone[0], atol=1e-6)
+
+
+def test_the_reference_backend_says_the_same(campaign):
+    data = campaign("spectrum")
+    batch = data.batch(np.arange(2))
+    own = [
+        model(data, raster=RasterSettings(backend=name))(batch.tx, batch.rx).mean
+        for name in ("cpu", "reference")
+    ]
+    assert torch.allclose(*own, atol=1e-4)

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.confidence import ConfidenceSettings, weighted
+from gsparc.emission import EmissionSettings
+from gsparc.encoding import EncodingSettings
+from gsparc.field import FieldSettings
+from gsparc.model import GaussianModel, ModelSettings
+from gsparc.module import GaussianModule, LossSettings
+from gsparc.ops import Pose
+from gsparc.schedule import OptimizerSettings
+
+RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
+
+
+def module(data, run_dir, confidence: bool = True) -> GaussianModule:
+    torch.manual_seed(0)
+    emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", log_distance=False)
+    settings = ModelSettings(
+        field=FieldSettings(count=20, init="uniform"),
+        emission=emission,
+        confidence=ConfidenceSettings(enabled=confidence),
+    )
+    shape = data.target.shape[1:] if data.site.kind == "csi" else None
+    model = GaussianModel(settings, data.site, RECEIVER, shape=shape)
+    made = GaussianModule(model, LossSettings(0.0), OptimizerSettings(), 10, run_dir)
+    made.log = lambda *a, **k: None  # type: ignore[method-assign]
+    return made
+
+
+def test_the_loss_is_weighted_by_confidence_per_sample(campaign, tmp_path):
+    data = campaign("spectrum")
+    batch = data.batch(np.arange(6))
+    sure = module(data, tmp_path)
+    task = sure.task_loss(sure.model(batch.tx, batch.rx).mean, batch)
+    exponent = sure.model.confidence.exponent(batch.tx)
+    assert torch.allclose(sure.training_step(batch, 0), weighted(task, exponent, 0.3).mean())
+    plain = module(data, tmp_path, confidence=False)
+    assert torch.allclose(plain.training_step(batch, 0), task.mean())
+
+
+def test_what_was_not_measured_pulls_at_nothing(campaign, tmp_path):
+    """A masked spectrum's holes hold anything; they must not be learned."""
+    data = campaign("spectrum")
+    batch = data.batch(np.arange(3))
+    mask = torch.zeros_like(batch.target, dtype=torch.bool)
+    mask[:, :, :12] = True
+    trained = module(data, tmp_path)
+    one = dataclasses.replace(batch, mask=mask)
+    other = dataclasses.replace(one, target=torch.where(mask, batch.target, 0.25))
+    losses = [trained.training_step(b, 0).item() for b in (one, other)]
+    assert losses[0] == losses[1]
+    assert losses[0] != trained.training_step(batch, 0).item()
+
+
+def test_every_parameter_learns(campaign, tmp_path):
+    for kind in ("spectrum", "csi", "rssi"):
+        data = campaign(kind)
+        trained = module(data, tmp_path)
+        trained.training_step(data.batch(np.arange(8)), 0).backward()
+        silent = [n for n, p in trained.model.named_parameters() if p.grad is None or not p.grad.any()]
+        # From an isotropic start a turn changes nothing; powers of one pose have no place in the image.
+        assert set(silent) <= {"gaussians.quats"}, kind
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi"])
+def test_validation_names_its_figures(campaign, tmp_path, kind):
+    data = campaign(kind)
+    found = {}
+    trained = module(data, tmp_path)
+    trained.log = lambda name, value, **k: found.update({name: value.item()})
+    trained.validation_step(data.batch(np.arange(4)), 0)
+    assert set(found) == ({"val/ssim_gauss", "val/psnr_db"} if kind == "spectrum" else {"val/mse"})
+    assert np.isfinite(list(found.values())).all()

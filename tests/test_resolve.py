@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from gsparc.emission import EmissionSettings
+from gsparc.encoding import EncodingSettings
+from gsparc.field import FieldSettings
+from gsparc.model import ModelSettings
+from gsparc.resolve import Choices, resolve, settled
+
+
+def open_settings(hidden: int = 0, **more) -> ModelSettings:
+    emission = EmissionSettings(
+        EncodingSettings("auto"),
+        **{"hidden": hidden, "activation": "auto", "init_bias": "auto", "log_distance": False, **more},
+    )
+    return ModelSettings(field=FieldSettings(init="auto"), emission=emission)
+
+
+@pytest.mark.parametrize(
+    ("kind", "static_end", "hidden", "want"),
+    [
+        ("spectrum", "rx", 0, Choices("sphere", "kernel", "linear", 0.0, True)),
+        ("spectrum", "rx", 16, Choices("sphere", "fourier", "sigmoid", 0.0, False)),
+        ("spectrum", "tx", 0, Choices("uniform", "kernel", "sigmoid", 0.0, False)),
+        ("csi", "rx", 0, Choices("uniform", "kernel", "linear", 0.0, False)),
+        ("csi", "tx", 8, Choices("uniform", "fourier", "linear", 0.0, False)),
+        ("rssi", "tx", 0, Choices("uniform", "kernel", "softplus", pytest.approx(-6.21, abs=0.01), False)),
+    ],
+)
+def test_what_auto_becomes(campaign, kind, static_end, hidden, want):
+    site = campaign(kind, static_end=static_end).site
+    choices, notes = resolve(open_settings(hidden), "auto", site)
+    assert choices == want
+    assert [n.split("=")[0] for n in notes][:4] == ["init", "encoding.kind", "warm_start", "activation"]
+    assert all("auto -> " in note and ": " in note for note in notes)
+
+
+def test_reasons_are_said(campaign):
+    _, notes = resolve(open_settings(), "auto", campaign("spectrum", static_end="tx").site)
+    assert "init=auto -> uniform: the receiver moves" in notes
+
+
+def test_what_is_said_stays_and_needs_no_words(campaign):
+    given = dataclasses.replace(
+        open_settings(),
+        field=FieldSettings(init="uniform"),
+        emission=EmissionSettings(EncodingSettings("raw")),
+    )
+    choices, notes = resolve(given, False, campaign("spectrum").site)
+    assert choices == Choices("uniform", "raw", "sigmoid", 0.0, False) and notes == ()
+    assert settled(given, choices) == given
+
+
+def test_the_logarithm_of_distance_brings_its_sigmoid(campaign):
+    choices, _ = resolve(open_settings(4, log_distance=True), "auto", campaign("rssi").site)
+    assert choices.activation == "sigmoid" and choices.init_bias == 0
+
+
+def test_nothing_is_left_open(campaign):
+    choices, _ = resolve(open_settings(), "auto", campaign("csi").site)
+    done = settled(open_settings(), choices)
+    left = [done.field.init, done.emission.encoding.kind, done.emission.activation, done.emission.init_bias]
+    assert "auto" not in left
