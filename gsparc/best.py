@@ -38,7 +38,12 @@ class Gsparc(LearnedField):
     """
 
     def __init__(
-        self, effects: EffectSettings, phase_model: Method, phase_probe: Method, array_model: Method, **field: Any
+        self,
+        effects: EffectSettings,
+        phase_model: Method,
+        phase_probe: Method,
+        array_model: Method,
+        **field: Any,
     ) -> None:
         super().__init__(**field)
         self.switches = effects
@@ -62,6 +67,10 @@ class Gsparc(LearnedField):
         if self._chosen is None:
             report = super().fit(data, fold, run_dir)
         else:
+            if self.training.resume is not None:
+                raise ValueError(
+                    f"ckpt_path: effects.{self._chosen} trains in one piece, there is nothing to go on from"
+                )
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             report = self._models[self._chosen].fit(data, fold, run_dir)
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
@@ -69,7 +78,7 @@ class Gsparc(LearnedField):
     def _decide(self, data: Measurements, fold: Fold) -> tuple[Decision, ...]:
         hidden = self.settings.emission.hidden
         splatting = f"emission.hidden={hidden}" if hidden else None
-        phase = decide_phase(self.switches.phase, data.site)
+        phase = decide_phase(self.switches.phase, data.site, splatting)
         array = decide_array(self.switches.array, data.site, splatting)
         if phase.on and self.switches.phase == "auto":
             phase = probe_phase(self._probe, GaussianProcess(), data, fold, self.training.seed)

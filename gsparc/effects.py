@@ -56,8 +56,13 @@ class Decision:
         return f"effects.{self.effect} -> {'on' if self.on else 'off'}: {self.reason}{cost}"
 
 
-def decide_phase(switch: Switch, site: Site) -> Decision:
-    """Whether the channels' phase is to come from source positions.
+def decide_phase(switch: Switch, site: Site, splatting: str | None) -> Decision:
+    """Whether the channels' phase is to come from source positions, before any probe.
+
+    Args:
+        switch: as configured.
+        site: what the dataset declares.
+        splatting: setting that asks for the splatted field, or None.
 
     Raises:
         ValueError: asked for where it has no meaning.
@@ -69,6 +74,8 @@ def decide_phase(switch: Switch, site: Site) -> Decision:
         obstacle = "the transmitter moves; carrier phase is modelled for a moving receiver"
     elif site.carrier_hz is None and site.subcarriers_hz is None:
         obstacle = "the dataset declares no frequency"
+    elif switch == "auto" and splatting is not None:
+        obstacle = f"{splatting} asks for the splatted field"
     return _settle("phase", switch, obstacle)
 
 
@@ -152,7 +159,6 @@ def probe_array(data: Measurements, fold: Fold, seed: int) -> Decision:
     found = recover(data.site, data.target[rows], data.moving[rows], seed=seed)
     share = 1 - float(found.suspect.mean())
     assert data.site.array is not None
-    reason = (
-        f"{share:.0%} of {len(rows)} probed images are explained by {len(data.site.array)} complex numbers each"
-    )
+    elements = len(data.site.array)
+    reason = f"{share:.0%} of {len(rows)} probed images are explained by {elements} complex numbers each"
     return Decision("array", share >= ARRAY_SHARE, reason, time.perf_counter() - started)

@@ -20,7 +20,7 @@ METHODS = {
     "gp": "gsparc.peers.gp.GaussianProcess",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "array": "gsparc.array.field.ArrayField",
-    "gsparc": "gsparc.learned.LearnedField",
+    "gsparc": "gsparc.best.Gsparc",
 }
 
 
