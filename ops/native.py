@@ -439,6 +439,11 @@ def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Ten
     return image
 
 
+def instruction_set() -> str:
+    """Name of the kernels in use: baseline, avx2 or avx512."""
+    return _native.instruction_set()
+
+
 def _model(means, quats, scales, opacities, extinctions, positions, rotations) -> list[Tensor | None]:
     tensors = (means, quats, scales, opacities, extinctions, positions, rotations)
     return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors]

@@ -170,6 +170,27 @@ void thaw(bool twice, int height, int width, int channels, int threads, const Ad
     });
 }
 
+// Exponentials accumulated by `tasks` tasks of the yardstick.
+int64_t mark_exponentials(int tasks, int threads) {
+    nb::gil_scoped_release unlocked;
+    std::vector<float> sums(tasks);
+    kernels<float>().mark_exponentials(tasks, threads, sums.data());
+    return int64_t(tasks) * kMarkPairs;
+}
+
+void mark_copy(uintptr_t from, uintptr_t to, int64_t bytes, int threads) {
+    nb::gil_scoped_release unlocked;
+    kernels<float>().mark_copy(reinterpret_cast<const char*>(from), reinterpret_cast<char*>(to), bytes, threads);
+}
+
+int64_t mark_pairs(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
+    return with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        return kernels<S>().mark_pairs(read_plan<S>(in, poses, count, whole[0]), lens_from<S>(whole, real), threads);
+    });
+}
+
 }  // namespace
 
 NB_MODULE(_native, module) {
@@ -185,6 +206,9 @@ NB_MODULE(_native, module) {
     module.def("weights_backward", &weights_backward);
     module.def("freeze", &freeze);
     module.def("thaw", &thaw);
+    module.def("mark_exponentials", &mark_exponentials);
+    module.def("mark_copy", &mark_copy);
+    module.def("mark_pairs", &mark_pairs);
     module.def("instruction_set", &instruction_set);
     module.def("use_instruction_set", &use_instruction_set);
 }

@@ -2,6 +2,7 @@
 #include "backward.h"
 #include "frozen.h"
 #include "project.h"
+#include "yardstick.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
@@ -9,9 +10,11 @@ namespace GSPARC_ISA {
 extern const Kernels<float> single_kernels;
 extern const Kernels<double> double_kernels;
 const Kernels<float> single_kernels = {project_range<float>, composite<float>, composite_backward<float>,
-                                       weights<float>, weights_backward<float>, freeze<float>, thaw<float>};
+                                       weights<float>, weights_backward<float>, freeze<float>, thaw<float>,
+                                       mark_exponentials, mark_copy, mark_pairs<float>};
 const Kernels<double> double_kernels = {project_range<double>, composite<double>, composite_backward<double>,
-                                        weights<double>, weights_backward<double>, freeze<double>, thaw<double>};
+                                        weights<double>, weights_backward<double>, freeze<double>, thaw<double>,
+                                        mark_exponentials, mark_copy, mark_pairs<double>};
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc

@@ -70,6 +70,9 @@ template <class S> struct Kernels {
     void (*weights_backward)(const WeightBackwardArgs<S>&);
     int (*freeze)(const FreezeArgs<S>&);  // returns the lanes of a block
     void (*thaw)(const ThawArgs<S>&);
+    void (*mark_exponentials)(int tasks, int threads, float* sums);  // see yardstick.h
+    void (*mark_copy)(const char* from, char* to, int64_t bytes, int threads);
+    int64_t (*mark_pairs)(const PlanView<S>&, const Lens<S>&, int threads);
 };
 
 template <class S> const Kernels<S>& kernels();  // the fastest set this machine has

@@ -1,0 +1,109 @@
+"""The ratios that are promised, each measured against its counterpart in the same rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from gsparc.benchmark import kernels
+from gsparc.benchmark.case import Call
+from gsparc.benchmark.scene import Scene, scene
+from gsparc.clock import ClockSettings, interleaved
+from gsparc.ops.settings import Projection
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A promised ratio.
+
+    Attributes:
+        name: what is promised.
+        ratio: median over rounds of one time over the other.
+        bound: what the ratio is compared with.
+        at_least: whether the ratio must be at least, rather than at most, the bound.
+    """
+
+    name: str
+    ratio: float
+    bound: float
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool:
+        """Whether the promise holds in this run."""
+        return self.ratio >= self.bound if self.at_least else self.ratio <= self.bound
+
+
+@torch.no_grad()
+def claims(
+    projection: Projection, counts: Sequence[int], threads: int, batch: int, clock: ClockSettings
+) -> list[Claim]:
+    """Every promise for one projection; `counts` ascending, the middle one for the static receiver."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        middle = scene(counts[len(counts) // 2], projection)
+        return [
+            *_backward(middle, clock),
+            *_frozen(middle, batch, clock),
+            *_growth([scene(count, projection) for count in counts], clock),
+        ]
+    finally:
+        torch.set_num_threads(before)
+
+
+def _backward(field: Scene, clock: ClockSettings) -> list[Claim]:
+    ratio = _ratio(kernels.backward(field, 1).kernel, kernels.moving(field, 1).kernel, clock)
+    return [Claim(f"backward / forward at {len(field)}", ratio, 3.0)]
+
+
+def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
+    moving, one, many = (
+        _whole(case)
+        for case in (kernels.moving(field, 1), kernels.frozen(field, 1), kernels.frozen(field, batch))
+    )
+    times = _times({"moving": moving, "one": one, "many": many}, clock)
+    return [
+        Claim(f"moving / frozen at {len(field)}", _median(times["moving"] / times["one"]), 3.0, True),
+        Claim(
+            f"moving / frozen, {batch} at once, per query",
+            *(_median(batch * times["moving"] / times["many"]), 10.0, True),
+        ),
+    ]
+
+
+def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
+    """Time per doubling of N between neighbouring sizes."""
+    calls = {str(len(field)): kernels.moving(field, 1).kernel for field in fields}
+    times = _times(calls, clock)
+    found = []
+    for small, large in pairwise(fields):
+        doublings = np.log2(len(large) / len(small))
+        growth = _median(times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
+        found.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
+    return found
+
+
+def _whole(case) -> Call:
+    assert case.whole is not None
+    return case.whole
+
+
+def _ratio(above: Call, below: Call, clock: ClockSettings) -> float:
+    times = _times({"above": above, "below": below}, clock)
+    return _median(times["above"] / times["below"])
+
+
+def _times(calls: dict[str, Call], clock: ClockSettings) -> dict[str, np.ndarray]:
+    def ignoring(call: Call) -> Callable[[int], object]:
+        return lambda turn: call()
+
+    return interleaved({name: ignoring(call) for name, call in calls.items()}, clock)
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values))

@@ -1,0 +1,115 @@
+"""What is timed: fields of a room filled with N Gaussians, seen by a receiver in its middle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Site
+from gsparc.emission import EmissionSettings
+from gsparc.encoding import EncodingSettings
+from gsparc.field import FieldSettings, GaussianField
+from gsparc.model import GaussianModel, ModelSettings, RasterSettings
+from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, make_plan
+from gsparc.ops.settings import IMAGE_CUTOFF, Projection
+
+ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
+GRID = SphereGrid.hemisphere()
+CHANNEL_GRID = SphereGrid.full_sphere(90, 180)
+CHANNEL_CUTOFF = Cutoff(1e-3, relative=True)
+PAPER = EmissionSettings(encoding=EncodingSettings(kind="raw"), hidden=16)
+DEFAULT = EmissionSettings()
+COMPLEX = 2  # real channels
+
+
+class ComplexSpectra(GaussianModel):
+    """A field that renders a complex image: two real channels."""
+
+    @property
+    def channels(self) -> int:
+        """Real and imaginary part."""
+        return COMPLEX
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A model of N Gaussians, its geometry as the rasterizer takes it, and places to ask at.
+
+    Attributes:
+        model: renders spectra of two channels; emission 3-16-2.
+        geometry: means, quats, scales, opacities.
+        features: (N, 2).
+        projection: of all plans.
+    """
+
+    model: GaussianModel
+    geometry: tuple[Tensor, Tensor, Tensor, Tensor]
+    features: Tensor
+    projection: Projection
+
+    def __len__(self) -> int:
+        return len(self.features)
+
+    def plan(self, pose: Pose, *, channels: bool = False, backend: str | None = None) -> Plan:
+        """Of spectra, or of the visibility that channels need."""
+        grid, cutoff = (CHANNEL_GRID, CHANNEL_CUTOFF) if channels else (GRID, IMAGE_CUTOFF)
+        return make_plan(
+            *(*self.geometry, pose, grid), projection=self.projection, cutoff=cutoff, backend=backend
+        )
+
+
+def scene(count: int, projection: Projection, emission: EmissionSettings = PAPER) -> Scene:
+    """A room of `count` Gaussians, half a spacing in size, of all shapes and opacities (seeded)."""
+    with torch.random.fork_rng():
+        torch.manual_seed(count)
+        settings = ModelSettings(
+            FieldSettings(count=count, init="uniform", margin=0.0),
+            emission,
+            raster=RasterSettings(projection),
+        )
+        model = ComplexSpectra(settings, _site())
+        _scatter(model.gaussians)
+        features = torch.rand(count, COMPLEX)
+    geometry = tuple(tensor.detach() for tensor in model._geometry())
+    return Scene(model, geometry, features, projection)
+
+
+def places(count: int) -> Tensor:
+    """Positions (count, 3) [m] around the middle of the room (seeded)."""
+    draw = torch.Generator().manual_seed(count)
+    return torch.randn(count, 3, generator=draw).clamp(-2, 2) * torch.tensor([1.0, 1.0, 0.3])
+
+
+def receivers(count: int) -> Pose:
+    """One pose per sample, upright."""
+    return Pose.identity(places(count))
+
+
+def receiver() -> Pose:
+    """One pose for a whole batch."""
+    return Pose.identity(places(1)[0])
+
+
+@torch.no_grad()
+def _scatter(field: GaussianField) -> None:
+    field.log_scales += 0.5 * torch.randn_like(field.log_scales)
+    field.quats.copy_(torch.randn_like(field.quats))
+    field.opacity_logits.copy_(1.5 * torch.randn_like(field.opacity_logits) - 1)
+
+
+def _site() -> Site:
+    return Site(
+        name="bench",
+        kind="spectrum",
+        static_end="tx",
+        grid=GRID,
+        array=None,
+        carrier_hz=None,
+        subcarriers_hz=None,
+        origin=np.zeros(3),
+        box=ROOM,
+        sha256="",
+    )

@@ -1,0 +1,34 @@
+"""What this machine can do at best, measured beside the kernels: see csrc/yardstick.h."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import _native
+from gsparc.ops.native import _addresses, _numbers
+from gsparc.ops.plan import Plan
+
+
+def exponentials(tasks: int) -> int:
+    """Accumulate bare exponentials over a row of pixels on torch's number of threads; returns how many."""
+    return _native.mark_exponentials(tasks, torch.get_num_threads())
+
+
+def copy(source: Tensor, target: Tensor) -> int:
+    """Copy a contiguous tensor on torch's number of threads; returns the bytes read and written."""
+    size = source.numel() * source.element_size()
+    if not source.is_contiguous() or not target.is_contiguous() or size != target.nbytes:
+        raise ValueError("copying needs two contiguous tensors of the same size")
+    _native.mark_copy(source.data_ptr(), target.data_ptr(), size, torch.get_num_threads())
+    return 2 * size
+
+
+def pairs(plan: Plan) -> int:
+    """Pixel-Gaussian pairs inside the exact footprints of a CPU plan, over all its poses."""
+    if plan.backend != "cpu":
+        raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
+    whole, real = _numbers(plan.grid, plan.optics)
+    twice = plan.means2d.dtype == torch.float64
+    sizes = (plan.num_poses, plan.num_gaussians, torch.get_num_threads())
+    return _native.mark_pairs(twice, *sizes, whole, real, _addresses(*plan.buffers))

@@ -1,0 +1,60 @@
+"""The benchmark runs, counts its work rightly, and leaves finite numbers."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from gsparc.benchmark import kernels
+from gsparc.benchmark.case import Case, Work
+from gsparc.benchmark.claims import Claim
+from gsparc.benchmark.measure import Machine, measure
+from gsparc.benchmark.scene import receiver, scene
+from gsparc.clock import ClockSettings
+from gsparc.ops import composite, make_plan, marks
+
+
+def test_quick_bench_leaves_finite_ratios(tmp_path):
+    command = [sys.executable, "-m", "gsparc.bench", "quick=true", f"hydra.run.dir={tmp_path}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((tmp_path / "summary.json").read_text())
+    ratios = [v for k, v in found.items() if k.endswith("/over_limit")]
+    assert len(ratios) > 20 and all(0 < r < 1e6 for r in ratios)
+    assert any(k.startswith("claim/") for k in found) and "Promises" in done.stdout
+
+
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+def test_pairs_are_the_pixels_inside_the_footprints(projection):
+    """Counted again in plain PyTorch: a pixel counts where its alpha passes the cut-off."""
+    field = scene(40, projection)
+    plan = field.plan(receiver())
+    alone = 0
+    for i in range(40):
+        one = [tensor[i : i + 1] for tensor in field.geometry]
+        made = make_plan(*one, receiver(), plan.grid, projection=projection, backend="reference")
+        alone += int((composite(made, *one, torch.ones(1, 1)).image > 0).sum())
+    assert abs(marks.pairs(plan) - alone) <= 2 + alone // 1000  # float32 at the edge
+
+
+def test_a_case_is_divided_by_the_larger_of_its_bounds():
+    clock = ClockSettings(rounds=3, least=3, warmup=1)
+    pairs = Case("x", "-", 0, 1, Work(1, 10**7), kernel=lambda: marks.exponentials(4))
+    moved = Case("x", "-", 0, 1, Work(10**9, 1), kernel=lambda: None)
+    assert measure(pairs, Machine(), 1, clock).bound == "pairs"
+    row = measure(moved, Machine(), 1, clock)
+    assert row.bound == "bytes" and row.over < 1
+
+
+def test_a_claim_knows_its_direction():
+    assert Claim("", 2.0, 3.0).met and not Claim("", 2.0, 3.0, True).met
+
+
+def test_every_row_of_the_rasterizer_renders_the_same_scene():
+    field = scene(60, "tangent")
+    moving, static = kernels.moving(field, 1), kernels.static(field, 1)
+    assert moving.work.pairs > 1000 and static.work.pairs > 1000
+    assert moving.kernel().shape == static.kernel().shape == (1, 2, 90, 360)
+    assert torch.allclose(static.kernel(), kernels.frozen(field, 1).kernel(), atol=1e-5)
