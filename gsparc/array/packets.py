@@ -36,12 +36,12 @@ class PacketSettings:
     """
 
     count: int | None = None
-    widths: tuple[float, ...] = (0.5, 1.0, 2.0)
+    widths: tuple[float, ...] = (0.2, 0.4, 0.8)
     jitter: float = 0.3
     pitch: float = 1.0
     samples: int = 5000
     near: float = 0.02
-    far: float = 4.0
+    far: float = 3.0
     ridge: float = 1e-6
 
 

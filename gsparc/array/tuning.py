@@ -1,8 +1,8 @@
 """Length and noise of the vector process, chosen for queries near and far: leave-out with gaps.
 
 Plain leave-one-out sees neighbours millimetres away only and picks a length that knows nothing beyond them.
-Here each sample is predicted without all others within a gap, for several gaps; what counts is the logarithm
-of the spectra's mean squared error, averaged over the gaps.
+Here each sample is predicted without all others within a gap, for several gaps; what counts is the PSNR of
+the spectra, averaged over samples and gaps.
 """
 
 from __future__ import annotations
@@ -13,15 +13,14 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.array.process import align, settle
-from gsparc.peers.gp import Kernel
+from gsparc.array.process import Kernel, align, settle
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths
 PIXELS = 600  # drawn from the grid
 ROWS = 384  # neighbouring samples the choice is made on
 CENTRES = 160  # of them predicted
 STEPS = 36
-STARTS = ((0.2, 0.02), (0.35, 0.02))  # length [wavelengths], noise
+STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
 
 
 @dataclass(frozen=True)
@@ -150,7 +149,7 @@ class _Looks:
         return left, error
 
     def score(self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray) -> float:
-        """Mean over gaps of the log of the mean squared error."""
+        """Mean over gaps and centres of the log of the squared error: up to a factor, minus the PSNR."""
         error = self.predictions(kernel, inverse, vectors)[1]
         usable = ~np.isnan(error).all(1)
-        return float(np.log(np.nanmean(error[usable], axis=1) + 1e-12).mean()) if usable.any() else 0.0
+        return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
