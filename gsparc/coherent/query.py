@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from gsparc.coherent.inphase import PhasedPosterior, shares, stacked
 from gsparc.coherent.phase import ranges, wave_over_band
-from gsparc.coherent.process import Posterior, Scene, steering
+from gsparc.coherent.process import Scene
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, matern32
 
@@ -54,23 +56,23 @@ class Query:
         variance_rows: of the process whose variance is given: fewer rows know less, so it errs high.
     """
 
-    def __init__(self, members: list[Posterior], variance_rows: int = 700) -> None:
+    def __init__(self, members: list[PhasedPosterior], variance_rows: int = 700) -> None:
         rows, scenes = members[0].rows, [member.scene for member in members]
         places, self.place_of = torch.unique(rows.position, dim=0, return_inverse=True)
         self.pack = Pack.of(scenes, places)
         self.counts = [len(scene.words) for scene in scenes]
-        pulled = [_pulled(member) for member in members]
+        pulled = [member.pulled for member in members]
+        phases = torch.cat([member.phased.phase for member in members])
+        self.turn = torch.polar(torch.ones(()), phases)[:, None, None]
         weight = torch.zeros(sum(self.counts), len(places), rows.target.shape[1], dtype=torch.complex64)
         weight.index_add_(1, self.place_of, torch.cat(pulled))
         self.real, self.imag = weight.real.contiguous(), weight.imag.contiguous()
         few = torch.linspace(0, len(rows) - 1, min(variance_rows, len(rows))).long()
-        first = (
-            members[0]
-            if len(few) == len(rows)
-            else Posterior(rows.take(few), scenes[0], members[0].noise_floor)
-        )
-        self.scene, self.root, self.few = scenes[0], first.factor.root, few
-        self.row_waves = first.waves
+        self.first = members[0]
+        if len(few) < len(rows):
+            self.first = PhasedPosterior(rows.take(few), members[0].phased, members[0].noise_floor)
+        self.few = few
+        self.root = self.first.factor.root
 
     def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor]:
         """Means (M, m, R, F) of the processes at queries (m, 3) [m] and tones (F,) [Hz]; variance (m,).
@@ -81,7 +83,7 @@ class Query:
         middle = tones[len(tones) // 2]
         for part in queries.split(CHUNK):
             correlation = self.pack.correlation(part)
-            gains = torch.complex(correlation @ self.real, correlation @ self.imag)  # (K, m, R)
+            gains = torch.complex(correlation @ self.real, correlation @ self.imag) * self.turn  # (K, m, R)
             waves = wave_over_band(ranges(part, self.pack.sources), tones)  # (m, K, F)
             split = zip(gains.split(self.counts), waves.split(self.counts, 1), strict=True)
             means.append(torch.stack([torch.einsum("kmr,mkf->mrf", g, w) for g, w in split]))
@@ -89,21 +91,20 @@ class Query:
         return torch.cat(means, 1), torch.cat(variances)
 
     def _variance(self, part: Tensor, tone: Tensor, correlation: Tensor) -> Tensor:
-        power = self.scene.log_amplitude.mul(2).exp()
-        none = torch.empty(len(part), 0, dtype=torch.complex64)
-        waves = steering(
-            Rows(part, tone.expand(len(part)), none, torch.arange(len(part))), self.scene.sources
-        )
+        phased, count = self.first.phased, len(part)
+        power = phased.scene.log_amplitude.mul(2).exp()
+        rows = Rows(part, tone.expand(count), torch.empty(count, 0), torch.arange(count))
+        waves = phased.waves(rows)
         seen = correlation[:, :, self.place_of[self.few]]
-        cross = torch.einsum("mk,kmn,nk->mn", waves * power, seen.to(waves.dtype), self.row_waves.conj())
-        prior = (waves.abs().square() * power).sum(1) + torch.tensor(self.scene.log_noise).exp()
-        return (prior - (self.root @ cross.mH).abs().square().sum(0)).clamp_min(0)
-
-
-def _pulled(member: Posterior) -> Tensor:
-    """What each row adds to each source's gain (K, n, R): s_k^2 conj(a_k) alpha."""
-    weights = member.waves.conj() * member.scene.log_amplitude.mul(2).exp()
-    return weights.T[:, :, None] * member.factor.alpha
+        # What a query and a row share: along the gain's own phase, and across it.
+        here, there = torch.stack(stacked(waves * power), -1), torch.stack(stacked(self.first.waves), -1)
+        here = here * shares(phased.turning)
+        cross = torch.zeros(2 * count, 2 * len(self.few))
+        for k in range(len(power)):
+            cross += (here[:, k] @ there[:, k].T) * seen[k].repeat(2, 2)
+        prior = (waves.abs().square() * power).sum(1) + math.exp(phased.scene.log_noise)
+        known = (self.root @ cross.T).square().sum(0)
+        return (prior - known[:count] - known[count:]).clamp_min(0)
 
 
 def _numbers(scene: Scene) -> Tensor:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsparc.coherent.descent import descend
 from gsparc.coherent.planes import images
-from gsparc.coherent.process import Factor, Posterior, Scene, add_covariance, correlations, steering
+from gsparc.coherent.process import JITTER, Factor, Posterior, Scene, add_covariance, correlations, steering
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, View
 
@@ -35,36 +36,28 @@ class Pace:
     logarithm: float = 0.05
 
 
-def refine(rows: Rows, scene: Scene, steps: int, pace: Pace = Pace(), noise_floor: float = 1e-5) -> Scene:
-    """The best scene met in `steps` steps of Adam (decay 0.8 and 0.95, slower for the last 40 %)."""
-    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
-    rates = [
+def rates(pace: Pace) -> list[Tensor]:
+    """Step sizes of transmitter, planes, log amplitudes and log noise."""
+    return [
         torch.tensor(pace.transmitter, dtype=torch.float64),
         torch.tensor([*[pace.normal] * 3, pace.offset], dtype=torch.float64),
         torch.tensor(pace.logarithm),
         torch.tensor(pace.logarithm),
     ]
-    first = [torch.zeros_like(v) for v in values]
-    second = [torch.zeros_like(v) for v in values]
-    seen, best, best_nll = None, values, math.inf
-    for step in range(steps + 1):
-        if step % REFRESH == 0 or seen is None:
+
+
+def refine(rows: Rows, scene: Scene, steps: int, pace: Pace = Pace(), noise_floor: float = JITTER) -> Scene:
+    """The best scene met in `steps` steps."""
+    seen = torch.empty(0)
+
+    def slopes(step: int, values: list[Tensor]) -> tuple[float, list[Tensor]]:
+        nonlocal seen
+        if step % REFRESH == 0:
             seen = correlations(rows, images(values[0], values[1], scene.words), scene.visibility)
-            best_nll = math.inf if step == 0 else best_nll
-        nll, gradient = _likelihood(rows, scene, values, seen, noise_floor)
-        if nll < best_nll:
-            best_nll, best = nll, values
-        if step == steps:
-            break
-        slow = 1.0 if step < 0.6 * steps else 0.3
-        moved = []
-        for i, g in enumerate(gradient):
-            first[i] = 0.8 * first[i] + 0.2 * g
-            second[i] = 0.95 * second[i] + 0.05 * g * g
-            mean = first[i] / (1 - 0.8 ** (step + 1))
-            size = (second[i] / (1 - 0.95 ** (step + 1))).sqrt() + 1e-9
-            moved.append(values[i] - slow * rates[i] * mean / size)
-        values = moved
+        return _likelihood(rows, scene, values, seen, noise_floor)
+
+    start = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
+    best = descend(start, rates(pace), steps, slopes)
     return replace(
         scene, transmitter=best[0], planes=best[1], log_amplitude=best[2], log_noise=float(best[3])
     )

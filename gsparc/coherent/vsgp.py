@@ -14,10 +14,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.coherent.process import Posterior, Scene
+from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
+from gsparc.coherent.process import Scene
 from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows, gather, query_elements, tones_of
 from gsparc.coherent.search import Search, SearchSettings
+from gsparc.coherent.settle import settle
 from gsparc.coherent.visibility import KernelVisibility
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -27,6 +29,7 @@ from gsparc.ops import Pose
 log = logging.getLogger(__name__)
 
 SECONDS_PER_MEASUREMENT = 0.4  # a conference room of 350 gets 140 s
+TURNING = 0.1  # share of a gain's variation that is not along its phase, before it is learned
 LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 480.0
 
 
@@ -86,7 +89,7 @@ class VirtualSourceGP(Method):
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
         self.site: Site | None = None
-        self.members: list[Posterior] = []
+        self.members: list[PhasedPosterior] = []
 
     # ---- learning ----
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
@@ -101,45 +104,46 @@ class VirtualSourceGP(Method):
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
         held = self.frame.inside(everything)
         scenes, notes = self._search_all(data, known, started)
-        self.members = [Posterior(held, scene, self.noise_floor) for scene in scenes]
+        self.members = [PhasedPosterior(held, scene, self.noise_floor) for scene in scenes]
         self.query = Query(self.members)
         return FitReport(time.monotonic() - started, tuple(notes))
 
     def _search_all(
         self, data: Measurements, known: np.ndarray, started: float
-    ) -> tuple[list[Scene], list[str]]:
+    ) -> tuple[list[PhasedScene], list[str]]:
         budget = self.budget_s
         if budget is None:
             budget = min(max(SECONDS_PER_MEASUREMENT * len(known), LEAST_BUDGET_S), MOST_BUDGET_S)
         threads = torch.get_num_threads()
         longest = 0.0
 
-        def one(number: int) -> Scene | None:
+        def search(number: int) -> PhasedScene | None:
             nonlocal longest
             begun = time.monotonic()
             if number > 0 and begun + longest > started + budget:
                 return None
             rows = self.frame.inside(gather(data, known, self.search_rows, self.seed + number))
-            search = Search(
+            finder = Search(
                 rows, self._start(data.site), self.settings, self.seed + number, started + 0.8 * budget
             )
-            scene = search.run()
+            scene = finder.run()
+            phased = settle(rows, PhasedScene.of(rows, scene, TURNING), self.settings.visibility)
             longest = max(longest, time.monotonic() - begun)
             log.info(
                 "search %d of %d: %d sources over %d planes, %.0f of %.0f s",
                 number + 1, self.searches, len(scene.words), len(scene.planes),
                 time.monotonic() - started, budget,
             )  # fmt: skip
-            return scene
+            return phased
 
         # Matrices of a few hundred rows gain nothing from two threads; two searches do.
         torch.set_num_threads(1)
         try:
             with ThreadPoolExecutor(max(1, min(threads, self.searches))) as pool:
-                found = [scene for scene in pool.map(one, range(self.searches)) if scene is not None]
+                found = [one for one in pool.map(search, range(self.searches)) if one is not None]
         finally:
             torch.set_num_threads(threads)
-        counts = ", ".join(str(len(scene.words)) for scene in found)
+        counts = ", ".join(str(len(phased.scene.words)) for phased in found)
         notes = [f"vsgp: {len(found)} of {self.searches} searches in {budget:.0f} s, {counts} sources"]
         return found, notes
 
@@ -180,7 +184,7 @@ class VirtualSourceGP(Method):
             "noise_floor": self.noise_floor,
             "frame": [self.frame.middle, self.frame.scale, self.frame.carrier_hz],
             "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
-            "scenes": [_scene_state(member.scene) for member in self.members],
+            "scenes": [_scene_state(member.phased) for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -189,7 +193,7 @@ class VirtualSourceGP(Method):
         self.noise_floor = float(state["noise_floor"])
         self.frame = Frame(*state["frame"])
         rows = Rows(*state["rows"])
-        self.members = [Posterior(rows, _scene(stored), self.noise_floor) for stored in state["scenes"]]
+        self.members = [PhasedPosterior(rows, _scene(stored), self.noise_floor) for stored in state["scenes"]]
         self.query = Query(self.members)
 
     def size(self) -> int:
@@ -220,7 +224,8 @@ def _frame(site: Site, rows: Rows) -> Frame:
     return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 
-def _scene_state(scene: Scene) -> dict[str, Any]:
+def _scene_state(phased: PhasedScene) -> dict[str, Any]:
+    scene = phased.scene
     law = scene.visibility
     assert isinstance(law, KernelVisibility)
     return {
@@ -230,11 +235,13 @@ def _scene_state(scene: Scene) -> dict[str, Any]:
         "log_amplitude": scene.log_amplitude,
         "log_noise": scene.log_noise,
         "visibility": [float(law.constant), float(law.angle), float(law.length)],
+        "phase": phased.phase,
+        "turning": phased.turning,
     }
 
 
-def _scene(state: dict[str, Any]) -> Scene:
-    return Scene(
+def _scene(state: dict[str, Any]) -> PhasedScene:
+    scene = Scene(
         state["transmitter"],
         state["planes"],
         tuple(tuple(word) for word in state["words"]),
@@ -242,3 +249,4 @@ def _scene(state: dict[str, Any]) -> Scene:
         float(state["log_noise"]),
         KernelVisibility(*state["visibility"]),
     )
+    return PhasedScene(scene, state["phase"], float(state["turning"]))
