@@ -26,7 +26,7 @@ from gsparc.peers.encoding import to_real, training_targets
 
 log = logging.getLogger(__name__)
 
-QUERY_CHUNK = 256  # bounds the memory of one prediction call
+QUERY_CHUNK = 16  # spectra drawn at a time: they stay in the cache
 
 
 class ArrayField(Method):
@@ -124,9 +124,9 @@ class ArrayField(Method):
 
     def _predict(self, tx: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         assert self.field is not None and self.renderer is not None
-        vectors, unknown = self.field(tx)
-        left = unknown[:, 0].square()
-        return self.renderer(vectors, unknown).clamp_(max=1), 1 - left, self.error[0] + self.error[1] * left
+        vectors = self.field(tx)
+        left = vectors[:, -1].real.square()
+        return self.renderer.draw(vectors), 1 - left, self.error[0] + self.error[1] * left
 
     def state(self) -> dict[str, Any]:
         """Packets, background, error model."""

@@ -58,33 +58,37 @@ class WavePackets(nn.Module):
 
     form: Tensor
     origin: Tensor
+    bias: Tensor
 
     def __init__(self, centres: Tensor, widths: Tensor, waves: Tensor, origin: Tensor, elements: int) -> None:
         super().__init__()
         self.elements = elements
         c, w, s = (centres - origin).double(), waves.double(), widths.double()
-        # Exponent and phase are linear in (x, |x|^2, 1): one small product gives both.
-        exponent = torch.cat(
-            [(c / s[:, None] ** 2).T, -0.5 / s[None] ** 2, -0.5 * (c**2).sum(1)[None] / s**2]
-        )
-        phase = torch.cat([w.T, torch.zeros(1, len(w)), -(c * w).sum(1)[None]])
+        # Exponent and phase are linear in (x, x^2, 1): one small product gives both.
+        curve = (-0.5 / s**2).expand(3, -1)
+        exponent = torch.cat([(c / s[:, None] ** 2).T, curve, -0.5 * (c**2).sum(1)[None] / s**2])
+        phase = torch.cat([w.T, torch.zeros(3, len(w)), -(c * w).sum(1)[None]])
         self.register_buffer("form", torch.cat([exponent, phase], 1).float().contiguous())
         self.register_buffer("origin", origin.float())
-        self.gains = nn.Parameter(torch.zeros(2 * len(centres), 2 * elements + 1))
+        self.gains = nn.Parameter(torch.zeros(2 * len(centres), 2 * elements + 2))
+        self.register_buffer("bias", torch.tensor([0.0] * (2 * elements) + [1.0, 0.0]))
 
     def features(self, x: Tensor) -> Tensor:
         """(B, 2 N) of positions (B, 3) [m]."""
-        x = x - self.origin.to(x.dtype)
-        lifted = torch.cat([x, x.square().sum(1, keepdim=True), torch.ones_like(x[:, :1])], 1)
-        exponent, phase = (lifted @ self.form.to(x.dtype)).chunk(2, 1)
+        x = x - self.origin
+        lifted = torch.cat([x, x * x, torch.ones_like(x[:, :1])], 1)
+        exponent, phase = (lifted @ self.form).chunk(2, 1)
         window = exponent.exp()
         return torch.cat([window * phase.cos(), window * phase.sin()], 1)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Array vectors (B, M) complex and the unknown share of the amplitude (B, 1) in [0, 1]."""
-        out = self.features(x) @ self.gains.to(x.dtype)
-        m = self.elements
-        return torch.complex(out[:, :m], out[:, m : 2 * m]), (1 + out[:, 2 * m :]).clamp(0, 1)
+    def forward(self, x: Tensor) -> Tensor:
+        """Array vectors and, as one more element, the unknown share of the amplitude: (B, M + 1) complex.
+
+        The share is real, in [0, 1], and 1 away from all packets.
+        """
+        out = torch.addmm(self.bias, self.features(x), self.gains)
+        out[:, -2:].clamp_(0, 1)
+        return torch.view_as_complex(out.view(len(x), -1, 2))
 
 
 def student_t(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -102,18 +106,18 @@ def distil(teacher: VectorProcess, settings: PacketSettings, seed: int) -> WaveP
     centres = places[rng.integers(0, n, count)]
     centres = centres + settings.jitter * widths[:, None] * rng.standard_normal((count, 3))
     waves = settings.pitch / widths[:, None] * student_t(count, rng)
-    field = WavePackets(
-        *(torch.from_numpy(part) for part in (centres, widths, waves, places.mean(0))), elements=m
-    )
+    parts = (torch.from_numpy(part) for part in (centres, widths, waves, places.mean(0)))
+    field = WavePackets(*parts, elements=m).double()
     reach = np.exp(rng.uniform(np.log(settings.near), np.log(settings.far), (settings.samples, 1))) * length
     around = places[rng.integers(0, n, settings.samples)] + reach * rng.standard_normal((settings.samples, 3))
     asked = np.concatenate([places, places, around])
     mean, left = teacher.posterior(asked)
-    wanted = np.concatenate([mean.real, mean.imag, np.sqrt(left)[:, None] - 1], 1)
+    # Pairs of real and imaginary parts; the unknown share is learned as its distance from 1.
+    wanted = np.concatenate([mean, np.sqrt(left)[:, None] - 1], 1).view(np.float64)
     with torch.no_grad():
         features = field.features(torch.from_numpy(asked)).numpy()
         gram = features.T @ features
         gram[np.diag_indices_from(gram)] += settings.ridge * np.trace(gram) / len(gram)
         gains = cho_solve(cho_factor(gram, lower=True, overwrite_a=True), features.T @ wanted)
         field.gains.copy_(torch.from_numpy(gains))
-    return field
+    return field.float()
