@@ -16,7 +16,7 @@ STILL = np.array([1.0, 1.0, 0.5])
 def spectra(path: Path, rows: int = 40, moving: str = "tx", origin: float = 0.0) -> Path:
     """Six lobes that come and go over a cube of 1 m, 16 x 32; `moving` end `tx` or `rx`, `origin` [m]."""
     rng = np.random.default_rng(0)
-    where = rng.uniform(-0.5, 0.5, (rows, 3)).round(3)
+    where = np.round(1024 * rng.uniform(-0.5, 0.5, (rows, 3))) / 1024  # exact also after adding 1e5
     centres = rng.normal(size=(6, 3)) * [1, 1, 0.3] + [0, 0, 0.5]
     centres /= np.linalg.norm(centres, axis=1, keepdims=True)
     directions = SphereGrid.hemisphere(16, 32).directions().numpy().reshape(-1, 3)
@@ -62,10 +62,12 @@ def compose(*overrides: str, config: str = "train"):
 
 
 def brief(file: Path, *more: str) -> list[str]:
-    """Overrides for a training run of a second or two: few Gaussians, few steps, the mean beside it."""
+    """Overrides that train the splatted field for a second: few Gaussians, few steps, the mean beside it."""
     return [
         "dataset=own",
         f"dataset.file='{file}'",
+        "model.effects.phase=false",
+        "model.effects.array=false",
         "model.field.count=40",
         "trainer.max_steps=20",
         "trainer.batch_size=8",

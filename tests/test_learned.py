@@ -52,9 +52,7 @@ def test_every_kind_of_file_trains_predicts_and_reads_back(tmp_path, name):
     assert said.mean.shape == batch.target.shape and said.mean.dtype == batch.target.dtype
     assert torch.isfinite(torch.view_as_real(said.mean) if said.mean.is_complex() else said.mean).all()
     assert ((said.confidence >= 0) & (said.confidence <= 1)).all()
-    checkpoint.save(
-        tmp_path / "model.ckpt", method, OmegaConf.to_yaml({"model": compose(*brief(file)).model})
-    )
+    checkpoint.save(tmp_path / "model.ckpt", method, OmegaConf.to_yaml(compose(*brief(file)), resolve=True))
     again, _ = checkpoint.load(tmp_path / "model.ckpt")
     two = again.predict(batch.tx, batch.rx)
     assert torch.equal(said.mean, two.mean) and torch.equal(said.confidence, two.confidence)
@@ -132,7 +130,7 @@ def test_the_test_rows_are_never_looked_at(tmp_path):
     for target in (data.target, poisoned):
         method = learned(file)
         method.fit(dataclasses.replace(data, target=target), fold, tmp_path)
-        states.append(method.state()["model"])
+        states.append(method.fitted().state_dict())
     assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
 
 
@@ -144,7 +142,7 @@ def test_seeds_repeat_and_differ(tmp_path):
         method = learned(file)
         method.training.seed = seed
         method.fit(data, fold, tmp_path / str(len(found)))
-        found.append(method.state()["model"]["gaussians.means"])
+        found.append(method.fitted().gaussians.means)
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 

@@ -58,7 +58,7 @@ def test_a_spoilt_parameter_stops_the_run_and_is_named(data, folds, tmp_path, na
     assert left["step"] == 7 and left["state_dict"][name][3].isnan().any() and len(left["index"])
     good = checkpoint.read(tmp_path / "last.ckpt")
     assert good.extra["trainer"]["global_step"] == 5
-    assert all(t.isfinite().all() for t in good.state["model"].values())
+    assert all(t.isfinite().all() for t in good.state["inner"]["model"].values())
 
 
 def test_a_poisoned_state_replaces_no_checkpoint(data, folds, tmp_path):

@@ -116,7 +116,7 @@ def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("resume")
     file = spectra(folder / "own.npz")
     finish(start(file, folder / "whole"))
-    sizes = checkpoint.read(folder / "whole" / "last.ckpt").state["model"]["gaussians.ids"]
+    sizes = checkpoint.read(folder / "whole" / "last.ckpt").state["inner"]["model"]["gaussians.ids"]
     assert len(sizes) > 40, "nothing was split: the test would show little"
     return folder / "whole", file
 
@@ -146,8 +146,8 @@ def test_a_checkpoint_of_parameters_and_moments_alone_breaks(whole, killed, tmp_
     torch.save(content, tmp_path / "cut.ckpt")
     settings = brief(file, *SETTINGS, f"ckpt_path={tmp_path / 'cut.ckpt'}", "model.refit=false")
     _, objects = train(compose(*settings), tmp_path)
-    undisturbed = checkpoint.read(folder / "last.ckpt").state["model"]
-    resumed = objects.methods[0].state()["model"]
+    undisturbed = checkpoint.read(folder / "last.ckpt").state["inner"]["model"]
+    resumed = objects.methods[0].fitted().state_dict()
     resumed = {k: v for k, v in resumed.items() if not k.endswith((".low", ".high"))}  # calibrated after
     undisturbed = {k: v for k, v in undisturbed.items() if not k.endswith((".low", ".high"))}
     assert bool(different(undisturbed, resumed)) == forgetful

@@ -1,0 +1,24 @@
+"""Dashboards: a Weights & Biases logger that stays offline unless its user has logged in."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from lightning.pytorch.loggers import WandbLogger
+
+
+def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
+    """A logger for `logger=wandb`.
+
+    Args:
+        offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was done.
+        **settings: of Lightning's `WandbLogger`.
+    """
+    import wandb  # slow to import, and few runs need it
+    from lightning.pytorch.loggers import WandbLogger
+
+    stays = not wandb.login(prompt=False) if offline is None else offline
+    # Lightning sets a variable that wandb, once asked for a login, does not read again.
+    mode = {"mode": "offline"} if stays else {}
+    return WandbLogger(offline=stays, **mode, **settings)

@@ -1,0 +1,64 @@
+"""Nobody there, in training: everything is pruned, or nothing is seen.
+
+Remedy: pruning has a floor and keeps the most opaque; empty plans are plans. Shown: a run that would prune
+every Gaussian ends with the floor; a run whose Gaussians are all behind the horizon, and one that starts
+without any, finish with finite figures. Naive: pruning by threshold alone leaves none.
+"""
+
+from __future__ import annotations
+
+import lightning.pytorch as L
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, channels, compose, powers, spectra
+
+from gsparc.data.load import load, split_for
+from gsparc.registry import build
+from gsparc.trainer import TrainerSettings, Training
+from gsparc.training import train
+
+PRUNE = (
+    "callbacks=densify",
+    "callbacks.densify.start=4",
+    "callbacks.densify.interval=4",
+    "callbacks.densify.stop=20",
+    "callbacks.densify.min_opacity=2.0",  # everyone is below
+    "callbacks.densify.min_gaussians=5",
+    "callbacks.densify.grad_threshold=1e9",
+)
+
+
+def test_pruning_stops_at_the_floor(tmp_path):
+    facts, objects = train(compose(*brief(spectra(tmp_path / "own.npz"), *PRUNE)), tmp_path / "run")
+    assert facts["model/num_gaussians"] == 5 and np.isfinite(facts["test/psnr_db"])
+    opacities = objects.methods[0].fitted().gaussians.opacities
+    assert (opacities < 2.0).all(), "naive: opacity below the threshold goes, and nobody is left"
+
+
+@pytest.mark.parametrize("maker", [spectra, channels, powers])
+def test_no_gaussians_at_all(tmp_path, maker):
+    file = maker(tmp_path / "own.npz")
+    settings = brief(file, "model.warm_start=false", "model.field.count=0", "callbacks=densify")
+    facts, _ = train(compose(*settings), tmp_path / "run")
+    assert facts["model/num_gaussians"] == 0
+    assert facts["test/nmse"] == pytest.approx(1.0)  # silence
+
+
+def test_nobody_is_seen(tmp_path):
+    """All Gaussians below a receiver that looks up."""
+
+    class Sink(L.Callback):
+        def on_train_start(self, trainer, module):
+            with torch.no_grad():
+                module.model.gaussians.means[:, 2] = -50.0
+                module.model.gaussians.log_scales.fill_(-3.0)
+
+    file = spectra(tmp_path / "own.npz")
+    method = build(compose(*brief(file, "model.warm_start=false", "model.refit=false")).model)
+    method.training = Training(TrainerSettings(max_steps=10, batch_size=8), callbacks=lambda: [Sink()])
+    data = load({"name": "own", "file": str(file)})
+    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path)
+    batch = data.batch(np.arange(4))
+    assert (method.predict(batch.tx, batch.rx).mean == 0).all()
+    assert all(p.isfinite().all() for p in method.fitted().parameters())
