@@ -1,0 +1,172 @@
+"""`python -m gsparc.sensitivity`: what position errors in training and in queries cost each method."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from gsparc import cli
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.learned import LearnedField
+from gsparc.method import Method
+from gsparc.registry import build, method_class
+from gsparc.scoring import score
+from gsparc.trainer import Training
+
+log = logging.getLogger(__name__)
+
+FIGURES = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One point of the sweep.
+
+    Attributes:
+        method: name of the variant or rival.
+        where: `none`, `query` or `train`: which positions were disturbed.
+        error_m: standard deviation of each coordinate [m].
+        figure: name of the accuracy.
+        value: its value on the test rows.
+        train_s: seconds of the training it rests on [s].
+    """
+
+    method: str
+    where: str
+    error_m: float
+    figure: str
+    value: float
+    train_s: float
+
+
+def displaced(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
+    """The moving end of `rows` believed elsewhere by N(0, error_m^2) per coordinate; all else the same."""
+    offset = np.random.default_rng(seed).normal(scale=error_m, size=(len(rows), 3))
+    name = "tx" if data.site.moving_end == "tx" else "rx_position"
+    moved = getattr(data, name).copy()
+    moved[rows] += offset
+    return replace(data, **{name: moved})
+
+
+def sweep(
+    contenders: Mapping[str, Callable[[], Method]],
+    data: Measurements,
+    fold: Fold,
+    errors_m: list[float],
+    run_dir: Path,
+    *,
+    train_errors: bool,
+    seed: int,
+) -> Iterator[Row]:
+    """Rows as they are finished; every method sees the same disturbed positions."""
+    figure = FIGURES[data.site.kind]
+    learned = np.concatenate([fold.train, fold.val])
+    for name, make in contenders.items():
+        method, seconds = _fitted(make, data, fold, run_dir / name)
+        yield Row(name, "none", 0.0, figure, _value(method, data, fold, figure), seconds)
+        for error in errors_m:
+            there = displaced(data, fold.test, error, seed)
+            yield Row(name, "query", error, figure, _value(method, there, fold, figure), seconds)
+        for error in errors_m if train_errors else ():
+            there = displaced(data, learned, error, seed)
+            method, seconds = _fitted(make, there, fold, run_dir / f"{name}-{error:g}")
+            yield Row(name, "train", error, figure, _value(method, data, fold, figure), seconds)
+
+
+def _fitted(make: Callable[[], Method], data: Measurements, fold: Fold, folder: Path) -> tuple[Method, float]:
+    method = make()
+    return method, method.fit(data, fold, folder).seconds
+
+
+def _value(method: Method, data: Measurements, fold: Fold, figure: str) -> float:
+    return float(score((method,), data, Split("sensitivity", (fold,), ""), "test").figures()[figure])
+
+
+def draw(rows: list[Row], path: Path) -> None:
+    """Accuracy against position error, queries on the left, training on the right."""
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2, sharey=True)
+    for axis, where in zip(axes, ("query", "train"), strict=True):
+        for method in dict.fromkeys(row.method for row in rows):
+            points = [(r.error_m * 100, r.value) for r in rows if r.method == method and r.where == where]
+            clean = [r.value for r in rows if r.method == method and r.where == "none"]
+            if points:
+                (line,) = axis.plot(*zip(*points, strict=True), marker="o", label=method)
+                axis.axhline(clean[0], color=line.get_color(), linestyle=":", linewidth=1)
+        axis.set_xscale("log")
+        axis.set_xlabel(f"position error in {'queries' if where == 'query' else 'training'} [cm]")
+        axis.grid(alpha=0.3)
+    axes[0].set_ylabel(rows[0].figure)
+    axes[0].legend(title="dotted: no error")
+    figure.savefig(path, dpi=110)
+
+
+def task(config: DictConfig) -> list[Row]:
+    """Sweep, table, CSV and picture."""
+    if config.threads is not None:
+        torch.set_num_threads(int(config.threads))
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    data = load(OmegaConf.to_container(config.dataset, resolve=True))  # type: ignore[arg-type]
+    fold = split_for(OmegaConf.to_container(config.split, resolve=True), data).folds[0]  # type: ignore[arg-type]
+
+    def maker(overrides: Any) -> Callable[[], Method]:
+        def make() -> Method:
+            method = build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+            if isinstance(method, LearnedField):
+                method.training = Training(instantiate(config.trainer), int(config.seed))
+            return method
+
+        return make
+
+    contenders: dict[str, Callable[[], Method]] = {str(k): maker(v) for k, v in config.variants.items()}
+    contenders |= {name: method_class(name) for name in config.rivals}
+    rows: list[Row] = []
+    started = time.monotonic()
+    found = sweep(
+        contenders, data, fold, [float(e) for e in config.errors_m], run_dir,
+        train_errors=bool(config.train_errors), seed=int(config.seed),
+    )  # fmt: skip
+    for row in found:
+        rows.append(row)
+        log.info("%s after %.0f s", row, time.monotonic() - started)
+    with (run_dir / "sensitivity.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([f.name for f in fields(Row)])
+        writer.writerows(astuple(row) for row in rows)
+    draw(rows, run_dir / "sensitivity.png")
+    table = Table(title=f"{data.site.name}: {rows[0].figure} against position error")
+    for column in ("method", "disturbed", "error m", rows[0].figure, "train s"):
+        table.add_column(column, justify="left" if column in ("method", "disturbed") else "right")
+    for row in rows:
+        table.add_row(row.method, row.where, f"{row.error_m:g}", f"{row.value:.4g}", f"{row.train_s:.3g}")
+    console = Console()
+    console.print(table)
+    console.print(f"written to {run_dir}", highlight=False)
+    return rows
+
+
+def main() -> None:
+    """Entry point."""
+    cli.run(task, "sensitivity")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""Effects are settled from the site, refused where they mean nothing, and probed on training rows only."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsparc.data.rfid import load_rfid
+from gsparc.data.schema import Site
+from gsparc.data.splits import Fold
+from gsparc.effects import decide_array, decide_phase, probe_array, spacing_in_wavelengths
+from gsparc.simulate.rfid_sim import ensure_rfid_sim
+
+
+@pytest.fixture(scope="module")
+def spectra(tmp_path_factory):
+    return load_rfid(ensure_rfid_sim(tmp_path_factory.mktemp("sim"), count=40, seed=0))
+
+
+@pytest.fixture()
+def channels(spectra) -> Site:
+    return replace(spectra.site, kind="csi", static_end="tx", grid=None)
+
+
+def test_array_needs_spectra_of_a_static_receiver(spectra, channels) -> None:
+    assert decide_array("auto", spectra.site, None).on
+    assert not decide_array("auto", channels, None).on
+    assert not decide_array(False, spectra.site, None).on
+    without = replace(spectra.site, array=None)
+    assert "no array" in decide_array("auto", without, None).reason
+    with pytest.raises(ValueError, match=r"effects\.array=true is not possible"):
+        decide_array(True, without, None)
+
+
+def test_phase_needs_channels_of_a_moving_receiver(spectra, channels) -> None:
+    assert decide_phase("auto", channels, None).on
+    assert not decide_phase("auto", spectra.site, None).on
+    with pytest.raises(ValueError, match=r"effects\.phase=true is not possible"):
+        decide_phase(True, replace(channels, static_end="rx"), None)
+    with pytest.raises(ValueError, match="choose auto, true or false"):
+        decide_phase("on", channels, None)  # type: ignore[arg-type]
+
+
+def test_an_ablation_of_the_networks_is_not_answered_by_another_model(spectra) -> None:
+    decision = decide_array("auto", spectra.site, "emission.hidden=8")
+    assert not decision.on and "emission.hidden=8" in decision.reason
+    assert decide_array(True, spectra.site, "emission.hidden=8").on
+
+
+def test_probe_accepts_the_array_that_measured_and_refuses_another(spectra) -> None:
+    rows = np.arange(30)
+    fold = Fold(rows, rows[:0], np.arange(30, 40))
+    assert probe_array(spectra, fold, seed=0).on
+    stretched = replace(spectra, site=replace(spectra.site, array=spectra.site.array * 0.6))
+    assert not probe_array(stretched, fold, seed=0).on
+    blanked = spectra.target.copy()
+    blanked[30:] = 0  # test rows may hold anything: the probe must not look
+    assert (
+        probe_array(replace(spectra, target=blanked), fold, seed=0).reason
+        == probe_array(spectra, fold, seed=0).reason
+    )
+
+
+def test_spacing_is_in_wavelengths(spectra) -> None:
+    rows = np.arange(40)
+    doubled = replace(spectra, tx=spectra.tx * 2)
+    assert spacing_in_wavelengths(doubled, rows) == pytest.approx(2 * spacing_in_wavelengths(spectra, rows))
