@@ -8,60 +8,61 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
-template <class S> struct StripScratch {
-    S *before, *behind, *planes;  // transmittance, what is still to come, upstream gradient per channel
-};
-
-template <class S, bool kTangent, bool kHides>
-void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>& ranked, const Tables<S>& tables, int task,
-                              StripScratch<S> mine, Vec<S>* feature_sums, S* moments, S* feature_slots) {
+// A cell holds what one tile needs: transmittance, what is still to come, upstream gradient per channel.
+template <class S, bool kTangent, bool kHides, int kChannels>
+void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>& ranked, const TileTables<S>& grid, int task,
+                              S* cells, S* sums_memory, S* moments, S* feature_slots) {
+    constexpr int n = Lanes<S>::n;
     const CompositeArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.lens.height, task);
-    const int stride = padded(a.lens.width), area = kStripRows * stride, k_count = ranked.width - 2;
+    const int k_count = kChannels ? kChannels : ranked.width - 2, cell = (2 + k_count) * n;
     const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max);
     const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
-    fill(mine.before, area, S(1));
-    fill(mine.behind, area, S(0));
-    fill(mine.planes, int64_t(area) * k_count, S(0));
-    for (int row = strip.row0; row < strip.row1; ++row) {
-        const int64_t to = (row - strip.row0) * stride, from = int64_t(row) * a.lens.width;
+    fill(cells, int64_t(grid.tiles) * cell, S(0));
+    for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
+    each_stretch<S>(strip, a.lens.width, [&](int tile, int lane, int64_t pixel, int count) {
+        S *behind = cells + int64_t(tile) * cell + n + lane, *g = behind;
         for (int k = 0; k < k_count; ++k) {
-            const int64_t plane = (int64_t(strip.pose) * k_count + k) * pixels + from;
-            S *g = mine.planes + int64_t(k) * area + to, *behind = mine.behind + to;
-            for (int j = 0; j < a.lens.width; ++j) g[j] = b.grad_image[plane + j], behind[j] += g[j] * a.image[plane + j];
+            const int64_t at = (int64_t(strip.pose) * k_count + k) * pixels + pixel;
+            g += n;
+            for (int j = 0; j < count; ++j) g[j] = b.grad_image[at + j], behind[j] += g[j] * a.image[at + j];
         }
+        const int64_t at = strip.pose * pixels + pixel;
         if (b.grad_transmittance)
-            for (int j = 0; j < a.lens.width; ++j)
-                mine.behind[to + j] += b.grad_transmittance[strip.pose * pixels + from + j] * a.transmittance[strip.pose * pixels + from + j];
-    }
+            for (int j = 0; j < count; ++j) behind[j] += b.grad_transmittance[at + j] * a.transmittance[at + j];
+    });
+    Vec<S> local[kChannels ? kChannels : 1];
     for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-        if ((entry - strip.first) % 64 == 63 && !any_lit(mine.before, area, a.lens.transmittance_min)) break;
+        if ((entry - strip.first) % 64 == 63 && !any_lit(cells, grid.tiles, cell, a.lens.transmittance_min)) break;
         const S* row = ranked.of(a.plan, strip.pose, *entry);
         const S opacity = row[0], extinction = row[1];
         MomentSums<S, kTangent, kHides> sums;
-        for (int k = 0; k < k_count; ++k) feature_sums[k] = splat(S(0));
-        each_block<S, kTangent>(strip, *entry, tables, a.lens, stride, [&](int at, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
-            const Vec<S> light = load(mine.before + at);
+        if (kChannels)
+            for (int k = 0; k < kChannels; ++k) local[k] = splat(S(0));
+        else fill(sums_memory, int64_t(k_count) * n, S(0));
+        each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+            S* mine = cells + int64_t(tile) * cell;
+            const Vec<S> light = load(mine);
             const Mask<S> counts = inside & at_most(floor, light);
             if (!any(counts)) return;
             const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha, through = S(1) - layer.gamma;
             Vec<S> gain = splat(S(0));
-            const S* plane = mine.planes + at;
-            for (int k = 0; k < k_count; ++k, plane += area) {
-                const Vec<S> g = load(plane);
+            for (int k = 0; k < k_count; ++k) {
+                const Vec<S> g = load(mine + (2 + k) * n);
                 gain = fma(splat(row[2 + k]), g, gain);
-                feature_sums[k] = fma(weight, g, feature_sums[k]);
+                if (kChannels) local[k] = fma(weight, g, local[k]);
+                else store(sums_memory + k * n, fma(weight, g, load(sums_memory + k * n)));
             }
-            const Vec<S> behind = load(mine.behind + at) - weight * gain;
-            store(mine.behind + at, behind);
-            store(mine.before + at, light * through);
-            const Vec<S> d_gamma = -behind / through;
+            const Vec<S> behind = load(mine + n) - weight * gain;
+            store(mine + n, behind);
+            store(mine, light * through);
+            const Vec<S> d_gamma = -behind * reciprocal(through);
             sums.add(layer, counts, kHides ? light * gain : fma(light, gain, d_gamma), d_gamma, t1, t2, form, alpha_max);
         });
         const int64_t slot = strip.slot(*entry);
         sums.write(moments + slot * kMoments);
-        for (int k = 0; k < k_count; ++k) feature_slots[slot * k_count + k] = sum<S>(feature_sums[k]);
+        for (int k = 0; k < k_count; ++k) feature_slots[slot * k_count + k] = sum<S>(kChannels ? local[k] : load(sums_memory + k * n));
     }
 }
 
@@ -113,23 +114,19 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, 
 template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
     const CompositeArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
-    const GridTables<S> grid(a.lens);
+    const TileTables<S> grid(a.lens);
     const Ranked<S> ranked(plan, a.model, a.features, a.samples, a.channels, a.threads);
     const int k_count = ranked.width - 2;
-    const int64_t area = int64_t(kStripRows) * padded(a.lens.width), scratch = area * (2 + k_count) + int64_t(k_count + 2) * kLanes;
+    const int64_t area = int64_t(grid.tiles) * Lanes<S>::n * (2 + k_count), scratch = area + int64_t(k_count) * Lanes<S>::n;
     const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
     Buffer<S> memory(scratch * a.threads), moments(entries * kMoments), feature_slots(entries * k_count);
-    auto strip = [&](int task, int worker) {
-        S* mine = memory.data + worker * scratch;
-        // The accumulators are vectors: align them.
-        char* tail = reinterpret_cast<char*>(mine + area * (2 + k_count));
-        Vec<S>* sums = reinterpret_cast<Vec<S>*>((reinterpret_cast<uintptr_t>(tail) + sizeof(Vec<S>) - 1) / sizeof(Vec<S>) * sizeof(Vec<S>));
-        const bool hides = a.model.extinctions != nullptr;
-        const auto run = a.lens.tangent ? (hides ? composite_backward_strip<S, true, true> : composite_backward_strip<S, true, false>)
-                                        : (hides ? composite_backward_strip<S, false, true> : composite_backward_strip<S, false, false>);
-        run(b, ranked, grid.tables, task, {mine, mine + area, mine + 2 * area}, sums, moments.data, feature_slots.data);
-    };
-    parallel_for(plan.poses * plan.strips, a.threads, strip);
+    with_switches(a.lens.tangent, a.model.extinctions, k_count, [&](auto tangent, auto hides, auto channels) {
+        auto strip = [&](int task, int worker) {
+            S* mine = memory.data + worker * scratch;
+            composite_backward_strip<S, tangent.value, hides.value, channels.value>(b, ranked, grid, task, mine, mine + area, moments.data, feature_slots.data);
+        };
+        parallel_for(plan.poses * plan.strips, a.threads, strip);
+    });
 
     constexpr int chunk = 256;
     const int chunks = (plan.count + chunk - 1) / chunk;
@@ -151,60 +148,58 @@ template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
 }
 
 template <class S, bool kTangent, bool kHides>
-void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Ranked<S>& ranked, const Tables<S>& tables, int task, S* before,
-                          S* behind, S* moments) {
+void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Ranked<S>& ranked, const TileTables<S>& grid, int task, S* cells,
+                          S* moments) {
+    constexpr int n = Lanes<S>::n;
     const WeightArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.lens.height, task);
-    const int stride = padded(a.lens.width), area = kStripRows * stride;
     const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
-    fill(before, area, S(1));
-    fill(behind, area, S(0));
+    fill(cells, int64_t(grid.tiles) * 2 * n, S(0));
     for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
+        for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
         for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
             const S* row = ranked.of(a.plan, strip.pose, *entry);
             const S opacity = row[0], extinction = row[1];
             const Vec<S> per_seen = splat(row[2]), per_alpha = splat(row[3]);
             MomentSums<S, kTangent, kHides> sums;
-            each_block<S, kTangent>(strip, *entry, tables, a.lens, stride, [&](int at, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
-                const Vec<S> light = load(before + at);
+            each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+                S* mine = cells + int64_t(tile) * 2 * n;
+                const Vec<S> light = load(mine);
                 const Mask<S> lit = at_most(floor, light);
                 const Layer<S, kHides> layer(form, inside, opacity, extinction, alpha_max);
                 const Vec<S> gain = select(lit, per_seen, none), through = S(1) - layer.gamma;
                 const Vec<S> part = light * layer.alpha * gain;
-                store(before + at, select(lit, light * through, light));
+                store(mine, select(lit, light * through, light));
                 if (pass == 0) {
-                    store(behind + at, load(behind + at) + part);
+                    store(mine + n, load(mine + n) + part);
                     return;
                 }
-                const Vec<S> rest = load(behind + at) - part;
-                store(behind + at, rest);
-                const Vec<S> d_alpha = fma(light, gain, per_alpha), d_gamma = select(lit, -rest / through, none);
+                const Vec<S> rest = load(mine + n) - part;
+                store(mine + n, rest);
+                const Vec<S> d_alpha = fma(light, gain, per_alpha), d_gamma = select(lit, -rest * reciprocal(through), none);
                 sums.add(layer, inside, kHides ? d_alpha : d_alpha + d_gamma, d_gamma, t1, t2, form, alpha_max);
             });
             if (pass == 1) sums.write(moments + strip.slot(*entry) * kMoments);
         }
-        fill(before, area, S(1));
     }
 }
 
 template <class S> void weights_backward(const WeightBackwardArgs<S>& b) {
     const WeightArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
-    const GridTables<S> grid(a.lens);
+    const TileTables<S> grid(a.lens);
     const int64_t all = int64_t(plan.poses) * plan.count;
     Buffer<S> upstream(2 * all);
     for (int64_t i = 0; i < all; ++i) upstream[2 * i] = b.grad_visible_sum[i], upstream[2 * i + 1] = b.grad_total[i];
     const Ranked<S> ranked(plan, a.model, upstream.data, 1, 2, a.threads);
-    const int64_t area = int64_t(kStripRows) * padded(a.lens.width);
-    Buffer<S> memory(2 * area * a.threads), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
-    auto strip = [&](int task, int worker) {
-        S* mine = memory.data + 2 * area * worker;
-        const bool hides = a.model.extinctions != nullptr;
-        const auto run = a.lens.tangent ? (hides ? weigh_backward_strip<S, true, true> : weigh_backward_strip<S, true, false>)
-                                        : (hides ? weigh_backward_strip<S, false, true> : weigh_backward_strip<S, false, false>);
-        run(b, ranked, grid.tables, task, mine, mine + area, moments.data);
-    };
-    parallel_for(plan.poses * plan.strips, a.threads, strip);
+    const int64_t area = int64_t(grid.tiles) * 2 * Lanes<S>::n;
+    Buffer<S> memory(area * a.threads), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
+    with_switches(a.lens.tangent, a.model.extinctions, 2, [&](auto tangent, auto hides, auto) {
+        auto strip = [&](int task, int worker) {
+            weigh_backward_strip<S, tangent.value, hides.value>(b, ranked, grid, task, memory.data + area * worker, moments.data);
+        };
+        parallel_for(plan.poses * plan.strips, a.threads, strip);
+    });
     chain(plan, a.model, a.lens, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, static_cast<S*>(nullptr));
 }
 

@@ -49,7 +49,7 @@ template <class S> struct FreezeArgs {
     Lens<S> lens;
     int threads;
     int64_t* starts;                // (strips + 1), first block of each strip; [1:] is counted while heads is null
-    int32_t* heads;                 // (blocks, 2) rank and place in the strip
+    int32_t* heads;                 // (blocks, 2) rank and tile of the strip
     S* weights;                     // (blocks, lanes)
 };
 

@@ -1,4 +1,4 @@
-// One footprint on one row of pixels: standardised offsets for a block of lanes. A record holds
+// One footprint on a block of pixels, a lane each: standardised offsets. A record holds
 //   tangent:  f1 (3), f2 (3), n (3), reach^2, gain    with tau_i = f_i . u / n . u for a pixel direction u
 //   equirect: column, row, sqrt(A), rho, sqrt(B), -, -, -, -, reach^2, gain
 #pragma once
@@ -58,42 +58,47 @@ template <class S> inline void fill_tables(const Lens<S>& lens, S* numbers) {
     }
 }
 
+// Where a block of pixels lies: a lane each. NaN in a lane beyond the grid.
+template <class S> struct Place {
+    Vec<S> cos_row, sin_row, row, cos_column, sin_column, column;
+};
+
+// A footprint prepared for pixels of given rows; `offsets` then takes their columns.
 template <class S, bool kTangent> struct RowView;
 
 template <class S> struct RowView<S, true> {
     Vec<S> x1, y1, z1, x2, y2, z2, xn, yn, zn, reach, horizon;
-    const Tables<S>& table;
 
-    GSPARC_INLINE RowView(const S* r, int row, const Tables<S>& t, const Lens<S>& lens) : table(t) {
-        const S c = t.cos_row[row], s = t.sin_row[row];
-        x1 = splat(r[0] * c), y1 = splat(r[1] * c), z1 = splat(r[2] * s);
-        x2 = splat(r[3] * c), y2 = splat(r[4] * c), z2 = splat(r[5] * s);
-        xn = splat(r[6] * c), yn = splat(r[7] * c), zn = splat(r[8] * s);
+    GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>&, const Lens<S>& lens) {
+        const Vec<S> c = at.cos_row, s = at.sin_row;
+        x1 = r[0] * c, y1 = r[1] * c, z1 = r[2] * s;
+        x2 = r[3] * c, y2 = r[4] * c, z2 = r[5] * s;
+        xn = r[6] * c, yn = r[7] * c, zn = r[8] * s;
         reach = splat(r[kReach]), horizon = splat(lens.horizon_cosine);
     }
     // Standardised offsets and their squared length; false if no lane lies inside the footprint.
-    GSPARC_INLINE bool offsets(int column, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
-        const Vec<S> c = load(table.cos_column + column), s = load(table.sin_column + column);
+    GSPARC_INLINE bool offsets(const Place<S>& at, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
+        const Vec<S> c = at.cos_column, s = at.sin_column;
         const Vec<S> a = fma(x1, c, fma(y1, s, z1)), b = fma(x2, c, fma(y2, s, z2)), d = fma(xn, c, fma(yn, s, zn));
-        inside = at_most(fma(a, a, b * b), reach * (d * d)) & at_most(horizon, d);
+        const Vec<S> square = fma(a, a, b * b);
+        inside = at_most(square, reach * (d * d)) & at_most(horizon, d);
         if (!any(inside)) return false;
-        const Vec<S> inverse = S(1) / d;
-        tau1 = a * inverse, tau2 = b * inverse, form = fma(tau1, tau1, tau2 * tau2);
+        const Vec<S> inverse = reciprocal(d);
+        tau1 = a * inverse, tau2 = b * inverse, form = square * (inverse * inverse);
         return true;
     }
 };
 
 template <class S> struct RowView<S, false> {
     Vec<S> center, root_a, shift, tau2_row, square2, reach, turn, per_turn;
-    const Tables<S>& table;
 
-    GSPARC_INLINE RowView(const S* r, int row, const Tables<S>& t, const Lens<S>&) : table(t) {
-        const S q = S(row) - r[1];
-        center = splat(r[0]), root_a = splat(r[2]), shift = splat(r[3] * q), tau2_row = splat(r[4] * q);
+    GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>& t, const Lens<S>&) {
+        const Vec<S> q = at.row - r[1];
+        center = splat(r[0]), root_a = splat(r[2]), shift = r[3] * q, tau2_row = r[4] * q;
         square2 = tau2_row * tau2_row, reach = splat(r[kReach]), turn = splat(t.turn), per_turn = splat(t.per_turn);
     }
-    GSPARC_INLINE bool offsets(int column, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
-        const Vec<S> away = load(table.column + column) - center;
+    GSPARC_INLINE bool offsets(const Place<S>& at, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
+        const Vec<S> away = at.column - center;
         const Vec<S> p = away - turn * nearest(away * per_turn);  // the nearest image of this column
         tau1 = root_a * (p - shift), tau2 = tau2_row, form = fma(tau1, tau1, square2);
         inside = at_most(form, reach);
@@ -102,7 +107,7 @@ template <class S> struct RowView<S, false> {
 };
 
 // A footprint's columns as at most two runs [from, to) of the row; each pixel occurs once, also when blocks of
-// lanes overhang, because a box within kLanes of the full circle was widened to it.
+// columns overhang, because a box within kLanes of the full circle was widened to it.
 struct Runs {
     int from[2], to[2], count;
 };

@@ -17,7 +17,7 @@ constexpr int kBytes = 64;
 #elif defined(__AVX2__)
 constexpr int kBytes = 32;
 #else
-constexpr int kBytes = 16;
+constexpr int kBytes = 32;  // two registers of what every x86-64 and ARM has
 #endif
 
 template <class S> struct Lanes;
@@ -79,6 +79,7 @@ template <class V> GSPARC_INLINE V fma(V a, V b, V c) { return a * b + c; }
 #endif
 #endif
 
+// The sum of all lanes, halves added to halves.
 template <class S> GSPARC_INLINE S sum(Vec<S> v) {
     S lanes[Lanes<S>::n];
     store(lanes, v);
@@ -86,6 +87,30 @@ template <class S> GSPARC_INLINE S sum(Vec<S> v) {
         for (int i = 0; i < width; ++i) lanes[i] += lanes[i + width];
     return lanes[0];
 }
+#if defined(__AVX2__)
+GSPARC_INLINE float sum_of(__m256 v) {
+    __m128 a = _mm_add_ps(_mm256_castps256_ps128(v), _mm256_extractf128_ps(v, 1));
+    a = _mm_add_ps(a, _mm_movehl_ps(a, a));
+    return _mm_cvtss_f32(_mm_add_ss(a, _mm_shuffle_ps(a, a, 1)));
+}
+#if defined(__AVX512F__)
+template <> GSPARC_INLINE float sum<float>(Vec<float> v) {
+    return sum_of(_mm256_add_ps(_mm512_castps512_ps256((__m512)v), _mm512_extractf32x8_ps((__m512)v, 1)));
+}
+#else
+template <> GSPARC_INLINE float sum<float>(Vec<float> v) { return sum_of((__m256)v); }
+#endif
+#endif
+
+// 1 / x to the last bit or two; x of normal size.
+template <class V> GSPARC_INLINE V reciprocal(V x) { return 1 / x; }
+#if defined(__AVX512F__)
+GSPARC_INLINE Vec<float> reciprocal(Vec<float> x) {
+    const Vec<float> r = (Vec<float>)_mm512_rcp14_ps((__m512)x);
+    return fma(r, fma(-x, r, splat(1.0f)), r);
+}
+#endif
+
 template <class S> GSPARC_INLINE Vec<S> lesser(Vec<S> a, Vec<S> b) { return select(at_most(a, b), a, b); }
 template <class S> GSPARC_INLINE Vec<S> greater(Vec<S> a, Vec<S> b) { return select(at_most(a, b), b, a); }
 

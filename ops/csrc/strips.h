@@ -20,12 +20,40 @@ template <class T> struct Buffer {
     T& operator[](int64_t i) { return data[i]; }
 };
 
-template <class S> struct GridTables {
-    Buffer<S> numbers;
-    Tables<S> tables;
+// A tile is a block of lanes: kStripRows rows of a strip by as many columns as there are lanes for.
+template <class S> constexpr int kTileColumns = Lanes<S>::n / kStripRows;
+template <class S> inline int tiles_across(int width) { return (width + kTileColumns<S> - 1) / kTileColumns<S>; }
 
-    explicit GridTables(const Lens<S>& lens) : numbers(table_size(lens)), tables(tables_at(lens, numbers.data)) {
-        fill_tables(lens, numbers.data);
+// Where every tile's lanes lie; a lane beyond the grid is NaN and passes no test.
+template <class S> struct TileTables {
+    static constexpr int n = Lanes<S>::n, columns = kTileColumns<S>;
+    const int tiles, strips;
+    Buffer<S> plain, across, along;  // across: cos, sin, column of (tiles, n); along: cos, sin, row of (strips, n)
+    const Tables<S> tables;
+
+    explicit TileTables(const Lens<S>& lens)
+        : tiles(tiles_across<S>(lens.width)), strips((lens.height + kStripRows - 1) / kStripRows), plain(table_size(lens)),
+          across(int64_t(3) * tiles * n), along(int64_t(3) * strips * n), tables(tables_at(lens, plain.data)) {
+        fill_tables(lens, plain.data);
+        for (int at = 0; at < tiles * n; ++at) {
+            const int column = at / n * columns + at % columns;
+            across[at] = tables.cos_column[column], across[tiles * n + at] = tables.sin_column[column];
+            across[2 * tiles * n + at] = tables.column[column];
+        }
+        for (int at = 0; at < strips * n; ++at) {
+            const int row = at / n * kStripRows + at % n / columns;
+            const bool real = row < lens.height;
+            along[at] = real ? tables.cos_row[row] : S(NAN), along[strips * n + at] = real ? tables.sin_row[row] : S(NAN);
+            along[2 * strips * n + at] = real ? S(row) : S(NAN);
+        }
+    }
+    GSPARC_INLINE void strip(int index, Place<S>& at) const {
+        const S* from = along.data + index * n;
+        at.cos_row = load(from), at.sin_row = load(from + strips * n), at.row = load(from + 2 * strips * n);
+    }
+    GSPARC_INLINE void tile(int index, Place<S>& at) const {
+        const S* from = across.data + index * n;
+        at.cos_column = load(from), at.sin_column = load(from + tiles * n), at.column = load(from + 2 * tiles * n);
     }
 };
 
@@ -37,6 +65,7 @@ template <class S> struct Strip {
     const S* records;
     const int64_t* slots;
 
+    Strip() = default;
     Strip(const PlanView<S>& plan, int height, int task) {
         pose = task / plan.strips, index = task % plan.strips;
         row0 = index * kStripRows;
@@ -48,21 +77,33 @@ template <class S> struct Strip {
     int64_t slot(int rank) const { return slots[rank] + index - boxes[rank].row0 / kStripRows; }
 };
 
-// Calls visit(offset into the strip's padded rows, tau1, tau2, form, inside) for each block a footprint touches.
+// Calls visit(tile, tau1, tau2, form, inside) for each tile of the strip that a footprint touches.
 template <class S, bool kTangent, class Visit>
-GSPARC_INLINE void each_block(const Strip<S>& strip, int rank, const Tables<S>& tables, const Lens<S>& lens, int stride, Visit&& visit) {
-    const Box box = strip.boxes[rank];
-    const S* record = strip.records + int64_t(rank) * kRecord;
-    const Runs runs = runs_of(box, lens.width);
-    const int begin = box.row0 > strip.row0 ? box.row0 : strip.row0, end = box.row1 < strip.row1 ? box.row1 : strip.row1;
-    for (int row = begin; row < end; ++row) {
-        const RowView<S, kTangent> view(record, row, tables, lens);
-        for (int run = 0; run < runs.count; ++run)
-            for (int column = runs.from[run]; column < runs.to[run]; column += Lanes<S>::n) {
-                Vec<S> tau1, tau2, form;
-                Mask<S> inside;
-                if (view.offsets(column, tau1, tau2, form, inside)) visit((row - strip.row0) * stride + column, tau1, tau2, form, inside);
-            }
+GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S>& grid, const Lens<S>& lens, Visit&& visit) {
+    const Runs runs = runs_of(strip.boxes[rank], lens.width);
+    Place<S> at;
+    grid.strip(strip.index, at);
+    const RowView<S, kTangent> view(strip.records + int64_t(rank) * kRecord, at, grid.tables, lens);
+    for (int run = 0; run < runs.count; ++run) {
+        const int last = (runs.to[run] - 1) / kTileColumns<S>;
+        for (int tile = runs.from[run] / kTileColumns<S>; tile <= last; ++tile) {
+            Vec<S> tau1, tau2, form;
+            Mask<S> inside;
+            grid.tile(tile, at);
+            if (view.offsets(at, tau1, tau2, form, inside)) visit(tile, tau1, tau2, form, inside);
+        }
+    }
+}
+
+// Calls visit(tile, lane, pixel, count) for each row of each tile: `count` neighbours from lane and pixel on.
+template <class S, class Visit> inline void each_stretch(const Strip<S>& strip, int width, Visit&& visit) {
+    constexpr int columns = kTileColumns<S>;
+    const int full = width / columns, rest = width % columns;
+    for (int row = strip.row0; row < strip.row1; ++row) {
+        const int lane = (row - strip.row0) * columns;
+        const int64_t pixel = int64_t(row) * width;
+        for (int tile = 0; tile < full; ++tile) visit(tile, lane, pixel + tile * columns, columns);
+        if (rest) visit(full, lane, pixel + full * columns, rest);
     }
 }
 
@@ -100,14 +141,12 @@ template <class S> struct Ranked {
     }
 };
 
-// Whether any pixel of the strip still sees through.
-template <class S> inline bool any_lit(const S* before, int size, S floor) {
-    for (int i = 0; i < size; i += Lanes<S>::n)
-        if (any(at_most(splat(floor), load(before + i)))) return true;
+// Whether any pixel of the strip still sees through; `before` every `step` numbers.
+template <class S> inline bool any_lit(const S* before, int tiles, int step, S floor) {
+    for (int i = 0; i < tiles; ++i)
+        if (any(at_most(splat(floor), load(before + int64_t(i) * step)))) return true;
     return false;
 }
-
-inline int padded(int width) { return (width + 2 * kLanes - 1) / kLanes * kLanes; }
 
 template <class S> inline void fill(S* to, int64_t size, S value) {
     for (int64_t i = 0; i < size; ++i) to[i] = value;

@@ -50,7 +50,7 @@ inline void mark_copy(const char* from, char* to, int64_t bytes, int threads) {
 
 // Pixel-Gaussian pairs inside the exact footprints of a plan: the exponentials that no renderer can avoid.
 template <class S> int64_t mark_pairs(const PlanView<S>& plan, const Lens<S>& lens, int threads) {
-    const GridTables<S> grid(lens);
+    const TileTables<S> grid(lens);
     const int tasks = plan.poses * plan.strips;
     Buffer<int64_t> counts(tasks);
     auto run = [&](int task, int) {
@@ -58,8 +58,8 @@ template <class S> int64_t mark_pairs(const PlanView<S>& plan, const Lens<S>& le
         for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
             Vec<S> found = splat(S(0));
             const auto count = [&](int, Vec<S>, Vec<S>, Vec<S>, Mask<S> inside) { found += select(inside, splat(S(1)), splat(S(0))); };
-            if (lens.tangent) each_block<S, true>(strip, *entry, grid.tables, lens, padded(lens.width), count);
-            else each_block<S, false>(strip, *entry, grid.tables, lens, padded(lens.width), count);
+            if (lens.tangent) each_tile<S, true>(strip, *entry, grid, lens, count);
+            else each_tile<S, false>(strip, *entry, grid, lens, count);
             counts[task] += int64_t(sum<S>(found));
         }
     };

@@ -22,6 +22,7 @@ template <class S> GSPARC_INLINE S sum(S x) { return x; }
 template <class S> GSPARC_INLINE S lesser(S a, S b) { return a <= b ? a : b; }
 GSPARC_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 GSPARC_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
+template <class S> GSPARC_INLINE S reciprocal(S x) { return S(1) / x; }
 GSPARC_INLINE float nearest(float x) { return rintf(x); }
 GSPARC_INLINE double nearest(double x) { return rint(x); }
 #ifdef __CUDA_ARCH__

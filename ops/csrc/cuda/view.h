@@ -97,10 +97,10 @@ template <class S, bool kTangent> struct Pixel {
     }
     // Standardised offsets of this pixel from the footprint of a record, and whether it lies inside.
     GSPARC_HD bool offsets(const S* record, const Lens<S>& lens, S& tau1, S& tau2, S& form) const {
-        const Tables<S> mine = {&cos_column, &sin_column, &number, &cos_row, &sin_row, turn, per_turn};
+        const Tables<S> circle = {nullptr, nullptr, nullptr, nullptr, nullptr, turn, per_turn};
+        const Place<S> here = {cos_row, sin_row, S(row), cos_column, sin_column, number};
         bool inside;
-        // `tangent` reads the row's numbers, of which this pixel has its own; `equirect` the row itself.
-        return RowView<S, kTangent>(record, kTangent ? 0 : row, mine, lens).offsets(0, tau1, tau2, form, inside) && real;
+        return RowView<S, kTangent>(record, here, circle, lens).offsets(here, tau1, tau2, form, inside) && real;
     }
     GSPARC_HD int64_t place(const Lens<S>& lens) const { return int64_t(row) * lens.width + column; }
 };
