@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+import signal
+
+import lightning.pytorch as L
+import pytest
+import torch
+from campaigns import brief, compose, spectra
+
+from gsparc import checkpoint
+from gsparc.data.load import load, split_for
+from gsparc.registry import build
+from gsparc.trainer import TrainerSettings, Training
+
+
+class Interrupt(L.Callback):
+    """Presses Ctrl-C in the middle of a step, `times` times."""
+
+    def __init__(self, step: int, times: int = 1) -> None:
+        self.step, self.times = step, times
+
+    def on_train_batch_start(self, trainer, *unused):
+        if trainer.global_step == self.step:
+            for _ in range(self.times):
+                signal.raise_signal(signal.SIGINT)
+
+
+def run(tmp_path, *callbacks, resume=None, steps: int = 20):
+    file = spectra(tmp_path / "own.npz")
+    method = build(compose(*brief(file, "model.refit=false")).model)
+    settings = TrainerSettings(max_steps=steps, batch_size=8, checkpoint_every=5)
+    method.training = Training(settings, callbacks=lambda: list(callbacks), resume=resume)
+    data = load({"name": "own", "file": str(file)})
+    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path / "run")
+    return method.fitted().state_dict()
+
+
+def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(tmp_path):
+    torch.set_num_threads(1)
+    before = signal.getsignal(signal.SIGINT)
+    last = tmp_path / "run" / "last.ckpt"
+    with pytest.raises(KeyboardInterrupt, match=f"go on with ckpt_path={last}"):
+        run(tmp_path, Interrupt(7))
+    assert signal.getsignal(signal.SIGINT) is before
+    assert checkpoint.read(last).extra["trainer"]["global_step"] == 8
+    resumed = run(tmp_path, resume=last)
+    whole = run(tmp_path)
+    assert all(torch.equal(whole[key], resumed[key]) for key in whole)
+
+
+def test_a_second_interrupt_does_not_wait(tmp_path):
+    with pytest.raises(KeyboardInterrupt, match="go on with"):
+        run(tmp_path, Interrupt(7, times=2))
+    assert checkpoint.read(tmp_path / "run" / "last.ckpt").extra["trainer"]["global_step"] == 5
+
+
+def test_an_impatient_interrupt_at_the_start_has_nothing_to_go_on_from(tmp_path):
+    with pytest.raises(KeyboardInterrupt, match="there is no checkpoint yet"):
+        run(tmp_path, Interrupt(0, times=2))
+
+
+def test_a_prime_number_of_steps_ends_exactly(tmp_path):
+    """Steps end a run, whatever epochs, validations and checkpoints say."""
+    steps = []
+
+    class Count(L.Callback):
+        def on_train_batch_end(self, trainer, *unused):
+            steps.append(trainer.global_step)
+
+    run(tmp_path, Count(), steps=13)
+    assert steps == list(range(1, 14))
