@@ -6,7 +6,7 @@ RUN := $(VENV)/bin/python
 SOURCES := $(wildcard ops/csrc/* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-slow bench lint typecheck format clean
+.PHONY: help setup cuda demo test test-slow bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -36,6 +36,9 @@ test-slow: setup ## slow tests: whole training runs, kills, sanitizers
 
 bench: setup ## timings of the kernels as ratios
 	$(RUN) -m gsparc.bench
+
+cuda: setup ## build the CUDA kernels for this machine's GPU (otherwise done when first used)
+	$(RUN) -P -c 'from gsparc.ops import backends; backends.named("cuda")'
 
 lint: setup ## ruff and mypy
 	$(RUN) -m ruff check .

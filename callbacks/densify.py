@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import Any
 
 import lightning.pytorch as L
@@ -55,7 +56,8 @@ class Densify(L.Callback):
 
     def _blank(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)
-        return {key: torch.zeros(count) for key in ("gradient", "seen", "radius")}
+        device = model.gaussians.means.device
+        return {key: torch.zeros(count, device=device) for key in ("gradient", "seen", "radius")}
 
     def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
@@ -113,7 +115,7 @@ class Densify(L.Callback):
         scales = torch.cat(
             [
                 field.log_scales[clones],
-                field.log_scales[splits] - torch.log(torch.tensor(0.8 * self.children)),
+                field.log_scales[splits] - math.log(0.8 * self.children),
             ]
         )
         spread = _sample_inside(field.scales[splits], field.quats[splits], generator)
@@ -155,7 +157,7 @@ def _sample_inside(scales: Tensor, quats: Tensor, generator: torch.Generator) ->
     """Offsets (M, 3) [m] drawn from Gaussians with the given scales (M, 3) and rotations (M, 4)."""
     w, *v = torch.nn.functional.normalize(quats, dim=-1).unbind(-1)
     axis = torch.stack(v, -1)
-    local = torch.randn(scales.shape, generator=generator) * scales
+    local = torch.randn(scales.shape, generator=generator).to(scales) * scales
     # Rotating by a unit quaternion: x + 2 w (v x x) + 2 v x (v x x).
     turned = torch.linalg.cross(axis, local)
     return local + 2 * w.unsqueeze(-1) * turned + 2 * torch.linalg.cross(axis, turned)

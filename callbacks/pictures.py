@@ -35,11 +35,11 @@ class Pictures(L.Callback):
         candidates = data.fold.val if len(data.fold.val) else data.fold.train
         rows = candidates[np.linspace(0, len(candidates) - 1, min(self.count, len(candidates))).astype(int)]
         with CostLedger.paused_in(trainer), torch.no_grad():
-            batch = data.measurements.batch(rows)
+            batch = data.measurements.batch(rows).to(module.device)
             predicted = module.model(batch.tx, batch.rx).mean
             title = f"step {step}, {module.train_seconds:.0f} s of training"
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
-            draw_spectra(batch.target.numpy(), predicted.numpy(), rows, title, path)
+            draw_spectra(batch.target.cpu().numpy(), predicted.cpu().numpy(), rows, title, path)
 
 
 def draw_spectra(target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, title: str, path: Path) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.ops.networks import networks
 
 EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities
 
@@ -78,12 +79,7 @@ class Emission(nn.Module):
             count, width, channels = self.weight2.shape
             flat = self.weight2.permute(1, 0, 2).reshape(width, count * channels)
             return (encoded @ flat).view(len(encoded), count, channels) + self.bias2
-        count, width, hidden = self.weight1.shape
-        # One product for all Gaussians: the encoded position is the same for each of them.
-        flat = self.weight1.permute(1, 0, 2).reshape(width, count * hidden)
-        inner = (encoded @ flat).view(len(encoded), count, hidden)
-        inner = torch.relu(inner + self.bias1)
-        return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
+        return networks(encoded, self.weight1, self.bias1, self.weight2, self.bias2)
 
     def forward(self, position: Tensor, distance: Tensor) -> Tensor:
         """Emission (B, N, C) at position (B, 3) [m]; distance (B, N) is d_i / d_ref, without unit (eq. 1)."""

@@ -77,7 +77,7 @@ def apply(
                 moment = state[key]
                 state[key] = torch.cat([moment[edit.keep], torch.zeros_like(added, dtype=moment.dtype)])
             optimizer.state[new] = state
-    fresh = gaussians.next_id + torch.arange(len(edit.parents))
+    fresh = gaussians.next_id + torch.arange(len(edit.parents), device=gaussians.ids.device)
     gaussians.ids = torch.cat([gaussians.ids[edit.keep], fresh])
     gaussians.next_id += len(edit.parents)
     gaussians.version += 1

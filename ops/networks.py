@@ -34,7 +34,9 @@ def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     """The same as matrix products; the definition of truth."""
     count, width, hidden = weight1.shape
     # One product for all Gaussians: the encoded position is the same for each of them.
-    inner = (encoded @ weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(-1, count, hidden)
+    inner = (encoded @ weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(
+        len(encoded), count, hidden
+    )
     return torch.einsum("bnh,nhc->bnc", torch.relu(inner + bias1), weight2) + bias2
 
 

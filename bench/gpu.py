@@ -1,0 +1,157 @@
+"""Stages of bench/gpu.sh: `python bench/gpu.py STAGE [FILE]`; figures go into one JSON file."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import logging
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import measure
+import torch
+
+LOG = logging.getLogger("gpu")
+
+
+def update(file: Path, **sections: Any) -> None:
+    """Merge sections into the JSON file."""
+    known = json.loads(file.read_text()) if file.exists() else {}
+    file.write_text(json.dumps(known | sections, indent=1))
+    LOG.info("%s", json.dumps(sections))
+
+
+def guarded(section: Callable[[], Any]) -> Any:
+    """What a section measured, or its error: one failure must not cost the others."""
+    try:
+        return section()
+    except Exception as error:
+        LOG.error("%s", traceback.format_exc())
+        return {"error": f"{type(error).__name__}: {error}"}
+
+
+def machine() -> dict[str, Any]:
+    """GPU, driver, versions, commit, date."""
+    asked = "--query-gpu=name,driver_version,clocks.sm,clocks.mem"
+    told = subprocess.run(["nvidia-smi", asked, "--format=csv,noheader"], capture_output=True, text=True)
+    commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
+    return {
+        "gpu": torch.cuda.get_device_name(),
+        "driver": told.stdout.strip(),
+        "capability": ".".join(map(str, torch.cuda.get_device_capability())),
+        "torch": torch.__version__,
+        "cuda": torch.version.cuda,
+        "commit": commit.stdout.strip() or os.environ.get("GSPARC_COMMIT", "unknown"),
+        "date": datetime.date.today().isoformat(),
+    }
+
+
+def build(file: Path) -> None:
+    """Compile the library anew and say how long it took."""
+    from gsparc.ops import cuda_library
+
+    path = cuda_library.library_path(cuda_library.architecture())
+    path.unlink(missing_ok=True)
+    started = time.perf_counter()
+    cuda_library.load()
+    update(file, machine=guarded(machine), build_s=round(time.perf_counter() - started, 1))
+
+
+def bench(file: Path) -> None:
+    """Ceilings, kernels, end-to-end queries, frozen batches."""
+    update(file, machine=guarded(machine))
+    ceilings = measure.ceilings()
+    update(file, ceilings=ceilings)
+    for count in (1_000, 10_000, 62_000):
+        update(file, **{f"n{count}": guarded(lambda count=count: measure.pipeline(count, ceilings))})
+    update(file, batch=guarded(lambda: measure.many_poses(10_000, 16, ceilings)))
+    update(file, frozen=guarded(lambda: measure.frozen(2_000, 4_096, ceilings)))
+    update(file, emission=guarded(lambda: measure.emission(62_000, 16, ceilings)))
+
+
+def short() -> None:
+    """Each kernel once on a small scene: what compute-sanitizer watches."""
+    measure.touch_everything()
+    LOG.info("every kernel ran")
+
+
+def train(file: Path) -> None:
+    """The same short training on the CPU and on the GPU, through train.py."""
+    results: dict[str, Any] = {}
+    for accelerator in ("gpu", "cpu"):
+        folder = Path("build") / f"train-{accelerator}"
+        command = [sys.executable, "-P", "train.py", "experiment=demo"]
+        command += [f"trainer.accelerator={accelerator}", f"hydra.run.dir={folder}"]
+        command += ["baselines=[zero,mean,nearest]", "dataset.root=build/stand-ins"]
+        command += ["model.effects.array=false", "model.effects.phase=false"]  # the splatted field
+        started = time.perf_counter()
+        done = subprocess.run(command, capture_output=True, text=True, timeout=190)
+        results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": done.returncode}
+        summary = folder / "summary.json"
+        if done.returncode == 0 and summary.exists():
+            facts = json.loads(summary.read_text())
+            wanted = ("test/", "time/", "model/", "baseline/nearest/test", "baseline/nearest/ssim")
+            results[accelerator] |= {k: v for k, v in facts.items() if k.startswith(wanted)}
+        else:
+            results[accelerator]["error"] = (done.stderr or done.stdout)[-1500:]
+        update(file, train=results)
+    update(file, train=results, learning=guarded(lambda: measure.learning(200)))
+    if any(result["exit"] for result in results.values()):
+        raise SystemExit(1)
+
+
+def table(file: Path) -> None:
+    """The JSON as a page of Markdown on standard output."""
+    facts = json.loads(file.read_text())
+    named = facts.get("machine", {})
+    lines = [f"# CUDA on {named.get('gpu', 'an unknown GPU')}", ""]
+    lines += [f"- {key}: {value}" for key, value in named.items() if key != "gpu"]
+    for title, section in facts.items():
+        if title == "machine":
+            continue
+        lines += ["", f"## {title}", ""]
+        if not isinstance(section, dict):
+            lines.append(f"{section}")
+            continue
+        lines += ["| | |", "|---|---|"]
+        for key, value in flat(section):
+            lines.append(f"| {key} | {value} |")
+    sys.stdout.write("\n".join(lines) + "\n")
+
+
+def flat(section: dict[str, Any], before: str = "") -> list[tuple[str, Any]]:
+    """Nested keys joined by dots, numbers to four digits."""
+    rows: list[tuple[str, Any]] = []
+    for key, value in section.items():
+        if isinstance(value, dict):
+            rows += flat(value, f"{before}{key}.")
+        else:
+            shown = f"{value:.4g}" if isinstance(value, float) else str(value).replace("\n", " ")[:300]
+            rows.append((before + key, shown))
+    return rows
+
+
+def note(file: Path, name: str, status: str, seconds: str) -> None:
+    """How a stage ended."""
+    known = json.loads(file.read_text()) if file.exists() else {}
+    stages = known.get("stages", {}) | {name: {"exit": int(status), "seconds": int(seconds)}}
+    log = file.parent / f"{name}.log"
+    if log.exists() and name in ("tests", "sanitize"):
+        lines = log.read_text(errors="replace").splitlines()
+        kept = [line for line in lines if "passed" in line or "failed" in line or "SUMMARY" in line]
+        stages[name]["said"] = kept[-6:]
+    file.write_text(json.dumps(known | {"stages": stages}, indent=1))
+
+
+STAGES = {"build": build, "bench": bench, "short": short, "train": train, "table": table, "note": note}
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    stage, *arguments = sys.argv[1:]
+    STAGES[stage](*(Path(a) if a.endswith(".json") else a for a in arguments))

@@ -1,0 +1,362 @@
+"""What the stages of gpu.py measure: synchronised events, warm, medians; ratios to what the device can do."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import (
+    Pose,
+    SphereGrid,
+    composite,
+    freeze,
+    make_plan,
+    mean_weights,
+    native,
+    networks,
+    rasterize,
+)
+
+GRID = SphereGrid.hemisphere()
+Model = tuple[Tensor, Tensor, Tensor, Tensor]
+
+# Floating-point operations of one pixel inside one footprint, read off csrc/pixels.h and csrc/layer.h.
+FORWARD_FLOPS, PER_CHANNEL = 42, 2
+BACKWARD_FLOPS = 120
+
+
+def scene(count: int, seed: int = 0) -> Model:
+    """A field as training starts with it: over the upper hemisphere, footprints as wide as their spacing."""
+    draw = torch.Generator().manual_seed(seed)
+    step = torch.arange(count) + 0.5
+    height, azimuth = step / count, torch.pi * (1 + 5**0.5) * step
+    horizontal = (1 - height**2).sqrt()
+    distance = 1 + 5 * torch.rand(count, 1, generator=draw)
+    means = distance * torch.stack([horizontal * azimuth.cos(), horizontal * azimuth.sin(), height], -1)
+    scales = distance * (2 * torch.pi / count) ** 0.5 * (0.5 + torch.rand(count, 3, generator=draw))
+    quats = torch.randn(count, 4, generator=draw)
+    opacities = 0.1 + 0.4 * torch.rand(count, generator=draw)
+    return means.cuda(), quats.cuda(), scales.cuda(), opacities.cuda()
+
+
+def origin(count: int = 0) -> Pose:
+    """The pose at the origin, or `count` poses around it."""
+    if count == 0:
+        return Pose.identity(torch.zeros(3)).to("cuda")
+    return Pose.identity(0.3 * torch.randn(count, 3, generator=torch.Generator().manual_seed(1))).to("cuda")
+
+
+def event_ms(function: Callable[[], Any], rounds: int = 30, inner: int = 1) -> dict[str, float]:
+    """Milliseconds of `function` between device events, over rounds of `inner` calls."""
+    for _ in range(3):
+        function()
+    times = []
+    for _ in range(rounds):
+        first, last = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        first.record()
+        for _ in range(inner):
+            function()
+        last.record()
+        last.synchronize()
+        times.append(first.elapsed_time(last) / inner)
+    return spread(times)
+
+
+def spread(times: list[float]) -> dict[str, float]:
+    """Median and 95th percentile."""
+    times = sorted(times)
+    return {"p50": statistics.median(times), "p95": times[int(0.95 * (len(times) - 1))]}
+
+
+def wall_ms(function: Callable[[], Any], rounds: int = 60) -> dict[str, float]:
+    """Milliseconds from call to finished result, as a caller sees them."""
+    for _ in range(5):
+        function()
+    times = []
+    for _ in range(rounds):
+        torch.cuda.synchronize()
+        started = time.perf_counter()
+        function()
+        torch.cuda.synchronize()
+        times.append(1e3 * (time.perf_counter() - started))
+    return spread(times)
+
+
+def graph_of(function: Callable[[], Any], inner: int = 1) -> torch.cuda.CUDAGraph:
+    """`inner` calls as one captured graph."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side), torch.no_grad():
+        for _ in range(2):
+            function()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph), torch.no_grad():
+        kept = [function() for _ in range(inner)]
+    del kept
+    return graph
+
+
+def kernel_ms(function: Callable[[], Any], inner: int = 10) -> dict[str, float]:
+    """Milliseconds of the kernels alone: replays of a graph that holds several calls."""
+    graph = graph_of(function, inner)
+    times = event_ms(graph.replay)
+    return {key: value / inner for key, value in times.items()}
+
+
+def ceilings() -> dict[str, float]:
+    """What this device does at best: copy bandwidth, float32 arithmetic, and a launch that does nothing."""
+    big = torch.randn(512 * 2**20, device="cuda")
+    other = torch.empty_like(big)
+    copy = event_ms(partial(other.copy_, big))["p50"]
+    del big, other
+    torch.backends.cuda.matmul.allow_tf32 = False
+    a, b = (torch.randn(8192, 8192, device="cuda") for _ in range(2))
+    product = event_ms(lambda: a @ b, rounds=8)["p50"]
+    one = torch.zeros(1, device="cuda")
+    return {
+        "copy_tb_s": 2 * 4 * 512 * 2**20 / copy / 1e9,
+        "float32_tflop_s": 2 * 8192**3 / product / 1e9,
+        "empty_launch_ms": kernel_ms(lambda: one.add_(1), inner=20)["p50"],
+    }
+
+
+def compared(
+    times: dict[str, float], bytes_: float, flops: float, limits: dict[str, float]
+) -> dict[str, float]:
+    """Times beside the least the device needs for so many bytes and operations."""
+    floor = max(bytes_ / limits["copy_tb_s"], flops / limits["float32_tflop_s"]) / 1e9
+    launch = limits["empty_launch_ms"]
+    ratio = times["p50"] / floor
+    return times | {
+        "floor_ms": floor,
+        "ratio": ratio,
+        "ratio_with_one_launch": times["p50"] / (floor + launch),
+    }
+
+
+def counted_pairs(model: Model, pose: Pose) -> tuple[int, int]:
+    """(pixel, Gaussian) pairs that are lit and inside, and entries of the plan."""
+    view = freeze(make_plan(*model, pose, GRID), *model, version=0)
+    return int((view.buffers[3] > 0).sum()), len(view.buffers[2])
+
+
+def pipeline(count: int, limits: dict[str, float]) -> dict[str, Any]:
+    """One static receiver, one real channel: kernels alone and from call to result."""
+    model, pose, features = scene(count), origin(), torch.rand(count, 1, device="cuda")
+    pairs, entries = counted_pairs(model, pose)
+    plan = make_plan(*model, pose, GRID)
+    pixels = GRID.height * GRID.width
+    image_bytes, model_bytes = 8 * pixels, 4 * count * 12
+    found: dict[str, Any] = {"pairs": pairs, "entries": entries, "pairs_per_pixel": pairs / pixels}
+
+    forward = lambda: composite(plan, *model, features)  # noqa: E731
+    flops = pairs * (FORWARD_FLOPS + PER_CHANNEL)
+    found["plan"] = compared(
+        kernel_ms(lambda: make_plan(*model, pose, GRID)), 4 * count * (11 + 21), 0, limits
+    )
+    found["forward"] = compared(kernel_ms(forward), model_bytes + image_bytes, flops, limits)
+    found["plan_and_forward"] = kernel_ms(lambda: rasterize(*model, features, pose, GRID))
+    backward = backward_of(plan, model, features[None])
+    moved = 2 * model_bytes + 3 * image_bytes
+    found["backward"] = compared(kernel_ms(backward), moved, pairs * BACKWARD_FLOPS, limits)
+    view = freeze(plan, *model, version=0)
+    found["frozen_query"] = compared(
+        kernel_ms(lambda: view.render(features, 0)), 4 * pairs, 2 * pairs, limits
+    )
+
+    leaves = [tensor.clone().requires_grad_() for tensor in (*model, features)]
+    upstream = torch.randn(1, 1, GRID.height, GRID.width, device="cuda")
+
+    def step() -> None:
+        rasterize(*leaves, pose, GRID).image.backward(upstream)
+
+    with torch.no_grad():
+        found["end_to_end_forward"] = wall_ms(lambda: rasterize(*model, features, pose, GRID))
+        found["end_to_end_frozen"] = wall_ms(lambda: view.render(features, 0))
+        replay = graph_of(lambda: rasterize(*model, features, pose, GRID))
+        found["end_to_end_graph"] = wall_ms(replay.replay)
+    found["end_to_end_forward_backward"] = wall_ms(step)
+    found["kernels_us"] = by_kernel(step)
+    return found
+
+
+def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
+    """The backward operator alone, for an upstream gradient of noise."""
+    raster = composite(plan, *model, features)
+    numbers = native._numbers(plan.grid, plan.optics)
+    upstream = torch.randn_like(raster.image)
+    inputs = (upstream, None, raster.image, raster.transmittance, *model, None, features)
+    place = (plan.pose.position, plan.pose.rotation, list(plan.buffers))
+    return lambda: native.composite_backward_op(*inputs, *place, *numbers)
+
+
+def by_kernel(function: Callable[[], Any]) -> dict[str, float]:
+    """Microseconds of each kernel in one call, the largest first."""
+    from torch.profiler import ProfilerActivity, profile
+
+    function()
+    with profile(activities=[ProfilerActivity.CUDA]) as seen:
+        for _ in range(5):
+            function()
+        torch.cuda.synchronize()
+    rows = [(e.key.split("(")[0][-60:], e.device_time_total / 5) for e in seen.key_averages()]
+    return {name: round(us, 1) for name, us in sorted(rows, key=lambda row: -row[1])[:14] if us > 0}
+
+
+def many_poses(count: int, poses: int, limits: dict[str, float]) -> dict[str, Any]:
+    """A training batch of a moving receiver, and of a static one with as many samples."""
+    model, several = scene(count), origin(poses)
+    features = torch.rand(poses, count, 1, device="cuda")
+    pairs = sum(
+        counted_pairs(model, Pose(p, r))[0] for p, r in zip(several.position, several.rotation, strict=True)
+    )
+    image_bytes = 4 * poses * GRID.height * GRID.width
+    plan = make_plan(*model, several, GRID)
+    still = make_plan(*model, origin(), GRID)
+    forward = kernel_ms(lambda: composite(plan, *model, features), inner=3)
+    shared = kernel_ms(lambda: composite(still, *model, features), inner=3)
+    pairs_shared = counted_pairs(model, origin())[0]
+    moved = 48 * count * poses + 2 * image_bytes
+    flops, flops_shared = pairs * (FORWARD_FLOPS + 2), pairs_shared * (FORWARD_FLOPS + 2 * poses)
+    return {
+        "plan": kernel_ms(lambda: make_plan(*model, several, GRID), inner=3),
+        "forward": compared(forward, moved, flops, limits),
+        "forward_shared_pose": compared(shared, 48 * count + image_bytes, flops_shared, limits),
+        "weights": kernel_ms(lambda: mean_weights(plan, *model), inner=3),
+        "backward_shared_pose": kernel_ms(backward_of(still, model, features), inner=3),
+    }
+
+
+def frozen(count: int, batch: int, limits: dict[str, float]) -> dict[str, Any]:
+    """Spectra per second of a static receiver, our kernel beside the vendor's products."""
+    model, pose = scene(count), origin()
+    view = freeze(make_plan(*model, pose, GRID), *model, version=0)
+    features = torch.rand(batch, count, 1, device="cuda")
+    with torch.no_grad():
+        ours = event_ms(lambda: view.render(features, 0), rounds=15)["p50"]
+        dense = view.render(torch.eye(count, device="cuda").unsqueeze(-1), 0).flatten(1)
+        flat = features.squeeze(-1)
+        want, got = flat @ dense, view.render(features, 0).flatten(1)
+        vendor = event_ms(lambda: flat @ dense, rounds=10)["p50"]
+        torch.backends.cuda.matmul.allow_tf32 = True
+        vendor_tf32 = event_ms(lambda: flat @ dense, rounds=10)["p50"]
+        torch.backends.cuda.matmul.allow_tf32 = False
+        sparse = dense.mT.contiguous().to_sparse_csr()
+        columns = flat.mT.contiguous()
+        vendor_sparse = event_ms(lambda: sparse @ columns, rounds=5)["p50"]
+        del want
+        found = {
+            "gaussians": count,
+            "batch": batch,
+            "share_of_weights_not_zero": float((dense != 0).float().mean()),
+            "spectra_per_s": 1e3 * batch / ours,
+            "spectra_per_s_dense_float32": 1e3 * batch / vendor,
+            "spectra_per_s_dense_tf32": 1e3 * batch / vendor_tf32,
+            "spectra_per_s_sparse_csr": 1e3 * batch / vendor_sparse,
+            "error_to_dense": float((got - flat @ dense).abs().max()),
+            "bytes_written_floor_ms": 4 * batch * GRID.height * GRID.width / limits["copy_tb_s"] / 1e9,
+        }
+        found |= with_networks(view, model, batch)
+    return found
+
+
+def with_networks(view: Any, model: Model, batch: int) -> dict[str, float]:
+    """The same from positions: encoding, networks (33-32-1), attenuation, image."""
+    count = len(model[0])
+    weights = [
+        torch.randn(shape, device="cuda")
+        for shape in ((count, 33, 32), (count, 32), (count, 32, 1), (count, 1))
+    ]
+    places, axes = torch.randn(batch, 3, device="cuda"), torch.randn(3, 15, device="cuda")
+
+    def answer() -> Tensor:
+        waves = places @ axes
+        encoded = torch.cat([places, waves.sin(), waves.cos()], -1)
+        distance = torch.cdist(places, model[0]).unsqueeze(-1)
+        return view.render(torch.sigmoid(networks.networks(encoded, *weights) - distance.log()) / distance, 0)
+
+    whole = event_ms(answer, rounds=10)["p50"]
+    return {"spectra_per_s_with_networks": 1e3 * batch / whole}
+
+
+def emission(count: int, batch: int, limits: dict[str, float]) -> dict[str, Any]:
+    """The emission networks alone (33-32-2), ours beside matrix products."""
+    weights = [
+        torch.randn(shape, device="cuda")
+        for shape in ((count, 33, 32), (count, 32), (count, 32, 2), (count, 2))
+    ]
+    found = {}
+    for samples in (1, batch):
+        encoded = torch.randn(samples, 33, device="cuda")
+        flops = 2 * samples * count * (33 * 32 + 64)
+        bytes_ = 4 * sum(w.numel() for w in weights) + 8 * samples * count
+        ours = kernel_ms(lambda encoded=encoded: networks.networks(encoded, *weights), inner=2)
+        found[f"batch{samples}"] = compared(ours, bytes_, flops, limits)
+        theirs = event_ms(lambda encoded=encoded: networks.products(encoded, *weights), rounds=10)
+        found[f"batch{samples}_matrix_products"] = theirs
+    leaves = [weight.requires_grad_() for weight in weights]
+    encoded = torch.randn(batch, 33, device="cuda")
+    for name, function in (("ours", networks.networks), ("matrix_products", networks.products)):
+        out = function(encoded, *leaves)
+        slope = torch.randn_like(out)
+        grads = lambda out=out, slope=slope: torch.autograd.grad(out, leaves, slope, retain_graph=True)  # noqa: E731
+        found[f"backward_{name}"] = event_ms(grads, rounds=10)
+    return found
+
+
+def touch_everything() -> None:
+    """Run every kernel once, both projections, one and several poses, few and many channels."""
+    model = scene(300)
+    grid = SphereGrid.hemisphere(13, 45)
+    for projection in ("tangent", "equirect"):
+        for pose, samples, channels in ((origin(), 1, 1), (origin(), 3, 7), (origin(2), 2, 3)):
+            leaves = [tensor.clone().requires_grad_() for tensor in model]
+            features = torch.rand(samples, 300, channels, device="cuda", requires_grad=True)
+            ids = torch.randperm(300, device="cuda")
+            raster = rasterize(*leaves, features, pose, grid, projection=projection, ids=ids)
+            plan = make_plan(*leaves, pose, grid, projection=projection)
+            seen = mean_weights(plan, *leaves)
+            (raster.image.sum() + raster.transmittance.sum() + seen.mean.sum() + seen.share.sum()).backward()
+        view = freeze(make_plan(*model, origin(), grid, projection=projection), *model, version=0)
+        view.render(torch.rand(300, 2, device="cuda"), 0)
+        view.render(torch.rand(40, 300, 1, device="cuda"), 0)
+    shapes = ((300, 19, 24), (300, 24), (300, 24, 2), (300, 2))
+    weights = [torch.randn(shape, device="cuda", requires_grad=True) for shape in shapes]
+    for samples in (1, 21):
+        networks.networks(torch.rand(samples, 19, device="cuda"), *weights).sum().backward()
+    torch.cuda.synchronize()
+
+
+def learning(steps: int) -> dict[str, Any]:
+    """The same gradient descent on the CPU and on the GPU from the same start: losses side by side."""
+    target_model, pose = scene(400, seed=3), origin()
+    features = torch.rand(6, 400, 1, device="cuda")
+    target = rasterize(*target_model, features, pose, GRID).image.detach()
+    found: dict[str, Any] = {}
+    for device in ("cpu", "cuda"):
+        start = [tensor.to(device) for tensor in scene(300, seed=4)]
+        means, quats, log_scales, logits = start[0], start[1], start[2].log(), torch.logit(start[3])
+        emitted = torch.zeros(6, 300, 1, device=device)
+        leaves = [t.clone().requires_grad_() for t in (means, quats, log_scales, logits, emitted)]
+        optimizer = torch.optim.Adam(leaves, lr=0.01)
+        there, wanted = pose.to(device), target.to(device)
+        losses, started = [], time.perf_counter()
+        for _ in range(steps):
+            m, q, s, o, f = leaves
+            image = rasterize(m, q, s.exp(), torch.sigmoid(o), torch.sigmoid(f), there, GRID).image
+            loss = (image - wanted).square().mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            losses.append(loss.detach())
+        ends = [float(losses[0]), float(losses[-1])]
+        found[device] = {"first": ends[0], "last": ends[1], "seconds": time.perf_counter() - started}
+    found["last_loss_ratio"] = found["cuda"]["last"] / found["cpu"]["last"]
+    return found

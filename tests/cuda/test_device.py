@@ -1,0 +1,144 @@
+"""On a GPU: tensors that live there, streams, captured graphs, repeatability, and the model."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from rasters import GRIDS, assert_close, poses, random_scene, render
+
+from gsparc.ops import Pose, cuda_library, freeze, make_plan, mean_weights, networks, rasterize
+
+REASON = cuda_library.missing_device()
+pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
+GRID = GRIDS["hemisphere"]
+
+
+def there(count: int = 0, n: int = 60, **kind):
+    """A scene, its Gaussians as `rasterize` takes them, and poses, all on the GPU in float32."""
+    scene = random_scene(n=n, **kind).to(torch.float32)
+    scene = type(scene)(**{k: None if v is None else v.cuda() for k, v in vars(scene).items()})
+    return scene, (scene.means, scene.quats, scene.scales, scene.opacities), poses(count).to("cuda")
+
+
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+@pytest.mark.parametrize("count", [0, 3])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_tensors_on_the_gpu_go_through_its_kernels(projection, count, dtype):
+    scene = random_scene(hides=True, seed=count)
+    want = render(scene, poses(count), GRID, "reference", projection=projection)
+    moved = type(scene)(**{k: None if v is None else v.cuda() for k, v in vars(scene.to(dtype)).items()})
+    got = render_there(moved, poses(count).to("cuda"), projection)
+    assert_close(got, want, 1e-9 if dtype == torch.float64 else 1e-4)
+
+
+def render_there(scene, pose: Pose, projection: str) -> dict[str, torch.Tensor]:
+    """`render` with the same upstream gradients for tensors on the GPU."""
+    names = ["means", "quats", "scales", "opacities", "features", "extinctions"]
+    leaves = {name: getattr(scene, name).clone().requires_grad_() for name in names}
+    model, hidden = [leaves[name] for name in names[:4]], leaves["extinctions"]
+    raster = rasterize(*model, leaves["features"], pose, GRID, extinctions=hidden, projection=projection)
+    assert raster.image.is_cuda
+    draw = torch.Generator().manual_seed(5)
+    loss = 0.0
+    for output in (raster.image, raster.transmittance):
+        noise = torch.randn(output.shape, generator=draw, dtype=torch.float64)
+        loss = loss + (output * noise.to(output)).sum()
+    loss.backward()
+    out = {f"d_{name}": leaf.grad.cpu() for name, leaf in leaves.items()}
+    out |= {"image": raster.image.detach().cpu(), "transmittance": raster.transmittance.detach().cpu()}
+    return out | {"d_means2d": raster.means2d.grad.cpu()}
+
+
+def test_twice_is_bit_identical():
+    scene, model, pose = there(3, n=2000)
+    runs = []
+    for _ in range(2):
+        leaves = [tensor.clone().requires_grad_() for tensor in (*model, scene.features)]
+        raster = rasterize(*leaves, pose, GRID)
+        (raster.image.square().sum() + raster.transmittance.sum()).backward()
+        runs.append([raster.image, *(leaf.grad for leaf in leaves)])
+    assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+def test_work_is_on_the_current_stream():
+    """A slow product is queued first; the raster reads what it makes, on the same side stream."""
+    scene, model, pose = there()
+    want = rasterize(*model, scene.features, pose, GRID).image
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        big = torch.randn(4096, 4096, device="cuda")
+        for _ in range(20):
+            big = (big @ big).clamp(-1, 1)
+        features = scene.features + 0 * big.sum()
+        got = rasterize(*model, features, pose, GRID).image
+    side.synchronize()
+    assert torch.equal(got, want)
+
+
+def captured(function):
+    """`function` as a replayable graph, warmed up; returns the graph and its outputs."""
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side), torch.no_grad():
+        for _ in range(2):
+            function()
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph), torch.no_grad():
+        outputs = function()
+    return graph, outputs
+
+
+def test_a_query_can_be_captured():
+    scene, model, pose = there(1)
+    query = scene.features[:1].clone()
+    graph, image = captured(lambda: rasterize(*model, query, pose, GRID).image)
+    for seed in range(3):
+        query.copy_(torch.randn(query.shape, generator=torch.Generator().manual_seed(seed)))
+        pose.position.copy_(0.1 * seed * torch.ones(1, 3))
+        graph.replay()
+        want = rasterize(*model, query, Pose(pose.position.clone(), pose.rotation), GRID).image
+        assert torch.equal(image, want), seed
+
+
+def test_weights_and_frozen_views_can_be_captured():
+    scene, model, pose = there()
+    weigh = lambda: mean_weights(make_plan(*model, pose, GRID), *model).share  # noqa: E731
+    graph, share = captured(weigh)
+    graph.replay()
+    assert torch.equal(share, weigh())
+    view = freeze(make_plan(*model, pose, GRID), *model, version=0)
+    for query in (scene.features, scene.features[0], torch.randn(40, 60, 1, device="cuda")):
+        graph, image = captured(lambda query=query: view.render(query, version=0))
+        graph.replay()
+        want = rasterize(*model, query, pose, GRID).image
+        assert torch.allclose(image, want if query.dim() == 3 else want[0], atol=1e-5)
+
+
+def test_networks_on_the_gpu():
+    shapes = [(500, 33, 32), (500, 32), (500, 32, 1), (500, 1)]
+    weights = [torch.randn(shape, device="cuda").requires_grad_() for shape in shapes]
+    encoded = torch.randn(20, 33, device="cuda")
+    exact = [weight.detach().double().requires_grad_() for weight in weights]
+    out, want = networks.networks(encoded, *weights), networks.products(encoded.double(), *exact)
+    got, truth = torch.autograd.grad(out.sum(), weights), torch.autograd.grad(want.sum(), exact)
+    for a, b in [(out, want), *zip(got, truth, strict=True)]:
+        assert (a.double() - b).abs().max() < 1e-5 * (1 + b.abs().max())
+
+
+def test_a_million_gaussians_stay_within_the_bound():
+    n = 1_000_000
+    means = 5 * torch.randn(n, 3, device="cuda")
+    model = (
+        means,
+        torch.randn(n, 4, device="cuda"),
+        torch.full((n, 3), 0.3).cuda(),
+        torch.full((n,), 0.3).cuda(),
+    )
+    torch.cuda.reset_peak_memory_stats()
+    before = torch.cuda.memory_allocated()
+    plan = make_plan(*model, poses(0).to("cuda"), GRID)
+    grown = torch.cuda.max_memory_allocated() - before
+    entries = plan.buffers[6].numel() // 2
+    assert grown < 40 * entries + 400 * n
