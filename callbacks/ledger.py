@@ -55,25 +55,25 @@ class CostLedger(L.Callback):
         running = 0.0 if self._running_since is None else time.perf_counter() - self._running_since
         return self.seconds + running
 
-    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Start the watch."""
         self._start()
 
-    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
         """Stop the watch."""
         self._stop()
         module.train_seconds = self.seconds
 
-    def on_exception(self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
         """Stop the watch."""
         self._stop()
 
-    def on_validation_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
         """Validation is shown, not billed."""
         self._stop()
         module.train_seconds = self.seconds
 
-    def on_validation_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Write a row of the learning curve and go on."""
         if trainer.sanity_checking:
             return

@@ -20,5 +20,5 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
 
     stays = not wandb.login(prompt=False) if offline is None else offline
     # Lightning sets a variable that wandb, once asked for a login, does not read again.
-    mode = {"mode": "offline"} if stays else {}
+    mode: dict[str, Any] = {"mode": "offline"} if stays else {}
     return WandbLogger(offline=stays, **mode, **settings)
