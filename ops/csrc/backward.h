@@ -76,36 +76,53 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, 
         for (int rank = 0; rank < plan.count; ++rank) rank_of[base + plan.order[base + rank]] = rank;
     };
     parallel_for(plan.poses, threads, invert);
-    constexpr int chunk = 256;
+    constexpr int chunk = 256, n = Pack<S>::n;
+    static_assert(chunk % n == 0, "a chunk is whole lanes");
+    const Lens<Pack<S>> wide = widened(lens);
     auto run = [&](int task, int) {
         const int64_t end = int64_t(task + 1) * chunk < plan.count ? int64_t(task + 1) * chunk : plan.count;
-        for (int64_t i = int64_t(task) * chunk; i < end; ++i) {
-            Gradients<S> total{};
-            const Gaussian<S> g = gaussian(model, i);
-            const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : S(0);
+        for (int64_t i = int64_t(task) * chunk; i < end; i += n) {
+            const int some = end - i < n ? int(end - i) : n;
+            const Gaussian<Pack<S>> g = gaussians(model, i, some);
+            Pack<S> opacity, extinction = S(0);
+            gather_rows(model.opacities + i, 1, some, &opacity);
+            if (model.extinctions) gather_rows(model.extinctions + i, 1, some, &extinction);
+            Pack<S> total[12];  // mean, quat, scale, opacity, extinction
+            for (Pack<S>& t : total) t = S(0);
             for (int pose = 0; pose < plan.poses; ++pose) {
-                const int rank = rank_of[int64_t(pose) * plan.count + i];
-                const int64_t* slots = plan.slots + int64_t(pose) * (plan.count + 1) + rank;
-                S* shift = screen ? screen + 2 * (int64_t(pose) * plan.count + i) : nullptr;
-                if (shift) shift[0] = shift[1] = 0;
-                if (slots[0] == slots[1]) continue;
-                S m[kMoments] = {};
-                for (int64_t slot = slots[0]; slot < slots[1]; ++slot)
-                    for (int k = 0; k < kMoments; ++k) m[k] += moments[slot * kMoments + k];
-                const S* rotation = model.rotations + 9 * pose;
-                const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, lens);
-                const Moments<S> sums = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
-                const Gradients<S> one = project_backward(f, sums, opacity, extinction, rotation, lens);
-                for (int k = 0; k < 3; ++k) total.mean[k] += one.mean[k], total.scale[k] += one.scale[k];
-                for (int k = 0; k < 4; ++k) total.quat[k] += one.quat[k];
-                total.opacity += one.opacity, total.extinction += one.extinction;
-                if (shift) shift[0] = one.screen[0], shift[1] = one.screen[1];
+                S sums[kMoments][n] = {}, seen[n] = {};
+                bool nothing = true;
+                for (int k = 0; k < some; ++k) {
+                    const int64_t* slots = plan.slots + int64_t(pose) * (plan.count + 1) + rank_of[int64_t(pose) * plan.count + i + k];
+                    if (slots[0] == slots[1]) continue;
+                    nothing = false, seen[k] = 1;
+                    S m[kMoments] = {};
+                    for (int64_t slot = slots[0]; slot < slots[1]; ++slot)
+                        for (int c = 0; c < kMoments; ++c) m[c] += moments[slot * kMoments + c];
+                    for (int c = 0; c < kMoments; ++c) sums[c][k] = m[c];
+                }
+                Pack<S> shift[2] = {S(0), S(0)};
+                if (!nothing) {
+                    const Stand<S> stand(model, pose);
+                    const Footprint<Pack<S>> f = project(g, stand.position, stand.rotation, wide);
+                    Pack<S> m[kMoments];
+                    for (int c = 0; c < kMoments; ++c) m[c] = load(sums[c]);
+                    const Gradients<Pack<S>> one = project_backward<Pack<S>>(f, {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]},
+                                                                             opacity, extinction, stand.rotation, wide);
+                    const Which<S> counts = Pack<S>(load(seen)) > 0;
+                    const Pack<S> none = S(0);
+                    for (int k = 0; k < 3; ++k) total[k] += pick(counts, one.mean[k], none), total[7 + k] += pick(counts, one.scale[k], none);
+                    for (int k = 0; k < 4; ++k) total[3 + k] += pick(counts, one.quat[k], none);
+                    total[10] += pick(counts, one.opacity, none), total[11] += pick(counts, one.extinction, none);
+                    for (int k = 0; k < 2; ++k) shift[k] = pick(counts, one.screen[k], none);
+                }
+                if (screen) scatter_rows(shift, 2, some, screen + 2 * (int64_t(pose) * plan.count + i));
             }
-            memcpy(means + 3 * i, total.mean, sizeof total.mean);
-            memcpy(quats + 4 * i, total.quat, sizeof total.quat);
-            memcpy(scales + 3 * i, total.scale, sizeof total.scale);
-            opacities[i] = total.opacity;
-            if (extinctions) extinctions[i] = total.extinction;
+            scatter_rows(total, 3, some, means + 3 * i);
+            scatter_rows(total + 3, 4, some, quats + 4 * i);
+            scatter_rows(total + 7, 3, some, scales + 3 * i);
+            scatter_rows(total + 10, 1, some, opacities + i);
+            if (extinctions) scatter_rows(total + 11, 1, some, extinctions + i);
         }
     };
     parallel_for((plan.count + chunk - 1) / chunk, threads, run);

@@ -53,30 +53,56 @@ template <class S> GSPARC_HD void set_columns(S low, S high, const Lens<S>& lens
     box.column0 = images ? int32_t(from) : 0, box.columns = images ? int32_t(to) - int32_t(from) + 1 : 0;
 }
 
-template <class S> GSPARC_HD Box box_of(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens) {
-    const S margin = S(0.01), wide = reach * S(1.0001);  // rounding may not cut a pixel off
-    S low, high;
-    Box box;
+// Rows and columns (fractional) between which a footprint lies, with a margin: rounding may not cut a pixel off.
+template <class S> struct Frame {
+    S bottom, top, left, right;
+};
+template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens) {
+    const S margin = S(0.01), wide = reach * S(1.0001);
     if (lens.tangent) {
         const S unit = wide * lens.elevation_step * lens.elevation_step;
         const S a11 = f.k11 * unit, a12 = f.k12 * unit, a22 = f.k22 * unit;
-        const bool below = f.n[2] < 0;
-        const Extent<S> up = elevation_extent(below ? -f.n[2] : f.n[2], f.cosine, root(a11), root(a22));
-        const S bottom = below ? -up.high : up.low, top = below ? -up.low : up.high;
-        low = (bottom - lens.first_elevation) / lens.elevation_step, high = (top - lens.first_elevation) / lens.elevation_step;
+        const Truth<S> below = f.n[2] < 0;
+        const Extent<S> up = elevation_extent(pick(below, -f.n[2], f.n[2]), f.cosine, root(a11), root(a22));
+        const S bottom = pick(below, -up.high, up.low), top = pick(below, -up.low, up.high);
         const Extent<S> across = azimuth_extent(f.n[2], f.cosine, a11, a12, a22);
-        set_columns(column + across.low / lens.azimuth_step - margin, column + across.high / lens.azimuth_step + margin, lens, box);
-    } else {
-        const S half = root(wide * f.k22);
-        low = row - half, high = row + half;
-        const S across = root(wide * f.k11);
-        set_columns(column - across - margin, column + across + margin, lens, box);
+        return {(bottom - lens.first_elevation) / lens.elevation_step - margin, (top - lens.first_elevation) / lens.elevation_step + margin,
+                column + across.low / lens.azimuth_step - margin, column + across.high / lens.azimuth_step + margin};
     }
+    const S half = root(wide * f.k22), across = root(wide * f.k11);
+    return {row - half - margin, row + half + margin, column - across - margin, column + across + margin};
+}
+
+template <class S> GSPARC_HD Box box_of(const Frame<S>& frame, const Lens<S>& lens) {
+    Box box;
     const S limit = S(lens.height);
-    box.row0 = int32_t(clamped(S(ceil(low - margin)), S(0), limit));
-    box.row1 = int32_t(clamped(S(floor(high + margin)) + 1, S(0), limit));
-    if (box.row1 <= box.row0 || box.columns <= 0) box = {0, 0, 0, 0};
+    box.row0 = int32_t(clamped(S(ceil(frame.bottom)), S(0), limit));
+    box.row1 = int32_t(clamped(S(floor(frame.top)) + 1, S(0), limit));
+    if (box.row1 <= box.row0) return {0, 0, 0, 0};
+    set_columns(frame.left, frame.right, lens, box);
+    if (box.columns <= 0) box = {0, 0, 0, 0};
     return box;
+}
+
+// What a plan needs of one Gaussian before one receiver.
+template <class S> struct Sight {
+    S depth, column, row, reach, radius;  // reach < 0 where there is nothing to see
+    Frame<S> frame;
+    S record[kRecord];
+};
+template <class S> GSPARC_HD Sight<S> sight_of(const Gaussian<S>& g, S opacity, const S* position, const S* rotation, const Lens<S>& lens) {
+    Sight<S> s;
+    const Footprint<S> f = project(g, position, rotation, lens);
+    s.depth = f.r;
+    const S azimuth = pick(f.cosine > 0, angle(f.n[1], f.n[0]), S(0)), elevation = angle(f.n[2], f.cosine);
+    s.column = pick(f.present, (azimuth - lens.first_azimuth) / lens.azimuth_step, S(0));
+    s.row = pick(f.present, (elevation - lens.first_elevation) / lens.elevation_step, S(0));
+    s.reach = pick(f.present, reach2(f, opacity, lens), S(-1));
+    s.frame = frame_of(f, s.column, s.row, s.reach, lens);
+    const S middle = (f.k11 + f.k22) / 2, half = (f.k11 - f.k22) / 2;
+    s.radius = root(s.reach * (middle + root(half * half + f.k12 * f.k12)));
+    write_record(f, s.column, s.row, s.reach, lens, s.record);
+    return s;
 }
 
 // Fills row i of everything in ProjectArgs; returns what is unsound as `unsound` does.
@@ -85,22 +111,16 @@ template <class S> GSPARC_HD int project_one(const ProjectArgs<S>& a, int64_t i)
     const S opacity = a.model.opacities[i];
     const int wrong = unsound(g, opacity);
     if (wrong >= 0) return wrong;
-    const Footprint<S> f = project(g, a.model.positions + 3 * a.pose, a.model.rotations + 9 * a.pose, a.lens);
-    a.depths[i] = f.r;
-    a.visible[i] = false, a.radii[i] = 0, a.means2d[2 * i] = a.means2d[2 * i + 1] = 0;
-    if (!f.present) return -1;
-    const S azimuth = f.cosine > 0 ? angle(f.n[1], f.n[0]) : S(0), elevation = angle(f.n[2], f.cosine);
-    const S column = (azimuth - a.lens.first_azimuth) / a.lens.azimuth_step;
-    const S row = (elevation - a.lens.first_elevation) / a.lens.elevation_step;
-    a.means2d[2 * i] = column, a.means2d[2 * i + 1] = row;
-    const S reach = reach2(f, opacity, a.lens);
-    if (!(reach >= 0)) return -1;
-    a.boxes[i] = box_of(f, column, row, reach, a.lens);
+    const Sight<S> s = sight_of(g, opacity, a.model.positions + 3 * a.pose, a.model.rotations + 9 * a.pose, a.lens);
+    a.depths[i] = s.depth, a.radii[i] = 0;
+    a.means2d[2 * i] = s.column, a.means2d[2 * i + 1] = s.row;
+    a.visible[i] = false;
+    if (!(s.reach >= 0)) return -1;
+    a.boxes[i] = box_of(s.frame, a.lens);
     a.visible[i] = a.boxes[i].row1 > a.boxes[i].row0;
     if (!a.visible[i]) return -1;
-    const S middle = (f.k11 + f.k22) / 2, half = (f.k11 - f.k22) / 2;
-    a.radii[i] = root(reach * (middle + root(half * half + f.k12 * f.k12)));
-    write_record(f, column, row, reach, a.lens, a.records + i * kRecord);
+    a.radii[i] = s.radius;
+    memcpy(a.records + i * kRecord, s.record, sizeof s.record);
     return -1;
 }
 

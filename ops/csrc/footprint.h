@@ -17,32 +17,55 @@
 #endif
 
 #include "layout.h"
+#ifdef GSPARC_PACKS
+#include "pack.h"
+#endif
 
 namespace gsparc {
 namespace GSPARC_ISA {
 
+// S is a number, or lanes of numbers (pack.h): a choice is `pick`, and what is not picked may be anything.
+template <class S> struct TruthOf {
+    using type = bool;
+};
+template <class S> using Truth = typename TruthOf<S>::type;
+#ifdef GSPARC_PACKS
+template <class S> struct TruthOf<Pack<S>> {
+    using type = Which<S>;
+};
+GSPARC_HD Pack<float> smallest(Pack<float>) { return 1.17549435e-38f; }
+GSPARC_HD Pack<double> smallest(Pack<double>) { return 2.2250738585072014e-308; }
+#endif
+template <class S> GSPARC_HD S pick(bool which, S a, S b) { return which ? a : b; }
+
 GSPARC_HD float root(float x) { return sqrtf(x); }
 GSPARC_HD double root(double x) { return sqrt(x); }
-// atan2 to 3e-7 rad (Abramowitz and Stegun 4.4.49): the library's took half of the planning time.
-GSPARC_HD float angle(float y, float x) {
-    const float ax = x < 0 ? -x : x, ay = y < 0 ? -y : y, long_side = ax > ay ? ax : ay;
-    const float t = long_side > 0 ? (ax > ay ? ay : ax) / long_side : 0.0f, s = t * t;
-    float p = 0.0028662257f;
-    p = p * s - 0.0161657367f, p = p * s + 0.0429096138f, p = p * s - 0.0752896400f, p = p * s + 0.1065626393f;
-    p = p * s - 0.1420889944f, p = p * s + 0.1999355085f, p = p * s - 0.3333314528f;
-    float a = t + t * s * p;
-    a = ay > ax ? 1.57079633f - a : a;
-    a = x < 0 ? 3.14159265f - a : a;
-    return y < 0 ? -a : a;
-}
-GSPARC_HD double angle(double y, double x) { return atan2(y, x); }
 GSPARC_HD float logarithm(float x) { return logf(x); }
 GSPARC_HD double logarithm(double x) { return log(x); }
 GSPARC_HD float smallest(float) { return 1.17549435e-38f; }
 GSPARC_HD double smallest(double) { return 2.2250738585072014e-308; }
-template <class S> GSPARC_HD S largest_of(S a, S b) { return a > b ? a : b; }
+
+// atan2 to 3e-7 rad (Abramowitz and Stegun 4.4.49): the library's took half of the planning time.
+template <class S> GSPARC_HD S short_angle(S y, S x) {
+    const S ax = pick(x < 0, -x, x), ay = pick(y < 0, -y, y), long_side = pick(ax > ay, ax, ay);
+    const S t = pick(long_side > 0, pick(ax > ay, ay, ax) / long_side, S(0)), s = t * t;
+    S p = S(0.0028662257f);
+    p = p * s - S(0.0161657367f), p = p * s + S(0.0429096138f), p = p * s - S(0.0752896400f), p = p * s + S(0.1065626393f);
+    p = p * s - S(0.1420889944f), p = p * s + S(0.1999355085f), p = p * s - S(0.3333314528f);
+    S a = t + t * s * p;
+    a = pick(ay > ax, S(1.57079633f) - a, a);
+    a = pick(x < 0, S(3.14159265f) - a, a);
+    return pick(y < 0, -a, a);
+}
+GSPARC_HD float angle(float y, float x) { return short_angle(y, x); }
+GSPARC_HD double angle(double y, double x) { return atan2(y, x); }
+#ifdef GSPARC_PACKS
+GSPARC_HD Pack<float> angle(Pack<float> y, Pack<float> x) { return short_angle(y, x); }
+GSPARC_HD Pack<double> angle(Pack<double> y, Pack<double> x) { return each_lane<double>(y, x, angle); }
+#endif
+template <class S> GSPARC_HD S largest_of(S a, S b) { return pick(a > b, a, b); }
 template <class S> GSPARC_HD S dot(const S* a, const S* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-template <class S> GSPARC_HD S clamped(S x, S low, S high) { return x < low ? low : (x > high ? high : x); }
+template <class S> GSPARC_HD S clamped(S x, S low, S high) { return pick(x < low, low, pick(x > high, high, x)); }
 
 // One Gaussian and one pose, both as they come: no derived quantity.
 template <class S> struct Gaussian {
@@ -50,7 +73,7 @@ template <class S> struct Gaussian {
 };
 
 template <class S> struct Footprint {
-    bool present;
+    Truth<S> present;
     S r, n[3], e1[3], e2[3], cosine;        // cosine of the elevation
     S unit[4], norm;                        // quaternion of length 1 and the length it came with (0: undefined)
     S axis[3][3];                           // a_i, receiver frame
@@ -74,18 +97,17 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     S x[3], d[3] = {g.mean[0] - position[0], g.mean[1] - position[1], g.mean[2] - position[2]};
     for (int k = 0; k < 3; ++k) x[k] = rotation[k] * d[0] + rotation[3 + k] * d[1] + rotation[6 + k] * d[2];
     f.r = root(dot(x, x));
-    f.present = f.r > lens.near;
-    if (!f.present) return f;
+    f.present = f.r > lens.near;  // of one that is not present the rest means nothing
     for (int k = 0; k < 3; ++k) f.n[k] = x[k] / f.r;
     f.cosine = root(f.n[0] * f.n[0] + f.n[1] * f.n[1]);
-    const S c0 = f.cosine > 0 ? f.n[0] / f.cosine : S(1), c1 = f.cosine > 0 ? f.n[1] / f.cosine : S(0);
-    f.e1[0] = -c1, f.e1[1] = c0, f.e1[2] = 0;
+    const S c0 = pick(f.cosine > 0, f.n[0] / f.cosine, S(1)), c1 = pick(f.cosine > 0, f.n[1] / f.cosine, S(0));
+    f.e1[0] = -c1, f.e1[1] = c0, f.e1[2] = S(0);
     f.e2[0] = -f.n[2] * c0, f.e2[1] = -f.n[2] * c1, f.e2[2] = f.cosine;
 
     const S square = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3];
-    const bool usable = square > smallest(S());
-    f.norm = usable ? root(square) : S(0);
-    for (int k = 0; k < 4; ++k) f.unit[k] = usable ? g.quat[k] / f.norm : S(k == 0);
+    const Truth<S> usable = square > smallest(S());
+    f.norm = pick(usable, root(square), S(0));
+    for (int k = 0; k < 4; ++k) f.unit[k] = pick(usable, g.quat[k] / f.norm, S(k == 0));
     S turn[9];
     rotation_of(f.unit, turn);
     for (int i = 0; i < 3; ++i)
@@ -95,7 +117,7 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     f.stretch2 = 1 / lens.elevation_step;
     f.bound2 = f.cosine * f.cosine + lens.elevation_step * lens.elevation_step;
     f.stretch1 = lens.tangent ? f.stretch2 : 1 / (root(f.bound2) * lens.azimuth_step);
-    f.k11 = lens.low_pass, f.k12 = 0, f.k22 = lens.low_pass;
+    f.k11 = lens.low_pass, f.k12 = S(0), f.k22 = lens.low_pass;
     S spread = 0;
     for (int i = 0; i < 3; ++i) {
         f.sigma[i] = g.scale[i] / f.r;
@@ -109,8 +131,7 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     f.length_y = root(dot(f.y, f.y));
     f.area = f.stretch1 * f.stretch2 * f.length_y;
     f.det = f.area * f.area + lens.low_pass * spread + lens.low_pass * lens.low_pass;
-    f.present = f.det > smallest(S()) && f.k22 > smallest(S());
-    if (!f.present) return f;
+    f.present = f.present & (f.det > smallest(S())) & (f.k22 > smallest(S()));
     f.root_a = root(f.k22 / f.det), f.root_b = 1 / root(f.k22), f.rho = f.k12 / f.k22;
 
     const S near = clamped((f.r - lens.near) / lens.near, S(0), S(1));
@@ -145,7 +166,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
         out.screen[0] = g1 * step, out.screen[1] = g2 * step;
     } else {
         out.screen[0] = dp, out.screen[1] = dq;
-        g1 = f.cosine > 0 ? dp / (f.cosine * lens.azimuth_step) : S(0), g2 = dq / step;
+        g1 = pick(f.cosine > 0, dp / (f.cosine * lens.azimuth_step), S(0)), g2 = dq / step;
     }
 
     // (A, B, rho) and the gain -> (k11, k12, k22, area), written so that no square of det appears.
@@ -160,7 +181,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
 
     S g_sigma[3] = {0, 0, 0}, g_axis[3][3], g_stretch1 = 0, twist = 0;
     S g_b[3], g_cofactor[3];
-    const S per_length = f.length_y > 0 ? f.stretch1 * f.stretch2 * g_area / f.length_y : S(0);
+    const S per_length = pick(f.length_y > 0, f.stretch1 * f.stretch2 * g_area / f.length_y, S(0));
     for (int i = 0; i < 3; ++i) {
         const S g_y = per_length * f.y[i];
         g_b[i] = g_y * f.sigma[(i + 1) % 3] * f.sigma[(i + 2) % 3];
@@ -181,7 +202,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
     }
     if (!lens.tangent) {
         // East and north turn about n by d1 tan(elevation), and the stretch of the columns depends on it.
-        if (f.cosine > 0) g1 += twist * f.n[2] / f.cosine;
+        g1 += pick(f.cosine > 0, twist * f.n[2] / f.cosine, S(0));
         g_stretch1 += g_area * f.area / f.stretch1;
         g2 += g_stretch1 * f.stretch1 * f.cosine * f.n[2] / f.bound2;
     }
@@ -189,7 +210,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
     S g_r = 0;
     for (int i = 0; i < 3; ++i) out.scale[i] = g_sigma[i] / f.r, g_r -= g_sigma[i] * f.sigma[i] / f.r;
     const S near = (f.r - lens.near) / lens.near;
-    if (near < 1) g_r += g_gain * f.compensation * 6 * near * (1 - near) / lens.near;
+    g_r += pick(near < 1, g_gain * f.compensation * 6 * near * (1 - near) / lens.near, S(0));
     S g_x[3];
     for (int c = 0; c < 3; ++c) g_x[c] = (g1 * f.e1[c] + g2 * f.e2[c]) / f.r + g_r * f.n[c];
     for (int c = 0; c < 3; ++c) out.mean[c] = dot(rotation + 3 * c, g_x);
@@ -205,14 +226,14 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
         2 * (x * (t[2] + t[6]) + y * (t[5] + t[7]) + w * (t[3] - t[1]) - 2 * z * (t[0] + t[4])),
     };
     const S radial = w * g_unit[0] + x * g_unit[1] + y * g_unit[2] + z * g_unit[3];
-    for (int k = 0; k < 4; ++k) out.quat[k] = f.norm > 0 ? (g_unit[k] - f.unit[k] * radial) / f.norm : S(0);
+    for (int k = 0; k < 4; ++k) out.quat[k] = pick(f.norm > 0, (g_unit[k] - f.unit[k] * radial) / f.norm, S(0));
     return out;
 }
 
 // Squared reach of the footprint in standardised offsets, or negative if it reaches nothing.
 template <class S> GSPARC_HD S reach2(const Footprint<S>& f, S strongest, const Lens<S>& lens) {
-    const S peak = lens.relative ? S(f.gain * strongest > 0) : f.gain * strongest;
-    return peak >= lens.alpha_min && peak > 0 ? 2 * logarithm(peak / lens.alpha_min) : S(-1);
+    const S strength = f.gain * strongest, peak = lens.relative ? pick(strength > 0, S(1), S(0)) : strength;
+    return pick((peak >= lens.alpha_min) & (peak > 0), 2 * logarithm(peak / lens.alpha_min), S(-1));
 }
 
 template <class S> struct Extent {
@@ -226,11 +247,11 @@ template <class S> GSPARC_HD Extent<S> elevation_extent(S sine, S cosine, S p, S
     S low = half_turn;
     for (int side = -1; side <= 1; side += 2) {
         const S z = sine + side * q * cosine, horizontal2 = (cosine - side * q * sine) * (cosine - side * q * sine);
-        const S here = angle(z, root(z > 0 ? horizontal2 + p * p : horizontal2));
-        low = here < low ? here : low;
+        const S here = angle(z, root(pick(z > 0, horizontal2 + p * p, horizontal2)));
+        low = pick(here < low, here, low);
     }
     const S top = angle(sine, cosine) + angle(q, S(1));
-    return {low, top < half_turn ? top : half_turn};
+    return {low, pick(top < half_turn, top, half_turn)};
 }
 
 // Azimuths [rad] relative to the centre that a `tangent` footprint reaches: tangent lines from the axis.
@@ -238,9 +259,9 @@ template <class S> GSPARC_HD Extent<S> elevation_extent(S sine, S cosine, S p, S
 template <class S> GSPARC_HD Extent<S> azimuth_extent(S sine, S cosine, S a11, S a12, S a22) {
     const S d = cosine * cosine - sine * sine * a22;
     const S pi = S(3.141592653589793);
-    if (d <= S(1e-4) * cosine * cosine || !(d > 0)) return {-pi, pi};
+    const Truth<S> apart = (d > S(1e-4) * cosine * cosine) & (d > 0);
     const S middle = sine * a12, radius = root(middle * middle + a11 * d);
-    return {angle(middle - radius, d), angle(middle + radius, d)};
+    return {pick(apart, angle(middle - radius, d), -pi), pick(apart, angle(middle + radius, d), pi)};
 }
 
 }  // namespace GSPARC_ISA

@@ -23,9 +23,9 @@ template <class S> GSPARC_HD void write_record(const Footprint<S>& f, S column, 
         }
     } else {
         out[0] = column, out[1] = row, out[2] = f.root_a, out[3] = f.rho, out[4] = f.root_b;
-        for (int k = 5; k < 9; ++k) out[k] = 0;
+        for (int k = 5; k < 9; ++k) out[k] = S(0);
     }
-    out[kReach] = reach, out[kGain] = f.gain, out[11] = 0;
+    out[kReach] = reach, out[kGain] = f.gain, out[11] = S(0);
 }
 
 // Per-column and per-row numbers of a grid. Columns are padded with NaN: a lane past the edge passes no test.

@@ -53,6 +53,8 @@ template <> struct MaskOf<double> { typedef __mmask8 M; };
 template <class S> using Mask = typename MaskOf<S>::M;
 GSPARC_INLINE __mmask16 at_most(Vec<float> a, Vec<float> b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LE_OQ); }
 GSPARC_INLINE __mmask8 at_most(Vec<double> a, Vec<double> b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LE_OQ); }
+GSPARC_INLINE __mmask16 below(Vec<float> a, Vec<float> b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ); }
+GSPARC_INLINE __mmask8 below(Vec<double> a, Vec<double> b) { return _mm512_cmp_pd_mask((__m512d)a, (__m512d)b, _CMP_LT_OQ); }
 GSPARC_INLINE Vec<float> select(__mmask16 m, Vec<float> a, Vec<float> b) { return (Vec<float>)_mm512_mask_blend_ps(m, (__m512)b, (__m512)a); }
 GSPARC_INLINE Vec<double> select(__mmask8 m, Vec<double> a, Vec<double> b) { return (Vec<double>)_mm512_mask_blend_pd(m, (__m512d)b, (__m512d)a); }
 template <class M> GSPARC_INLINE bool any(M m) { return m != 0; }
@@ -62,6 +64,8 @@ GSPARC_INLINE Vec<double> fma(Vec<double> a, Vec<double> b, Vec<double> c) { ret
 template <class S> using Mask = Int<S>;
 GSPARC_INLINE Int<float> at_most(Vec<float> a, Vec<float> b) { return a <= b; }
 GSPARC_INLINE Int<double> at_most(Vec<double> a, Vec<double> b) { return a <= b; }
+GSPARC_INLINE Int<float> below(Vec<float> a, Vec<float> b) { return a < b; }
+GSPARC_INLINE Int<double> below(Vec<double> a, Vec<double> b) { return a < b; }
 GSPARC_INLINE Vec<float> select(Int<float> m, Vec<float> a, Vec<float> b) { return m ? a : b; }
 GSPARC_INLINE Vec<double> select(Int<double> m, Vec<double> a, Vec<double> b) { return m ? a : b; }
 #if defined(__AVX2__)
