@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 LIGHT = 299_792_458.0  # [m/s]
-NEAR_M = 0.01  # a source inside the receiver's own centimetre is not resolved; keeps 1/r finite
+NEAR_M = 0.001  # no receiver comes closer to a source; keeps 1/r and its slope finite
 
 
 def ranges(observers: Tensor, sources: Tensor) -> Tensor:

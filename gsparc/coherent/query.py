@@ -74,12 +74,12 @@ class Query:
         self.few = few
         self.root = self.first.factor.root
 
-    def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor]:
-        """Means (M, m, R, F) of the processes at queries (m, 3) [m] and tones (F,) [Hz]; variance (m,).
+    def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Means (M, m, R, F) at queries (m, 3) [m] and tones (F,) [Hz], variance (m,), prior (m,).
 
-        The variance holds at the middle of the band; it hardly changes over it.
+        Variance and the power expected without any rows hold at the middle of the band.
         """
-        means, variances = [], []
+        means, variances, priors = [], [], []
         middle = tones[len(tones) // 2]
         for part in queries.split(CHUNK):
             correlation = self.pack.correlation(part)
@@ -87,10 +87,12 @@ class Query:
             waves = wave_over_band(ranges(part, self.pack.sources), tones)  # (m, K, F)
             split = zip(gains.split(self.counts), waves.split(self.counts, 1), strict=True)
             means.append(torch.stack([torch.einsum("kmr,mkf->mrf", g, w) for g, w in split]))
-            variances.append(self._variance(part, middle, correlation[: self.counts[0]]))
-        return torch.cat(means, 1), torch.cat(variances)
+            variance, prior = self._variance(part, middle, correlation[: self.counts[0]])
+            variances.append(variance)
+            priors.append(prior)
+        return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
 
-    def _variance(self, part: Tensor, tone: Tensor, correlation: Tensor) -> Tensor:
+    def _variance(self, part: Tensor, tone: Tensor, correlation: Tensor) -> tuple[Tensor, Tensor]:
         phased, count = self.first.phased, len(part)
         power = phased.scene.log_amplitude.mul(2).exp()
         rows = Rows(part, tone.expand(count), torch.empty(count, 0), torch.arange(count))
@@ -104,7 +106,7 @@ class Query:
             cross += (here[:, k] @ there[:, k].T) * seen[k].repeat(2, 2)
         prior = (waves.abs().square() * power).sum(1) + math.exp(phased.scene.log_noise)
         known = (self.root @ cross.T).square().sum(0)
-        return (prior - known[:count] - known[count:]).clamp_min(0)
+        return (prior - known[:count] - known[count:]).clamp_min(0), prior
 
 
 def _numbers(scene: Scene) -> Tensor:

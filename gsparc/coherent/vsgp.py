@@ -29,7 +29,7 @@ from gsparc.ops import Pose
 log = logging.getLogger(__name__)
 
 SECONDS_PER_MEASUREMENT = 0.4  # a conference room of 350 gets 140 s
-TURNING = 0.1  # share of a gain's variation that is not along its phase, before it is learned
+TURNING = 0.4  # share of a gain's variation that is not along its phase, before it is learned
 LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 480.0
 
 
@@ -153,7 +153,11 @@ class VirtualSourceGP(Method):
 
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; the error of an entry is its posterior variance plus the searches' spread."""
+        """See `Method.predict`.
+
+        The variance is the posterior's plus the searches' spread; the confidence is the share of the power
+        expected there that is known.
+        """
         site = self._fitted()
         if site.moving_end == "rx":
             places = query_elements(site, rx, len(tx), self.antennas)
@@ -162,15 +166,15 @@ class VirtualSourceGP(Method):
         count, per = places.shape[:2]
         flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
         tones = torch.from_numpy(tones_of(site))
-        stack, variance = self.query.means(flat, tones)  # (members, B E, R, K)
+        stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         mean = stack.mean(0)
         variance = variance + (stack - mean).abs().square().mean(0).flatten(1).mean(1)
         loudness = (self.frame.carrier_hz / tones).float()
         mean = (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
-        variance = variance.reshape(count, per).mean(1)
+        variance, prior = (v.reshape(count, per).mean(1) for v in (variance, prior))
         return Prediction(
             mean,
-            confidence=(1 - variance).clamp(0, 1),
+            confidence=(1 - variance / prior).clamp(0, 1),
             variance=variance * self.frame.scale**2,
         )
 

@@ -1,0 +1,52 @@
+import itertools
+
+import pytest
+import torch
+
+from gsparc.coherent.parsing import vote
+from gsparc.coherent.planes import all_words, bisector, images, reflect
+
+WALLS = torch.tensor(
+    [[1.0, 0, 0, 0], [2.0, 0, 0, 4.0], [0, 1, 0, 0], [0, 1, 0, 3.0]], dtype=torch.float64
+)  # the second normal is not of unit length, and its plane is x = 4
+TX = torch.tensor([0.6, 0.8, 1.9], dtype=torch.float64)
+
+
+def test_mirror_twice_is_the_point_itself():
+    torch.testing.assert_close(reflect(reflect(TX, WALLS), WALLS), TX.expand(4, 3))
+
+
+def test_bisector_mirrors_one_point_into_the_other():
+    other = torch.tensor([-3.0, 2.0, 0.5], dtype=torch.float64)
+    torch.testing.assert_close(reflect(TX, bisector(TX, other)), other)
+
+
+def test_words_are_mirrors_one_after_the_other():
+    place = images(TX, WALLS, [(), (1,), (1, 0), (2, 3, 1)])
+    by_hand = [TX, reflect(TX, WALLS[1]), reflect(reflect(TX, WALLS[1]), WALLS[0])]
+    by_hand.append(reflect(reflect(reflect(TX, WALLS[2]), WALLS[3]), WALLS[1]))
+    torch.testing.assert_close(place, torch.stack(by_hand))
+    assert place[1].tolist() == pytest.approx([8 - 0.6, 0.8, 1.9])
+
+
+def test_words_have_no_letter_after_itself():
+    words = all_words([0, 1, 2], 3)
+    assert len(words) == len(set(words)) == 3 + 6 + 12
+    assert all(a != b for word in words for a, b in itertools.pairwise(word))
+
+
+def test_walls_are_voted_for_by_the_sources_they_explain():
+    words = [(), *all_words([0, 1, 2, 3], 2)]
+    sources = images(TX, WALLS, words)
+    sources = sources + 0.002 * torch.randn(
+        sources.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    walls = vote(sources)
+    assert walls is not None
+    probe = torch.tensor([1.1, 0.3, 0.7], dtype=torch.float64)
+    reached = torch.cdist(reflect(probe, WALLS), reflect(probe, walls)).amin(1)
+    assert reached.max() < 0.05
+
+
+def test_two_sources_make_no_wall():
+    assert vote(torch.stack([TX, reflect(TX, WALLS[0])])) is None

@@ -1,0 +1,39 @@
+"""Rooms of the image-source simulator whose every source is known, as measurements."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.simulate.shoebox import Room, Trace, scatter, trace
+
+WAVELENGTH = 299_792_458.0 / 2.4e9
+PILLAR = np.array([[[1.6, 1.2, 0.0], [2.0, 1.6, 2.5]]])
+
+
+def shoebox(
+    count: int,
+    *,
+    size: tuple[float, float, float] = (4.0, 3.0, 2.5),
+    reflection: complex = -0.7,
+    pillar: bool = False,
+    frequency_hz: np.ndarray | float = 2.4e9,
+    max_order: int = 2,
+    array: np.ndarray | None = None,
+    snr_db: float = 30.0,
+    seed: int = 0,
+) -> tuple[Trace, Measurements, Fold]:
+    """A transmitter near a corner, `count` receivers all over the room; its trace, data and random fold."""
+    room = Room.uniform(size, reflection, occluders=PILLAR if pillar else np.zeros((0, 2, 3)))
+    tx = np.array(size) * [0.15, 0.27, 0.75]
+    rx = scatter(room, count, seed + 1, margin=0.1)
+    told = trace(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
+    data = from_arrays(told.as_arrays())
+    return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
+
+
+def nmse(predicted: np.ndarray, true: np.ndarray) -> float:
+    """sum |e|^2 / sum |h|^2."""
+    return float((np.abs(predicted - true) ** 2).sum() / (np.abs(true) ** 2).sum())
