@@ -3,7 +3,7 @@ SHELL := /bin/bash
 PYTHON ?= python3
 VENV ?= .venv
 RUN := $(VENV)/bin/python
-SOURCES := $(wildcard ops/csrc/* CMakeLists.txt)
+SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
 .PHONY: help setup cuda demo test test-slow bench lint typecheck format clean
@@ -38,7 +38,7 @@ bench: setup ## timings of the kernels as ratios
 	$(RUN) -m gsparc.bench
 
 cuda: setup ## build the CUDA kernels for this machine's GPU (otherwise done when first used)
-	$(RUN) -P -c 'from gsparc.ops import backends; backends.named("cuda")'
+	$(RUN) -P -m gsparc.ops.cuda_library
 
 lint: setup ## ruff and mypy
 	$(RUN) -m ruff check .

@@ -154,3 +154,11 @@ def compile_to(path: Path, command: list[str]) -> None:
         )
         raise LibraryUnavailable(f"the CUDA kernels do not compile with {command[0]}: {first}")
     unfinished.replace(path)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    try:
+        load()
+    except LibraryUnavailable as unavailable:
+        raise SystemExit(str(unavailable)) from None

@@ -45,7 +45,7 @@ def on_gpu(run: Callable) -> Callable:
         torch.cuda.synchronize()
         for tensor, copy in zip(tensors, moved, strict=True):
             if tensor is not None:
-                tensor.copy_(copy)
+                tensor.data.copy_(copy)  # unseen by autograd: most of them are inputs
 
     return there
 

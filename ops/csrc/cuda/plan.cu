@@ -95,7 +95,8 @@ template <class S> __global__ void break_ties(int32_t* order, const uint64_t* ke
     if (last - at > 1) sort_run(order + at, last - at, ids);
 }
 
-// Tiles that a box touches, each once, also where it wraps around the circle.
+// Tiles that a box touches, each once: a box that would wrap into its own first tile was widened to the circle.
+static_assert(kTileWidth < kLanes, "set_columns widens boxes within kLanes of the full circle");
 struct TileRange {
     int row0, rows, column0, columns, wrap;
 
@@ -108,7 +109,6 @@ struct TileRange {
             columns = (end - 1) / kTileWidth - column0 + 1;
         else
             columns = v.tiles_x - column0 + (end - v.lens.width - 1) / kTileWidth + 1;
-        columns = columns < v.tiles_x ? columns : v.tiles_x;
     }
     GSPARC_HD int count() const { return rows * columns; }
     GSPARC_HD int tile(int k) const { return (row0 + k / columns) * wrap + (column0 + k % columns) % wrap; }
