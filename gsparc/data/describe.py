@@ -82,8 +82,13 @@ def _targets(data: Measurements) -> str:
     if data.site.kind == "spectrum":
         return f"{count} images of {shape[0]} x {shape[1]} directions"
     if data.site.kind == "csi":
-        return f"{count} channels of {shape[0]} antennas x {shape[1]} subcarriers"
+        antennas, tones = _counted(shape[0], "antenna"), _counted(shape[1], "subcarrier")
+        return f"{count} channels of {antennas} x {tones}"
     return f"{count} received powers"
+
+
+def _counted(count: int, thing: str) -> str:
+    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
 
 
 def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:

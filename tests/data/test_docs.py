@@ -23,4 +23,4 @@ def test_the_example_makes_a_good_file(tmp_path):
     command = [sys.executable, "-m", "gsparc.check", "mine.npz"]
     said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert said.returncode == 0, said.stdout + said.stderr
-    assert "200 channels" in said.stdout and "2.4 GHz" in said.stdout and "mine.npz: good" in said.stdout
+    assert "300 channels" in said.stdout and "2.4 GHz" in said.stdout and "mine.npz: good" in said.stdout
