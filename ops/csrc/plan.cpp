@@ -4,7 +4,6 @@
 #include <array>
 #include <cstring>
 #include <memory>
-#include <memory>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -41,6 +40,16 @@ template <class S> void sort_by_depth(const S* depths, std::vector<int32_t>& ite
     for (size_t k = 0; k < items.size(); ++k) items[k] = from[k].value;
 }
 
+constexpr int kBinned = 1024;  // ranks that one task bins
+
+// Counts of footprints per strip, one row for each chunk of ranks.
+struct Bins {
+    int poses, chunks, strips;
+    Bins(int poses, int count, int strips) : poses(poses), chunks((count + kBinned - 1) / kBinned), strips(strips) {}
+    int64_t size() const { return int64_t(poses) * chunks * strips; }
+    int64_t of(int task) const { return int64_t(task) * strips; }
+};
+
 }  // namespace
 
 template <class S> int64_t make_plan(const PlanArgs<S>& a) {
@@ -48,7 +57,7 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     // Not vectors: those would write zeros first.
     const std::unique_ptr<S[]> records(new S[a.poses * count * kRecord]), depths(new S[a.poses * count]);
     const std::unique_ptr<Box[]> boxes(new Box[a.poses * count]);
-    constexpr int chunk = 1024;
+    constexpr int chunk = kBinned;
     const int chunks = int((count + chunk - 1) / chunk);
     std::vector<int64_t> wrong(std::max(chunks, 1), -1);
     auto project = [&](int task, int) {
@@ -69,7 +78,6 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     if (a.ids && !std::is_sorted(a.ids, a.ids + count))
         std::stable_sort(by_id.begin(), by_id.end(), [&](int32_t x, int32_t y) { return a.ids[x] < a.ids[y]; });
 
-    std::vector<int64_t> per_pose(a.poses);
     auto arrange = [&](int pose, int) {
         const int64_t base = pose * count;
         std::vector<int32_t> items, hidden;
@@ -79,57 +87,82 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
         sort_by_depth(depths.get() + base, items);
         std::copy(items.begin(), items.end(), a.order + base);
         std::copy(hidden.begin(), hidden.end(), a.order + base + items.size());
-        int64_t* slots = a.slots + pose * (count + 1);
-        int64_t* starts = a.strip_starts + int64_t(pose) * a.strips + 1;
-        std::fill(starts, starts + a.strips, 0);
-        int64_t total = 0;
-        for (int64_t rank = 0; rank < count; ++rank) {
-            slots[rank] = total;
-            if (rank >= a.shown[pose]) continue;
-            const Box box = boxes[base + a.order[base + rank]];
-            for (int strip = box.row0 / kStripRows; strip <= (box.row1 - 1) / kStripRows; ++strip) ++starts[strip], ++total;
-        }
-        slots[count] = total;
-        per_pose[pose] = total;
     };
     parallel_for(a.poses, a.threads, arrange);
+    const Bins bins(a.poses, a.count, a.strips);
+    std::vector<int32_t> per_bin(bins.size());
+    std::vector<int64_t> per_chunk(a.poses * chunks);
     auto copy = [&](int task, int) {
         const int pose = task / chunks;
         const int64_t base = pose * count, begin = int64_t(task % chunks) * chunk, end = std::min(begin + chunk, count);
+        int32_t* in_strip = per_bin.data() + bins.of(task);
+        int64_t* slots = a.slots + pose * (count + 1);
+        int64_t total = 0;
         for (int64_t rank = begin; rank < end; ++rank) {
+            slots[rank] = total;
             const int64_t i = base + a.order[base + rank];
             S* record = a.records + (base + rank) * kRecord;
             if (rank < a.shown[pose]) {
-                a.boxes[base + rank] = boxes[i];
+                const Box box = a.boxes[base + rank] = boxes[i];
                 std::copy_n(records.get() + i * kRecord, kRecord, record);
+                const int first = box.row0 / kStripRows, last = (box.row1 - 1) / kStripRows;
+                for (int strip = first; strip <= last; ++strip) ++in_strip[strip];
+                total += last - first + 1;
             } else {
                 a.boxes[base + rank] = {0, 0, 0, 0};
                 std::fill_n(record, kRecord, S(0));
             }
         }
+        per_chunk[task] = total;
     };
     parallel_for(a.poses * chunks, a.threads, copy);
-    a.strip_starts[0] = 0;
-    for (int64_t k = 0; k < int64_t(a.poses) * a.strips; ++k) a.strip_starts[k + 1] += a.strip_starts[k];
     int64_t before = 0;
-    for (int pose = 0; pose < a.poses; ++pose) {
-        for (int64_t rank = 0; rank <= count; ++rank) a.slots[pose * (count + 1) + rank] += before;
-        before += per_pose[pose];
-    }
+    for (int64_t& total : per_chunk) before += std::exchange(total, before);  // where each chunk's slots begin
+    auto shift = [&](int task, int) {
+        const int64_t pose = task / chunks, begin = int64_t(task % chunks) * chunk, end = std::min(begin + chunk, count);
+        int64_t* slots = a.slots + pose * (count + 1);
+        for (int64_t rank = begin; rank < end; ++rank) slots[rank] += per_chunk[task];
+        if (end == count) slots[count] = task + 1 < a.poses * chunks ? per_chunk[task + 1] : before;
+    };
+    parallel_for(a.poses * chunks, a.threads, shift);
+    if (count == 0) std::fill_n(a.slots, a.poses, 0);
+    a.strip_starts[0] = 0;
+    for (int64_t pose = 0, at = 0; pose < a.poses; ++pose)
+        for (int strip = 0; strip < a.strips; ++strip, ++at) {
+            int64_t total = 0;
+            for (int k = 0; k < chunks; ++k) total += per_bin[bins.of(int(pose) * chunks + k) + strip];
+            a.strip_starts[at + 1] = a.strip_starts[at] + total;
+        }
     return -1;
 }
 
+// Each chunk of ranks writes its own stretch of every strip, so ranks stay in order whoever writes.
 template <class S> void fill_entries(const PlanView<S>& plan, int threads, int32_t* entries) {
-    auto fill = [&](int task, int) {
-        const int64_t base = int64_t(task / plan.strips) * plan.count;
-        const int32_t row0 = task % plan.strips * kStripRows, row1 = row0 + kStripRows;
-        int32_t* out = entries + plan.strip_starts[task];
-        for (int32_t rank = 0; rank < plan.shown[task / plan.strips]; ++rank) {
-            const Box& box = plan.boxes[base + rank];
-            if (box.row0 < row1 && box.row1 > row0) *out++ = rank;
-        }
+    const Bins bins(plan.poses, plan.count, plan.strips);
+    std::vector<int32_t> counts(bins.size());
+    auto each = [&](int task, auto visit) {
+        const int64_t pose = task / bins.chunks, begin = int64_t(task % bins.chunks) * kBinned;
+        const int64_t end = std::min<int64_t>(begin + kBinned, plan.shown[pose]);
+        const Box* boxes = plan.boxes + pose * plan.count;
+        for (int64_t rank = begin; rank < end; ++rank)
+            for (int strip = boxes[rank].row0 / kStripRows; strip <= (boxes[rank].row1 - 1) / kStripRows; ++strip) visit(int32_t(rank), strip);
     };
-    parallel_for(plan.poses * plan.strips, threads, fill);
+    auto count = [&](int task, int) {
+        int32_t* mine = counts.data() + bins.of(task);
+        each(task, [&](int32_t, int strip) { ++mine[strip]; });
+    };
+    parallel_for(plan.poses * bins.chunks, threads, count);
+    for (int pose = 0; pose < plan.poses; ++pose)
+        for (int strip = 0; strip < plan.strips; ++strip) {
+            int32_t before = 0;
+            for (int k = 0; k < bins.chunks; ++k) before += std::exchange(counts[bins.of(pose * bins.chunks + k) + strip], before);
+        }
+    auto write = [&](int task, int) {
+        int32_t* next = counts.data() + bins.of(task);
+        const int64_t* starts = plan.strip_starts + int64_t(task / bins.chunks) * plan.strips;
+        each(task, [&](int32_t rank, int strip) { entries[starts[strip] + next[strip]++] = rank; });
+    };
+    parallel_for(plan.poses * bins.chunks, threads, write);
 }
 
 template int64_t make_plan(const PlanArgs<float>&);
