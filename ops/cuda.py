@@ -59,9 +59,8 @@ def freeze(
             means, quats, scales, opacities, extinctions, plan.pose.position, plan.pose.rotation
         )
         tensors = [*cuda_kernels.view_of(means, buffers, whole, real), *model, None, blocks, ends]
-        cuda_kernels.run(
-            "weights", means, *tensors, whole=whole, real=real, poses=1, count=n, capacity=capacity
-        )
+        sizes = {"poses": 1, "count": n, "capacity": capacity}
+        cuda_kernels.run("weights", means, *tensors, whole=whole, real=real, sizes=sizes)
     order = buffers[2][0, : int(buffers[3][0])].to(torch.int64)
     rank_of = order.new_zeros(n)
     rank_of[order] = torch.arange(len(order), device=order.device)
@@ -77,5 +76,7 @@ def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Ten
     image = features.new_empty(features.shape[1], grid.height, grid.width)
     whole = (grid.height, grid.width)
     if features.shape[1] > 0:
-        cuda_kernels.run("thaw", features, *buffers, features, image, whole=whole, channels=features.shape[1])
+        cuda_kernels.run(
+            "thaw", features, *buffers, features, image, whole=whole, sizes={"channels": features.shape[1]}
+        )
     return image

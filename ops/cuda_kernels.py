@@ -48,7 +48,7 @@ def run(
     *tensors: Tensor | None,
     whole: Sequence[int] = (),
     real: Sequence[float] = (),
-    **sizes: int,
+    sizes: dict[str, int],
 ) -> None:
     """Call a kernel with addresses of tensors and scratch memory, on the stream of `like`'s device."""
     library, device = libraries[like.device.type], like.device
@@ -103,14 +103,25 @@ def plan(
     tensors = native._plan_tensors(means, poses, whole[0])
     starts = poses * tiles(whole) + 1
     if n == 0:
-        return (*(t.zero_() for t in tensors[:6]), tensors[3].new_zeros(starts), *tensors[6:])
+        return (*(t.zero_() for t in tensors[:6]), tensors[3].new_zeros(starts), *tensors[6:])  # type: ignore[return-value]
     *buffers, means2d, radii, visible = tensors
     model = [t.contiguous() for t in (means, quats, scales, strongest)]
     view = [positions.contiguous(), rotations.contiguous()]
     verdict = means.new_empty(2, dtype=torch.int64)
-    names = {"whole": whole, "real": real, "poses": poses, "count": n}
+    sizes = {"poses": poses, "count": n}
     outputs = (None if ids is None else ids.contiguous(), means2d, radii, visible, verdict)
-    run("plan", means, *view_of(means, buffers, whole, real), *model, None, *view, *outputs, **names)
+    run(
+        "plan",
+        means,
+        *view_of(means, buffers, whole, real),
+        *model,
+        None,
+        *view,
+        *outputs,
+        whole=whole,
+        real=real,
+        sizes=sizes,
+    )
     key = (poses, n, tuple(whole))
     if _capturing(means):
         if key not in _capacities:
@@ -125,8 +136,9 @@ def plan(
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     native._check_memory(capacity, BYTES_PER_ENTRY)
     buffers.append(means.new_empty(starts + 2 * capacity, dtype=torch.int32))
-    run("bin", means, *view_of(means, buffers, whole, real), capacity=capacity, **names)
-    return (*buffers, means2d, radii, visible)
+    sizes["capacity"] = capacity
+    run("bin", means, *view_of(means, buffers, whole, real), whole=whole, real=real, sizes=sizes)
+    return (*buffers, means2d, radii, visible)  # type: ignore[return-value]
 
 
 def _by_gaussian(features: Tensor, poses: int) -> Tensor:
@@ -163,15 +175,8 @@ def composite(
     rows = _by_gaussian(features, poses)
     tensors = [*view_of(means, buffers, whole, real), *model, rows, image, transmittance]
     sizes = {"poses": poses, "count": means.shape[0], "channels": _channels(features, poses)}
-    run(
-        "composite",
-        means,
-        *tensors,
-        whole=whole,
-        real=real,
-        capacity=capacity_of(buffers, poses, whole),
-        **sizes,
-    )
+    sizes["capacity"] = capacity_of(buffers, poses, whole)
+    run("composite", means, *tensors, whole=whole, real=real, sizes=sizes)
     return image, transmittance
 
 
@@ -205,7 +210,7 @@ def composite_backward(
     tensors = [*view_of(means, buffers, whole, real), *model, *inputs, *grads, slopes, screen]
     sizes = {"poses": poses, "count": n, "channels": channels, "capacity": capacity}
     if n > 0:
-        run("composite_backward", means, *tensors, whole=whole, real=real, **sizes)
+        run("composite_backward", means, *tensors, whole=whole, real=real, sizes=sizes)
     if poses == 1:
         samples, _, width = features.shape
         slopes = slopes.reshape(n, samples, width).permute(1, 0, 2).contiguous()
@@ -231,7 +236,7 @@ def weights(
     tensors = [*view_of(means, buffers, whole, real), *model, sums, None, None]
     if n > 0:
         sizes = {"poses": poses, "count": n, "capacity": capacity_of(buffers, poses, whole)}
-        run("weights", means, *tensors, whole=whole, real=real, **sizes)
+        run("weights", means, *tensors, whole=whole, real=real, sizes=sizes)
     return sums[..., 0].clone(), sums[..., 1].clone()
 
 
@@ -258,7 +263,7 @@ def weights_backward(
     tensors = [*view_of(means, buffers, whole, real), *model, *slopes, *grads]
     if n > 0:
         sizes = {"poses": poses, "count": n, "channels": 1, "capacity": capacity}
-        run("weights_backward", means, *tensors, whole=whole, real=real, **sizes)
+        run("weights_backward", means, *tensors, whole=whole, real=real, sizes=sizes)
     return native._filled(grads, means)
 
 
@@ -269,7 +274,7 @@ def evaluate(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     out = encoded.new_empty(samples, count, channels)
     sizes = {"samples": samples, "count": count, "channels": channels}
     if out.numel():
-        run("networks", encoded, *inputs, out, whole=(width, hidden), **sizes)
+        run("networks", encoded, *inputs, out, whole=(width, hidden), sizes=sizes)
     return out
 
 
@@ -282,7 +287,7 @@ def evaluate_backward(
     grads = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs[1:5]]
     sizes = {"samples": samples, "count": count, "channels": channels}
     if slope.numel():
-        run("networks_backward", encoded, *inputs, *grads, whole=(width, hidden), **sizes)
+        run("networks_backward", encoded, *inputs, *grads, whole=(width, hidden), sizes=sizes)
     return grads[0], grads[1], grads[2], grads[3]
 
 

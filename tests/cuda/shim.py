@@ -39,9 +39,9 @@ def gpu() -> cuda_library.Library:
 def on_gpu(run: Callable) -> Callable:
     """`run` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
 
-    def there(name, like, *tensors, **sizes):
+    def there(name, like, *tensors, **options):
         moved = [None if t is None else t.cuda() for t in tensors]
-        run(name, torch.empty(0, dtype=like.dtype, device="cuda"), *moved, **sizes)
+        run(name, torch.empty(0, dtype=like.dtype, device="cuda"), *moved, **options)
         torch.cuda.synchronize()
         for tensor, copy in zip(tensors, moved, strict=True):
             if tensor is not None:
