@@ -20,6 +20,7 @@ METHODS = {
     "gp": "gsparc.peers.gp.GaussianProcess",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "array": "gsparc.array.field.ArrayField",
+    "array_mirrored": "gsparc.array.mirrored_field.MirroredField",
     "gsparc": "gsparc.best.Gsparc",
 }
 

@@ -106,8 +106,8 @@ def distil(teacher: VectorProcess, settings: PacketSettings, seed: int) -> WaveP
     centres = places[rng.integers(0, n, count)]
     centres = centres + settings.jitter * widths[:, None] * rng.standard_normal((count, 3))
     waves = settings.pitch / widths[:, None] * student_t(count, rng)
-    parts = (torch.from_numpy(part) for part in (centres, widths, waves, places.mean(0)))
-    field = WavePackets(*parts, elements=m).double()
+    c, s, w, origin = (torch.from_numpy(part) for part in (centres, widths, waves, places.mean(0)))
+    field = WavePackets(c, s, w, origin, m).double()
     reach = np.exp(rng.uniform(np.log(settings.near), np.log(settings.far), (settings.samples, 1))) * length
     around = places[rng.integers(0, n, settings.samples)] + reach * rng.standard_normal((settings.samples, 3))
     asked = np.concatenate([places, places, around])

@@ -1,0 +1,288 @@
+"""The array methods end to end: renderer, packets, process, tuning, storing, queries."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from known_arrays import array_site, measure, room_vectors, walk
+
+from gsparc import checkpoint
+from gsparc.array.field import ArrayField
+from gsparc.array.mirrored_field import MirroredField, TuningSettings
+from gsparc.array.packets import PacketSettings, WavePackets, distil
+from gsparc.array.process import Kernel, learn_process, mirror_elements, settle, twin
+from gsparc.array.render import SpectrumRenderer, spectra
+from gsparc.array.response import steering
+from gsparc.array.search import SearchSettings
+from gsparc.array.tuning import tune
+from gsparc.data.load import load, split_for
+from gsparc.data.rfid import planar_array
+from gsparc.data.splits import Fold, Split, indices_hash
+from gsparc.ops import SphereGrid
+from gsparc.registry import method_class
+from gsparc.scoring import score
+
+SMALL = PacketSettings(count=300, samples=1500)
+
+
+def _fold(rows, seed=0):
+    order = np.random.default_rng(seed).permutation(rows)
+    cut = rows // 5
+    return Fold(np.sort(order[2 * cut :]), np.sort(order[cut : 2 * cut]), np.sort(order[:cut]))
+
+
+def _split(rows):
+    folds = (_fold(rows),)
+    return Split("known", folds, indices_hash(folds))
+
+
+@pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
+@pytest.mark.parametrize("height", [0.0, 0.07])
+def test_renderer_equals_the_plain_beamformer(grid, height):
+    """With and without the half-turn shortcut: on any grid, and with an element out of the plane [m]."""
+    array = planar_array()
+    array[3, 2] = height
+    rng = np.random.default_rng(0)
+    site, background = array_site(grid, array), torch.from_numpy(rng.random((grid.height, grid.width)))
+    h = torch.from_numpy(rng.normal(size=(3, 16)) + 1j * rng.normal(size=(3, 16))) / 30
+    share = torch.tensor([[0.0], [0.5], [1.0]], dtype=torch.float64)
+    expected = (spectra(site, h).square() + share[:, :, None].square() * background.square()).sqrt()
+    renderer = SpectrumRenderer(site, background)
+    extended = torch.cat([h, share.to(h.dtype)], 1).to(torch.complex64)
+    assert renderer.half_turn == (grid.width == 10 and height == 0)
+    torch.testing.assert_close(renderer(extended).double(), expected, atol=2e-4, rtol=1e-4)
+    torch.testing.assert_close(renderer.draw(extended), renderer(extended).clamp(max=1))
+
+
+def test_renderer_slopes():
+    site = array_site(SphereGrid.hemisphere(4, 6), planar_array(2, 2))
+    renderer = SpectrumRenderer(site, torch.rand(4, 6)).double()
+    h = torch.randn(2, 5, dtype=torch.complex128)
+    real = torch.view_as_real(h).clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: renderer(torch.view_as_complex(v)), [real])
+
+
+def test_packets_know_nothing_far_away():
+    packets = WavePackets(torch.rand(20, 3), torch.full((20,), 0.1), torch.randn(20, 3), torch.zeros(3), 4)
+    with torch.no_grad():
+        packets.gains.normal_()
+        out = packets(torch.tensor([[50.0, 0.0, 0.0], [1e4, -1e4, 3.0]]))
+    assert torch.equal(out[:, :4], torch.zeros_like(out[:, :4])) and (out[:, 4] == 1).all()
+
+
+def test_packets_slopes():
+    c, w = torch.rand(6, 3).double(), torch.randn(6, 3).double()
+    packets = WavePackets(c, torch.full((6,), 0.3).double(), w, torch.zeros(3), 2).double()
+    with torch.no_grad():
+        packets.gains.normal_()
+        packets.gains[:, -2:] *= 0.01  # off the bounds of the share
+        packets.bias[-2] = 0.5
+    x = torch.rand(3, 3).double().requires_grad_()
+    assert torch.autograd.gradcheck(lambda v: torch.view_as_real(packets(v)), [x])
+
+
+def test_settling_undoes_phases_and_twins(known_campaign):
+    """Scrambled vectors of a smooth field predict each other again."""
+    data, truth = known_campaign
+    partner, rng = mirror_elements(data.site.array), np.random.default_rng(1)
+    scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
+    mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
+    mixed[::3] = twin(mixed[::3], partner)
+    kernel = Kernel(0.2, 1e-3)
+    inverse = np.linalg.inv(kernel.gram(data.tx))
+    process = learn_process(mixed, data.tx, partner, kernel)
+    left_out = process.vectors - (inverse @ process.vectors) / np.diag(inverse)[:, None]
+    agree = np.abs((left_out.conj() * process.vectors).sum(1)) / np.linalg.norm(left_out, axis=1)
+    assert np.median(agree) > 0.99
+    assert np.allclose(settle(process.vectors, inverse, partner, 1), process.vectors, atol=0.02)
+
+
+def test_leave_out_with_gaps_equals_refitting(known_campaign):
+    """The small systems of the tuning give what a process without those samples gives."""
+    from gsparc.array import tuning
+
+    data, truth = known_campaign
+    x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
+    kernel = Kernel(0.15, 0.01)
+    distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
+    matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
+    looks = tuning._Looks(
+        x, np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
+    )
+    left, error = looks.predictions(kernel, np.linalg.inv(kernel.gram(x)), v)
+    far = distance[7] > 0.03
+    weights = np.linalg.solve(kernel.gram(x[far]), kernel.cross(x[far], x[7:8]))[:, 0]
+    assert left[0, 0] == pytest.approx(1 - weights @ kernel.cross(x[far], x[7:8])[:, 0], rel=1e-6)
+    assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
+
+
+def test_packets_answer_like_their_teacher(known_campaign):
+    data, truth = known_campaign
+    scale = truth / np.abs(truth).max()
+    teacher = learn_process(scale, data.tx, None, Kernel(0.15, 1e-3))
+    packets = distil(teacher, PacketSettings(count=600, samples=2500), seed=0)
+    asked = data.tx[::7] + 0.01
+    mean, left = teacher.posterior(asked)
+    with torch.no_grad():
+        out = packets(torch.from_numpy(asked).float()).numpy()
+    assert np.linalg.norm(out[:, :-1] - mean) < 0.03 * np.linalg.norm(mean)
+    assert np.abs(out[:, -1].real - np.sqrt(left)).max() < 0.1
+
+
+def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
+    data, truth = known_campaign
+    images = data.target.reshape(160, -1).astype(np.float32) / 255
+    matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()
+    scaled = truth / np.abs(truth @ matrix.conj()).max(1, keepdims=True)
+    chosen = tune(scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array))
+    a, b = chosen.error_model()
+    assert 0.05 < chosen.kernel.length < 1.0 and a > 0 and b > 0
+    assert np.corrcoef(chosen.left, np.log(chosen.error))[0, 1] > 0.5
+
+
+def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
+    data, _ = known_campaign
+    split = _split(160)
+    method = ArrayField(SMALL, cache=False)
+    report = method.fit(data, split.folds[0], tmp_path)
+    assert report.seconds > 0 and (tmp_path / "array_recovery.csv").exists()
+    nearest = method_class("nearest")()
+    nearest.fit(data, split.folds[0], tmp_path)
+    ours, theirs = (score([m], data, split) for m in (method, nearest))
+    assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    again, _ = checkpoint.load(tmp_path / "model.ckpt")
+    batch = data.batch(split.folds[0].test)
+    one, other = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    assert torch.equal(one.mean, other.mean) and torch.equal(one.variance, other.variance)
+    assert again.size() == 300
+
+
+def test_confidence_falls_and_error_grows_with_distance(known_campaign, tmp_path):
+    data, _ = known_campaign
+    method = ArrayField(SMALL, cache=False)
+    method.fit(data, _fold(160), tmp_path)
+    batch = data.batch(np.array([40]))
+    away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
+    found = method.predict(batch.tx + away, batch.rx)
+    assert (found.confidence.diff() < 0).all() and (found.variance.diff() > 0).all()
+    assert found.confidence[-1] == 0 and found.mean.min() >= 0 and found.mean.max() <= 1
+    torch.testing.assert_close(found.mean[-1], method.background, atol=1e-3, rtol=0)
+
+
+def test_position_errors_cost_smoothly(known_campaign, tmp_path):
+    """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
+    data, _ = known_campaign
+    method = ArrayField(SMALL, cache=False)
+    method.fit(data, _fold(160), tmp_path)
+    batch = data.batch(np.arange(0, 160, 8))
+    still = method.predict(batch.tx, batch.rx).mean
+    moved = [method.predict(batch.tx + shift, batch.rx).mean for shift in (0.001, 0.01, 0.1)]
+    error = [float((m - still).square().mean().sqrt()) for m in moved]
+    assert error[0] < 0.02 and error[0] < error[1] < error[2]
+
+
+def test_same_seed_same_answer(known_campaign, tmp_path):
+    data, _ = known_campaign
+    batch = data.batch(np.arange(3))
+    answers = []
+    for seed in (0, 0, 1):
+        method = ArrayField(SMALL, cache=False, seed=seed)
+        method.fit(data, _fold(160), tmp_path)
+        answers.append(method.predict(batch.tx, batch.rx).mean)
+    assert torch.equal(answers[0], answers[1]) and not torch.equal(answers[0], answers[2])
+
+
+def test_many_rows_are_thinned(known_campaign, tmp_path):
+    data, _ = known_campaign
+    method = ArrayField(SMALL, rows=40, cache=False)
+    method.fit(data, _fold(160), tmp_path)
+    assert method.seen == 40
+
+
+def test_refuses_what_has_no_array(campaign, tmp_path):
+    for kind in (ArrayField, MirroredField):
+        with pytest.raises(ValueError, match="no antenna array"):
+            kind().fit(campaign("spectrum", 12), _fold(12), tmp_path)
+        with pytest.raises(RuntimeError, match="not been trained"):
+            kind().predict(torch.zeros(1, 3), None)
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_very_few_rows(known_campaign, tmp_path, rows):
+    data, _ = known_campaign
+    method = ArrayField(SMALL, cache=False)
+    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 10)), tmp_path)
+    batch = data.batch(np.arange(4))
+    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+
+
+def test_duplicate_positions(known_campaign, tmp_path):
+    data, _ = known_campaign
+    data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
+    method = ArrayField(SMALL, cache=False)
+    method.fit(data, _fold(160), tmp_path)
+    batch = data.batch(np.arange(4))
+    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+
+
+def test_mirrored_arrays_learn_a_single_source(tmp_path):
+    """Free space: the direct path alone, exact everywhere, also far from every sample."""
+    site = array_site(SphereGrid.hemisphere(24, 48), planar_array())
+    tx = walk(60)
+    far = tx[:10] + np.array([0.5, 0.5, 0.2])
+    every = np.concatenate([tx, far])
+    vectors, _ = room_vectors(every, 0, planar_array())
+    data = measure(site, every, vectors, sha256="free space")
+    method = MirroredField(
+        SearchSettings(sources=3, candidates=300, polished=4), TuningSettings(steps=3), cache=False
+    )
+    method.fit(data, Fold(np.arange(50), np.arange(50, 60), np.arange(60, 70)), tmp_path)
+    batch = data.batch(np.arange(60, 70))
+    error = (method.predict(batch.tx, batch.rx).mean - batch.target).square().mean().sqrt()
+    assert error < 0.01
+    checkpoint.save(tmp_path / "mirrored.ckpt", method)
+    again, _ = checkpoint.load(tmp_path / "mirrored.ckpt")
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, method.predict(batch.tx, batch.rx).mean)
+
+
+@pytest.mark.slow
+def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
+    """Real spectra: paired differences to the image GP."""
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    ahead = {}
+    for name in ("random", "grouped"):
+        split = split_for({"name": name}, data)
+        scores = []
+        for kind in (ArrayField, method_class("gp")):
+            methods = [kind() for _ in split.folds]
+            for method, fold in zip(methods, split.folds, strict=True):
+                method.fit(data, fold, tmp_path)
+            scores.append(score(methods, data, split))
+        ahead[name] = [
+            (scores[0].samples[k] - scores[1].samples[k]).mean() for k in ("ssim_gauss", "psnr_db")
+        ]
+    assert ahead["random"][0] > 0 and ahead["random"][1] > 0
+    assert ahead["grouped"][0] > 0.02 and ahead["grouped"][1] > 0.5
+
+
+@pytest.mark.slow
+def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
+    data = load({"name": "rfid", "root": str(real_rfid)})
+    method = ArrayField()
+    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path)
+    batch, times = data.batch(np.array([0])), []
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for _ in range(300):
+            begin = time.perf_counter()
+            method.predict(batch.tx, batch.rx)
+            times.append(time.perf_counter() - begin)
+    finally:
+        torch.set_num_threads(threads)
+    assert np.median(times[50:]) < 1e-3

@@ -1,0 +1,88 @@
+"""`h = A z`, `|A^H h|`, its lags and the normalisation, against sums written out and the simulator."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.array import response
+from gsparc.data.rfid import planar_array
+from gsparc.ops import SphereGrid
+from gsparc.simulate import rfid_sim
+
+WAVELENGTH = 0.3259
+
+
+def _vectors(rows, elements, seed=0):
+    rng = np.random.default_rng(seed)
+    return torch.from_numpy(rng.normal(size=(rows, elements)) + 1j * rng.normal(size=(rows, elements)))
+
+
+def test_steering_is_the_simulators():
+    grid, array = SphereGrid.hemisphere(6, 8), planar_array()
+    ours = response.steering(array, grid, WAVELENGTH)
+    np.testing.assert_allclose(ours.numpy(), rfid_sim.steering(array, grid, WAVELENGTH), atol=1e-6)
+
+
+@pytest.mark.parametrize("array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2])
+def test_squared_spectrum_is_linear_in_the_lags(array):
+    grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
+    lags = response.lags(array, WAVELENGTH)
+    direct = response.bartlett(h, response.steering(array, grid, WAVELENGTH)) ** 2
+    torch.testing.assert_close(lags.of(h) @ lags.basis(grid, WAVELENGTH).T, direct)
+    v = torch.cat([h.real, h.imag], 1)
+    torch.testing.assert_close(torch.einsum("bi,kij,bj->bk", v, lags.forms(), v), lags.of(h))
+
+
+def test_a_square_array_has_49_lags():
+    assert response.lags(planar_array(), WAVELENGTH).count == 49
+    assert response.lags(planar_array(2, 3), WAVELENGTH).count == 15
+
+
+def test_array_output_is_the_weighted_sum_over_directions():
+    grid, array = SphereGrid.hemisphere(4, 6), planar_array(2, 2)
+    z = _vectors(1, 24).view(1, 4, 6)
+    pattern = response.element_pattern(grid, 1.5)
+    h = response.array_output(z, response.steering(array, grid, WAVELENGTH), grid, pattern)
+    expected = torch.zeros(4, dtype=torch.complex128)
+    for i in range(4):
+        for j in range(6):
+            u = grid.directions()[i, j].numpy()
+            turn = np.exp(2j * np.pi / WAVELENGTH * array @ u)
+            weight = grid.solid_angles()[i, j] * max(u[2], 0) ** 1.5
+            expected += z[0, i, j] * weight * torch.from_numpy(turn)
+    torch.testing.assert_close(h[0], expected)
+
+
+@pytest.mark.parametrize("how", ["max", "minmax", "power", "none"])
+def test_slopes_through_the_array_and_the_normalisation(how):
+    grid, array = SphereGrid.hemisphere(3, 4), planar_array(2, 2)
+    matrix = response.steering(array, grid, WAVELENGTH)
+
+    def splat_then_array(real, imag):
+        h = response.array_output(torch.complex(real, imag), matrix, grid)
+        return response.normalised(response.bartlett(h, matrix), how)
+
+    parts = [v.clone().requires_grad_() for v in torch.view_as_real(_vectors(2, 12).view(2, 3, 4)).unbind(-1)]
+    assert torch.autograd.gradcheck(splat_then_array, parts)
+
+
+def test_slope_where_the_spectrum_vanishes_is_zero_not_nan():
+    matrix = torch.ones(2, 1, dtype=torch.complex128)
+    h = torch.tensor([[1.0 + 0j, -1.0]], dtype=torch.complex128, requires_grad=True)
+    response.bartlett(h, matrix).sum().backward()
+    assert torch.equal(h.grad, torch.zeros_like(h))
+
+
+def test_normalised_silence_is_finite():
+    for how in ("max", "minmax", "power", "none"):
+        assert torch.isfinite(response.normalised(torch.zeros(1, 5), how)).all()
+    with pytest.raises(ValueError, match="median"):
+        response.normalised(torch.zeros(1, 5), "median")
+
+
+def test_sites_without_an_array_are_named(campaign):
+    assert "no antenna array" in response.site_problem(campaign("spectrum", 4).site)
+    assert "csi" in response.site_problem(campaign("csi", 4).site)
+    assert "receiver moves" in response.site_problem(campaign("spectrum", 4, "tx").site)
