@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gsparc.coherent.process import JITTER, Posterior, Scene, steering
 from gsparc.coherent.rows import Rows
-from gsparc.coherent.visibility import View
+from gsparc.coherent.visibility import KernelVisibility, View
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,13 @@ class PhasedPosterior:
         power = self.scene.log_amplitude.mul(2).exp()
         raw = (self.waves.conj() * power).T[:, :, None] * alpha
         return torch.complex(along * raw.real, across * raw.imag)
+
+    @property
+    def mean_gains(self) -> Tensor:
+        """Each source's gain (K, R) complex64 as far as it is the same everywhere."""
+        law = self.scene.visibility
+        share = float(law.constant) if isinstance(law, KernelVisibility) else 1.0
+        return share * self.pulled.sum(1) * torch.polar(torch.ones(()), self.phased.phase)[:, None]
 
     def gains(self, places: Tensor) -> Tensor:
         """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m]."""

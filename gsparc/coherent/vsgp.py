@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import time
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,23 +12,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.coherent.ensemble import Budget, Member, search_many, weights
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
+from gsparc.coherent.offsets import KINDS, Offsets, estimate
+from gsparc.coherent.phase import ranges, wave_over_band
 from gsparc.coherent.process import Scene
 from gsparc.coherent.query import Query
-from gsparc.coherent.rows import Rows, gather, query_elements, tones_of
-from gsparc.coherent.search import Search, SearchSettings
-from gsparc.coherent.settle import settle
+from gsparc.coherent.rows import Rows, elements, gather, query_elements, tones_of
+from gsparc.coherent.search import SearchSettings
 from gsparc.coherent.visibility import KernelVisibility
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 
-log = logging.getLogger(__name__)
-
 SECONDS_PER_MEASUREMENT = 0.4  # a conference room of 350 gets 140 s
-TURNING = 0.4  # share of a gain's variation that is not along its phase, before it is learned
 LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 480.0
+ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
+ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
 
 
 @dataclass(frozen=True)
@@ -62,6 +61,7 @@ class VirtualSourceGP(Method):
         search_rows: receivers times tones that a search looks at.
         rows: receivers times tones that the final process holds.
         margin, max_sources, order: see `SearchSettings`.
+        offsets: what every snapshot has of its own: `none`, `phase`, or `phase_timing`; it is estimated.
         seed: of everything random.
 
     Raises:
@@ -72,20 +72,24 @@ class VirtualSourceGP(Method):
 
     def __init__(
         self,
-        searches: int = 4,
+        searches: int = 6,
         budget_s: float | None = None,
         search_rows: int = 700,
         rows: int = 3000,
         margin: float = 8.0,
         max_sources: int = 60,
         order: int = 3,
+        offsets: Offsets = "none",
         seed: int = 0,
     ) -> None:
+        if offsets not in KINDS:
+            raise ValueError(f"vsgp: offsets={offsets!r} is none of {', '.join(KINDS)}")
         if searches < 1:
             raise ValueError(f"vsgp: searches must be at least 1, got {searches}")
         if search_rows < 8 or rows < 8:
             raise ValueError(f"vsgp: search_rows and rows must be at least 8, got {search_rows} and {rows}")
         self.searches, self.budget_s, self.seed = searches, budget_s, seed
+        self.offsets = offsets
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
         self.site: Site | None = None
@@ -103,53 +107,72 @@ class VirtualSourceGP(Method):
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
         held = self.frame.inside(everything)
-        scenes, notes = self._search_all(data, known, started)
-        self.members = [PhasedPosterior(held, scene, self.noise_floor) for scene in scenes]
+        notes = []
+        if self.offsets != "none":
+            data = self._aligned(data, known)
+            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+            notes.append(f"vsgp: {self.offsets} of every snapshot estimated; predictions have none")
+        budget = Budget(started, self._budget(len(known)))
+        found = self._search(data, known, self.settings, self.searches, budget)
+        self.weights = weights(found)
+        self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
+        counts = ", ".join(str(len(member.scene.words)) for member in self.members)
+        notes.append(
+            f"vsgp: {len(found)} of {self.searches} searches within {budget.seconds:.0f} s, {counts} sources"
+        )
         return FitReport(time.monotonic() - started, tuple(notes))
 
-    def _search_all(
-        self, data: Measurements, known: np.ndarray, started: float
-    ) -> tuple[list[PhasedScene], list[str]]:
-        budget = self.budget_s
-        if budget is None:
-            budget = min(max(SECONDS_PER_MEASUREMENT * len(known), LEAST_BUDGET_S), MOST_BUDGET_S)
-        threads = torch.get_num_threads()
-        longest = 0.0
+    def _budget(self, measurements: int) -> float:
+        if self.budget_s is not None:
+            return self.budget_s
+        return min(max(SECONDS_PER_MEASUREMENT * measurements, LEAST_BUDGET_S), MOST_BUDGET_S)
 
-        def search(number: int) -> PhasedScene | None:
-            nonlocal longest
-            begun = time.monotonic()
-            if number > 0 and begun + longest > started + budget:
-                return None
-            rows = self.frame.inside(gather(data, known, self.search_rows, self.seed + number))
-            finder = Search(
-                rows, self._start(data.site), self.settings, self.seed + number, started + 0.8 * budget
-            )
-            scene = finder.run()
-            phased = settle(rows, PhasedScene.of(rows, scene, TURNING), self.settings.visibility)
-            longest = max(longest, time.monotonic() - begun)
-            log.info(
-                "search %d of %d: %d sources over %d planes, %.0f of %.0f s",
-                number + 1, self.searches, len(scene.words), len(scene.planes),
-                time.monotonic() - started, budget,
-            )  # fmt: skip
-            return phased
+    def _search(
+        self, data: Measurements, known: np.ndarray, settings: SearchSettings, count: int, budget: Budget
+    ) -> list[Member]:
+        draw = [self._inside(data, known, self.search_rows, self.seed + i) for i in range(count)]
+        return search_many(draw, self._start(data.site), settings, self.seed, self.noise_floor, budget)
 
-        # Matrices of a few hundred rows gain nothing from two threads; two searches do.
-        torch.set_num_threads(1)
-        try:
-            with ThreadPoolExecutor(max(1, min(threads, self.searches))) as pool:
-                found = [one for one in pool.map(search, range(self.searches)) if one is not None]
-        finally:
-            torch.set_num_threads(threads)
-        counts = ", ".join(str(len(phased.scene.words)) for phased in found)
-        notes = [f"vsgp: {len(found)} of {self.searches} searches in {budget:.0f} s, {counts} sources"]
-        return found, notes
+    def _inside(self, data: Measurements, known: np.ndarray, limit: int, seed: int) -> Rows:
+        return self.frame.inside(gather(data, known, limit, seed))
 
     def _start(self, site: Site) -> Tensor:
         assert site.static_position is not None
         return torch.from_numpy(np.asarray(site.static_position, np.float64)) - self.frame.middle
+
+    def _aligned(self, data: Measurements, known: np.ndarray) -> Measurements:
+        """Offsets against the line of sight, then against ever more sources."""
+        start = self._start(data.site)
+        aligned = self._against(data, known, start[None], torch.ones(1, self.antennas))
+        for sources in ALIGNING:
+            few = replace(self.settings, max_sources=sources, final_steps=20)
+            now = Budget(time.monotonic(), LEAST_BUDGET_S)
+            phased = self._search(aligned, known, few, 1, now)[0].phased
+            for _ in range(ALIGNMENTS):
+                rows = self._inside(aligned, known, self.search_rows, self.seed)
+                gains = PhasedPosterior(rows, phased, self.noise_floor).mean_gains
+                aligned = self._against(data, known, phased.scene.sources, gains)
+        return aligned
+
+    def _against(self, data: Measurements, known: np.ndarray, sources: Tensor, gains: Tensor) -> Measurements:
+        """Targets of the known rows without the offsets they have against sources of constant gains."""
+        frequency = tones_of(data.site)
+        places = elements(data.site, data.moving[known], data.rx_rotation[known], self.antennas)
+        flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
+        waves = wave_over_band(ranges(flat, sources), torch.from_numpy(frequency))
+        if gains.shape[1] == 1 or places.shape[1] > 1:
+            gains = gains[:, :1]
+        predicted = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
+        predicted = predicted.reshape(len(known), -1, len(frequency)).numpy()
+        mask = None if data.mask is None else data.mask[known]
+        carrier = self.frame.carrier_hz
+        found = estimate(
+            data.target[known], predicted, frequency, carrier, self.offsets == "phase_timing", mask
+        )
+        target = data.target.copy()
+        target[known] = found.removed(data.target[known], frequency, carrier)
+        return replace(data, target=target)
 
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
@@ -167,8 +190,9 @@ class VirtualSourceGP(Method):
         flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
         tones = torch.from_numpy(tones_of(site))
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
-        mean = stack.mean(0)
-        variance = variance + (stack - mean).abs().square().mean(0).flatten(1).mean(1)
+        weight = self.weights[:, None, None, None]
+        mean = (weight * stack).sum(0)
+        variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
         loudness = (self.frame.carrier_hz / tones).float()
         mean = (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
         variance, prior = (v.reshape(count, per).mean(1) for v in (variance, prior))
@@ -185,6 +209,7 @@ class VirtualSourceGP(Method):
         rows = self.members[0].rows
         return {
             "antennas": self.antennas,
+            "weights": self.weights,
             "noise_floor": self.noise_floor,
             "frame": [self.frame.middle, self.frame.scale, self.frame.carrier_hz],
             "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
@@ -195,6 +220,7 @@ class VirtualSourceGP(Method):
         """See `Method.restore`."""
         self.site, self.antennas = site, int(state["antennas"])
         self.noise_floor = float(state["noise_floor"])
+        self.weights = state["weights"]
         self.frame = Frame(*state["frame"])
         rows = Rows(*state["rows"])
         self.members = [PhasedPosterior(rows, _scene(stored), self.noise_floor) for stored in state["scenes"]]

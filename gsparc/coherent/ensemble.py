@@ -1,0 +1,110 @@
+"""Several searches within a time budget, side by side on the threads there are."""
+
+from __future__ import annotations
+
+import logging
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
+from gsparc.coherent.rows import Rows
+from gsparc.coherent.search import Search, SearchSettings
+from gsparc.coherent.settle import settle
+
+log = logging.getLogger(__name__)
+
+TURNING = 0.4  # share of a gain's variation that is not along its phase, before it is learned
+SHARPNESS = 4  # weight of a search = (left-out error)^-4: half the error again counts a fifth
+ROUNDS_END = 0.8  # of the budget: what is left is for settling
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Wall-clock time for searching.
+
+    Attributes:
+        started: `time.monotonic()` of the fit.
+        seconds: no search starts that would end later.
+    """
+
+    started: float
+    seconds: float
+
+    @property
+    def spent(self) -> float:
+        """[s]"""
+        return time.monotonic() - self.started
+
+
+@dataclass(frozen=True)
+class Member:
+    """What one search found.
+
+    Attributes:
+        phased: the scene.
+        left_out: NMSE of its own rows, each receiver predicted from the others.
+    """
+
+    phased: PhasedScene
+    left_out: float
+
+
+def search_many(
+    draw: list[Rows],
+    transmitter: Tensor,
+    settings: SearchSettings,
+    seed: int,
+    noise_floor: float,
+    budget: Budget,
+) -> list[Member]:
+    """One search on each of the drawn rows, best first; at least one, others while the budget lasts.
+
+    Args:
+        draw: rows of each search, unit mean power, about the middle of the scene.
+        transmitter: (3,) float64 [m], in the same frame.
+        settings: of every search.
+        seed: of the first search; the others count on.
+        noise_floor: known variance of the noise, in units of the rows' power.
+        budget: of all together.
+    """
+    threads, longest = torch.get_num_threads(), 0.0
+
+    def search(number: int) -> Member | None:
+        nonlocal longest
+        begun = budget.spent
+        if number > 0 and begun + longest > budget.seconds:
+            return None
+        rows = draw[number]
+        deadline = budget.started + ROUNDS_END * budget.seconds
+        scene = Search(rows, transmitter, settings, seed + number, deadline).run()
+        phased = settle(
+            rows, PhasedScene.of(rows, scene, TURNING), settings.visibility, noise_floor=noise_floor
+        )
+        error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
+        left_out = float(error.abs().square().sum() / rows.target.abs().square().sum())
+        longest = max(longest, budget.spent - begun)
+        log.info(
+            "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
+            number + 1, len(draw), len(scene.words), len(scene.planes), left_out,
+            budget.spent, budget.seconds,
+        )  # fmt: skip
+        return Member(phased, left_out)
+
+    # Matrices of a few hundred rows gain little from two threads; two searches do.
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(max(1, min(threads, len(draw)))) as pool:
+            found = [member for member in pool.map(search, range(len(draw))) if member is not None]
+    finally:
+        torch.set_num_threads(threads)
+    return sorted(found, key=lambda member: member.left_out)
+
+
+def weights(members: list[Member]) -> Tensor:
+    """What each search counts in the average, (M,) float32 of sum 1."""
+    error = torch.tensor([max(member.left_out, 1e-6) for member in members])
+    return torch.softmax(-SHARPNESS * error.log(), 0)
