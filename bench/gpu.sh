@@ -40,7 +40,7 @@ sanitize() {
   local worst=0
   for tool in memcheck racecheck synccheck; do
     echo "-- $tool"
-    PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 150 compute-sanitizer --tool "$tool" --error-exitcode 7 \
+    PYTORCH_NO_CUDA_MEMORY_CACHING=1 timeout 95 compute-sanitizer --tool "$tool" --error-exitcode 7 \
       "$PYTHON" bench/gpu.py short || worst=$?
   done
   return $worst
@@ -49,9 +49,9 @@ export -f sanitize
 export PYTHON
 
 stage build 300 "$PYTHON" bench/gpu.py build "$OUT/cuda.json"
-stage tests 300 "$PYTHON" -P -m pytest tests/cuda -q --maxfail=20 -k "gpu or test_device" -p no:cacheprovider
-stage bench 240 "$PYTHON" bench/gpu.py bench "$OUT/cuda.json"
-stage sanitize 460 bash -c sanitize
-stage train 400 "$PYTHON" bench/gpu.py train "$OUT/cuda.json"
+stage tests 240 "$PYTHON" -P -m pytest tests/cuda -q --maxfail=20 -k "gpu or test_device" -p no:cacheprovider
+stage bench 200 "$PYTHON" bench/gpu.py bench "$OUT/cuda.json"
+stage sanitize 290 bash -c sanitize
+stage train 290 "$PYTHON" bench/gpu.py train "$OUT/cuda.json"
 "$PYTHON" bench/gpu.py table "$OUT/cuda.json" | tee "$OUT/cuda.md"
 [ -z "$FAILED" ] || { echo "failed:$FAILED"; exit 1; }
