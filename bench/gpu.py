@@ -83,6 +83,7 @@ def short() -> None:
 
 def train(file: Path) -> None:
     """The same short training on the CPU and on the GPU, through train.py."""
+    update(file, learning=guarded(lambda: measure.learning(200)))
     results: dict[str, Any] = {}
     for accelerator in ("gpu", "cpu"):
         folder = Path("build") / f"train-{accelerator}"
@@ -91,7 +92,10 @@ def train(file: Path) -> None:
         command += ["baselines=[zero,mean,nearest]", "dataset.root=build/stand-ins", "dataset.count=160"]
         command += ["model.effects.array=false", "model.effects.phase=false"]  # the splatted field
         started = time.perf_counter()
-        done = subprocess.run(command, capture_output=True, text=True, timeout=130)
+        try:
+            done = subprocess.run(command, capture_output=True, text=True, timeout=130)
+        except subprocess.TimeoutExpired as late:
+            done = subprocess.CompletedProcess(command, 124, "", str(late))
         results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": done.returncode}
         summary = folder / "summary.json"
         if done.returncode == 0 and summary.exists():
@@ -101,7 +105,6 @@ def train(file: Path) -> None:
         else:
             results[accelerator]["error"] = (done.stderr or done.stdout)[-1500:]
         update(file, train=results)
-    update(file, train=results, learning=guarded(lambda: measure.learning(200)))
     if any(result["exit"] for result in results.values()):
         raise SystemExit(1)
 
