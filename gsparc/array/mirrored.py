@@ -65,11 +65,17 @@ class MirroredArrays(nn.Module):
         power = self.paths(x).abs().square().sum((0, 2)) * self.gains.square().sum(1)
         return power / power.sum().clamp_min(1e-30)
 
+    def hold_first(self) -> None:
+        """Drop the first source's slopes of place and turn: the array itself stands where it was measured."""
+        for parameter in (self.positions, self.turns):
+            if parameter.grad is not None:
+                parameter.grad[0] = 0
+
     @torch.no_grad()
     def pruned(self, x: Tensor, least: float) -> MirroredArrays:
-        """The sources that contribute at least the share `least` at x; the strongest one always stays."""
-        share = self.contributions(x)
-        keep = (share >= least) | (share == share.max())
+        """The sources that contribute at least the share `least` at x; the first always stays."""
+        keep = self.contributions(x) >= least
+        keep[0] = True
         return MirroredArrays(
             self.array, self.wavelength, self.positions[keep], self.orthogonal()[keep],
             torch.view_as_complex(self.gains[keep].contiguous()),

@@ -20,7 +20,7 @@ from gsparc.array.mirrored import MirroredArrays
 from gsparc.array.process import Kernel, learn_process, mirror_elements
 from gsparc.array.render import SpectrumRenderer
 from gsparc.array.response import site_problem
-from gsparc.array.search import SearchSettings, explained, find_sources
+from gsparc.array.search import PROGRESS, SearchSettings, explained, find_sources
 from gsparc.array.store import recovered, report
 from gsparc.baselines import platform_cache
 from gsparc.data.schema import Measurements, Site
@@ -127,7 +127,8 @@ class MirroredField(Method):
             with torch.no_grad():
                 unit = reading / torch.linalg.vector_norm(reading, dim=1, keepdim=True).clamp_min(1e-30)
                 models.append((float(explained(model(x[cut:]), unit[cut:]).mean()), model))
-        score, model = max(models, key=lambda pair: pair[0])
+        # Of two readings that explain about as much, the one with fewer sources is the right one.
+        score, model = max(models, key=lambda pair: pair[0] - PROGRESS * len(pair[1].positions))
         images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum"))
         log.info("%s: %.1f %% of the judged vectors explained", self.name, 100 * score)
         self.site = site
@@ -164,6 +165,7 @@ class MirroredField(Method):
             rows = torch.randint(len(x), (settings.batch,), generator=generator)
             optimizer.zero_grad()
             spectrum_loss(self._spectra(x[rows]), images[rows]).mean().backward()
+            model.hold_first()
             optimizer.step()
             schedule.step()
 

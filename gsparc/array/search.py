@@ -18,6 +18,8 @@ from gsparc.array.mirrored import MirroredArrays, mirror, rotation, spherical
 
 log = logging.getLogger(__name__)
 
+PROGRESS = 1e-3  # of the share explained: less does not keep a source
+
 
 @dataclass(frozen=True)
 class SearchSettings:
@@ -111,7 +113,7 @@ def find_sources(
         model = _fitted(array, wavelength, positions, frames, x, unit)
         refine(model, x, unit, steps=20)
         now = judged(model)
-        if now > score + 1e-4:
+        if now > score + PROGRESS:
             best, score, waiting = model, now, 0
         else:
             waiting += 1
@@ -126,7 +128,7 @@ def find_sources(
 
 
 def refine(model: MirroredArrays, x: Tensor, unit: Tensor, steps: int) -> None:
-    """Positions, turns and gains by Adam on the unexplained share."""
+    """Positions, turns and gains by Adam on the unexplained share; the direct path stays where it is."""
     scale = float(model.gains.detach().abs().mean())
     optimizer = torch.optim.Adam(
         [
@@ -138,6 +140,7 @@ def refine(model: MirroredArrays, x: Tensor, unit: Tensor, steps: int) -> None:
     for _ in range(steps):
         optimizer.zero_grad()
         (1 - explained(model(x), unit)).mean().backward()
+        model.hold_first()
         optimizer.step()
 
 
