@@ -18,6 +18,7 @@ METHODS = {
     "nearest": "gsparc.peers.nearest.Nearest",
     "idw": "gsparc.peers.idw.InverseDistance",
     "gp": "gsparc.peers.gp.GaussianProcess",
+    "complex_gp": "gsparc.coherent.complex_gp.ComplexGP",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "array": "gsparc.array.field.ArrayField",
     "array_mirrored": "gsparc.array.mirrored_field.MirroredField",
