@@ -1,8 +1,8 @@
 """`model=complex_gp`: a Gaussian process on complex channels that knows the carrier but no sources.
 
 Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al., "Measurement
-of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2 envelope
-lets it fade with distance. Real and imaginary parts share one kernel: the circular complex process.
+of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2 law
+over distance lets it fade. Real and imaginary parts share one kernel: the circular complex process.
 """
 
 from __future__ import annotations
