@@ -96,7 +96,10 @@ def _fitted(make: Callable[[], Method], data: Measurements, fold: Fold, folder: 
 
 
 def _value(method: Method, data: Measurements, fold: Fold, figure: str) -> float:
-    return float(score((method,), data, Split("sensitivity", (fold,), ""), "test").figures()[figure])
+    value = score((method,), data, Split("sensitivity", (fold,), ""), "test").figures()[figure]
+    if value is None:
+        raise ValueError(f"{figure} is not defined on these test rows")
+    return value
 
 
 def draw(rows: list[Row], path: Path) -> None:
