@@ -16,7 +16,8 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>
     const CompositeArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const int k_count = kChannels ? kChannels : ranked.width - 2, cell = (2 + k_count) * n;
-    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max);
+    const Vec<S> alpha_max = splat(a.lens.alpha_max);
+    const Lit<S> lit = {cells, cell, splat(a.lens.transmittance_min)};
     const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
     fill(cells, int64_t(grid.tiles) * cell, S(0));
     for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
@@ -40,11 +41,9 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>
         if (kChannels)
             for (int k = 0; k < kChannels; ++k) local[k] = splat(S(0));
         else fill(sums_memory, int64_t(k_count) * n, S(0));
-        each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+        each_tile<S, kTangent, true>(strip, *entry, grid, a.lens, lit, [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> counts) __attribute__((always_inline)) {
             S* mine = cells + int64_t(tile) * cell;
             const Vec<S> light = load(mine);
-            const Mask<S> counts = inside & at_most(floor, light);
-            if (!any(counts)) return;
             const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha, through = S(1) - layer.gamma;
             Vec<S> gain = splat(S(0));
@@ -56,7 +55,7 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>
             }
             const Vec<S> behind = load(mine + n) - weight * gain;
             store(mine + n, behind);
-            store(mine, light * through);
+            store(mine, fma(-light, layer.gamma, light));
             const Vec<S> d_gamma = -behind * reciprocal(through);
             sums.add(layer, counts, kHides ? light * gain : fma(light, gain, d_gamma), d_gamma, t1, t2, form, alpha_max);
         });
@@ -179,14 +178,14 @@ void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Ranked<S>& ranke
             const S opacity = row[0], extinction = row[1];
             const Vec<S> per_seen = splat(row[2]), per_alpha = splat(row[3]);
             MomentSums<S, kTangent, kHides> sums;
-            each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+            each_tile<S, kTangent, true>(strip, *entry, grid, a.lens, Always<S>(), [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
                 S* mine = cells + int64_t(tile) * 2 * n;
                 const Vec<S> light = load(mine);
                 const Mask<S> lit = at_most(floor, light);
                 const Layer<S, kHides> layer(form, inside, opacity, extinction, alpha_max);
                 const Vec<S> gain = select(lit, per_seen, none), through = S(1) - layer.gamma;
                 const Vec<S> part = light * layer.alpha * gain;
-                store(mine, select(lit, light * through, light));
+                store(mine, select(lit, fma(-light, layer.gamma, light), light));
                 if (pass == 0) {
                     store(mine + n, load(mine + n) + part);
                     return;

@@ -170,6 +170,46 @@ void thaw(bool twice, int height, int width, int channels, int threads, const Ad
     });
 }
 
+template <class S> NetworkArgs<S> read_networks(Reader& in, const Ints& sizes, int threads) {
+    NetworkArgs<S> a;
+    a.samples = sizes.at(0), a.count = sizes.at(1), a.inputs = sizes.at(2), a.hidden = sizes.at(3), a.outputs = sizes.at(4);
+    a.threads = threads;
+    a.encoded = in.next<const S>(), a.weight1 = in.next<const S>(), a.bias1 = in.next<const S>();
+    a.weight2 = in.next<const S>(), a.bias2 = in.next<const S>(), a.out = in.next<S>();
+    return a;
+}
+
+void networks(bool twice, const Ints& sizes, int threads, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        kernels<S>().networks(read_networks<S>(in, sizes, threads));
+    });
+}
+
+void networks_backward(bool twice, const Ints& sizes, int threads, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        NetworkBackwardArgs<S> b;
+        b.forward = read_networks<S>(in, sizes, threads);
+        b.slope = in.next<const S>();
+        b.weight1 = in.next<S>(), b.bias1 = in.next<S>(), b.weight2 = in.next<S>(), b.bias2 = in.next<S>();
+        kernels<S>().networks_backward(b);
+    });
+}
+
+void similarity(const Ints& sizes, const Reals& stability, int threads, const Addresses& tensors) {
+    nb::gil_scoped_release unlocked;
+    Reader in{tensors};
+    SimilarityArgs a;
+    a.count = sizes.at(0), a.height = sizes.at(1), a.width = sizes.at(2), a.radius = sizes.at(3), a.threads = threads;
+    a.c1 = float(stability.at(0)), a.c2 = float(stability.at(1));
+    a.taps = in.next<const float>(), a.prediction = in.next<const float>(), a.target = in.next<const float>();
+    a.value = in.next<float>(), a.slope = in.next<float>();
+    kernels<float>().similarity(a);
+}
+
 // Exponentials accumulated by `tasks` tasks of the yardstick.
 int64_t mark_exponentials(int tasks, int threads) {
     nb::gil_scoped_release unlocked;
@@ -206,6 +246,9 @@ NB_MODULE(_native, module) {
     module.def("weights_backward", &weights_backward);
     module.def("freeze", &freeze);
     module.def("thaw", &thaw);
+    module.def("networks", &networks);
+    module.def("networks_backward", &networks_backward);
+    module.def("similarity", &similarity);
     module.def("mark_exponentials", &mark_exponentials);
     module.def("mark_copy", &mark_copy);
     module.def("mark_pairs", &mark_pairs);

@@ -28,21 +28,20 @@ void composite_strip(const CompositeArgs<S>& a, const Ranked<S>& ranked, const T
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const int k_count = kChannels ? kChannels : ranked.width - 2, cell = (1 + k_count) * n;
-    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max);
+    const Vec<S> alpha_max = splat(a.lens.alpha_max);
+    const Lit<S> lit = {cells, cell, splat(a.lens.transmittance_min)};
     fill(cells, int64_t(grid.tiles) * cell, S(0));
     for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
     for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
         if ((entry - strip.first) % 64 == 63 && !any_lit(cells, grid.tiles, cell, a.lens.transmittance_min)) break;
         const S* row = ranked.of(a.plan, strip.pose, *entry);
         const S opacity = row[0], extinction = row[1];
-        each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+        each_tile<S, kTangent, false>(strip, *entry, grid, a.lens, lit, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> counts) __attribute__((always_inline)) {
             S* mine = cells + int64_t(tile) * cell;
             const Vec<S> light = load(mine);
-            const Mask<S> counts = inside & at_most(floor, light);
-            if (!any(counts)) return;
             const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha;
-            store(mine, light * (S(1) - layer.gamma));
+            store(mine, fma(-light, layer.gamma, light));
             for (int k = 0; k < k_count; ++k) {
                 mine += n;
                 store(mine, fma(splat(row[2 + k]), weight, load(mine)));
@@ -81,14 +80,14 @@ void weigh_strip(const WeightArgs<S>& a, const Ranked<S>& ranked, const TileTabl
         const S* row = ranked.of(a.plan, strip.pose, *entry);
         const S opacity = row[0], extinction = row[1];
         Vec<S> seen = none, total = none;
-        each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+        each_tile<S, kTangent, false>(strip, *entry, grid, a.lens, Always<S>(), [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
             S* mine = before + tile * n;
             const Vec<S> light = load(mine);
             const Mask<S> lit = at_most(floor, light);
             const Layer<S, kHides> layer(form, inside, opacity, extinction, alpha_max);
             total += layer.alpha;
             seen += select(lit, light * layer.alpha, none);
-            store(mine, select(lit, light * (S(1) - layer.gamma), light));
+            store(mine, select(lit, fma(-light, layer.gamma, light), light));
         });
         S* slot = sums + 2 * strip.slot(*entry);
         slot[0] = sum<S>(seen), slot[1] = sum<S>(total);

@@ -10,18 +10,17 @@ template <class S, bool kTangent, bool kHides>
 void freeze_strip(const FreezeArgs<S>& a, const Ranked<S>& ranked, const TileTables<S>& grid, int task, S* before) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
-    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max);
+    const Vec<S> alpha_max = splat(a.lens.alpha_max);
+    const Lit<S> lit = {before, n, splat(a.lens.transmittance_min)};
     fill(before, int64_t(grid.tiles) * n, S(1));
     int64_t block = a.heads ? a.starts[task] : 0;
     for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
         const S* row = ranked.of(a.plan, strip.pose, *entry);
         const S opacity = row[0], extinction = row[1];
-        each_tile<S, kTangent>(strip, *entry, grid, a.lens, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
+        each_tile<S, kTangent, false>(strip, *entry, grid, a.lens, lit, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> counts) __attribute__((always_inline)) {
             const Vec<S> light = load(before + tile * n);
-            const Mask<S> counts = inside & at_most(floor, light);
-            if (!any(counts)) return;
             const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
-            store(before + tile * n, light * (S(1) - layer.gamma));
+            store(before + tile * n, fma(-light, layer.gamma, light));
             if (a.heads) {
                 a.heads[2 * block] = *entry, a.heads[2 * block + 1] = tile;
                 store(a.weights + block * n, light * layer.alpha);

@@ -2,7 +2,9 @@
 #define GSPARC_PACKS
 #include "backward.h"
 #include "frozen.h"
+#include "networks.h"
 #include "project.h"
+#include "similarity.h"
 #include "yardstick.h"
 
 namespace gsparc {
@@ -12,9 +14,11 @@ extern const Kernels<float> single_kernels;
 extern const Kernels<double> double_kernels;
 const Kernels<float> single_kernels = {project_range<float>, composite<float>, composite_backward<float>,
                                        weights<float>, weights_backward<float>, freeze<float>, thaw<float>,
+                                       networks<float>, networks_backward<float>, similarity,
                                        mark_exponentials, mark_copy, mark_pairs<float>};
 const Kernels<double> double_kernels = {project_range<double>, composite<double>, composite_backward<double>,
                                         weights<double>, weights_backward<double>, freeze<double>, thaw<double>,
+                                        networks<double>, networks_backward<double>, similarity,
                                         mark_exponentials, mark_copy, mark_pairs<double>};
 
 }  // namespace GSPARC_ISA

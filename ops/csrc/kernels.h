@@ -61,6 +61,26 @@ template <class S> struct ThawArgs {
     S* image;                       // (K, H, W)
 };
 
+template <class S> struct NetworkArgs {
+    int samples, count, inputs, hidden, outputs, threads;
+    const S *encoded, *weight1, *bias1, *weight2, *bias2;  // (B, E), (N, E, H), (N, H), (N, H, C), (N, C)
+    S* out;                         // (B, N, C)
+};
+
+template <class S> struct NetworkBackwardArgs {
+    NetworkArgs<S> forward;         // out unused
+    const S* slope;                 // (B, N, C)
+    S *weight1, *bias1, *weight2, *bias2;
+};
+
+// B images (H, W), seen through a separable window of 2 radius + 1 taps.
+struct SimilarityArgs {
+    int count, height, width, radius, threads;
+    const float *taps, *prediction, *target;
+    float c1, c2;
+    float *value, *slope;           // (B,), and (B, H, W) d value / d prediction, or null
+};
+
 // Returns -1, or 4 * Gaussian + (0 means, 1 quats, 2 scales, 3 opacities) for the first that is not sound.
 template <class S> struct Kernels {
     int64_t (*project)(const ProjectArgs<S>&, int begin, int end);
@@ -70,6 +90,9 @@ template <class S> struct Kernels {
     void (*weights_backward)(const WeightBackwardArgs<S>&);
     int (*freeze)(const FreezeArgs<S>&);  // returns the lanes of a block
     void (*thaw)(const ThawArgs<S>&);
+    void (*networks)(const NetworkArgs<S>&);
+    void (*networks_backward)(const NetworkBackwardArgs<S>&);
+    void (*similarity)(const SimilarityArgs&);
     void (*mark_exponentials)(int tasks, int threads, float* sums);  // see yardstick.h
     void (*mark_copy)(const char* from, char* to, int64_t bytes, int threads);
     int64_t (*mark_pairs)(const PlanView<S>&, const Lens<S>&, int threads);

@@ -12,7 +12,7 @@ template <class S, bool kHides> struct Layer {
 
     GSPARC_INLINE Layer(Vec<S> form, Mask<S> counts, S opacity, S extinction, Vec<S> alpha_max) {
         const Vec<S> none = splat(S(0));
-        shape = exponential(form * S(-0.5));
+        shape = bell<S>(form);
         emits = splat(opacity) * shape;
         alpha = select(counts, lesser<S>(emits, alpha_max), none);
         hides = kHides ? splat(extinction) * shape : emits;

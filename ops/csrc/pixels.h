@@ -63,10 +63,14 @@ template <class S> struct Place {
     Vec<S> cos_row, sin_row, row, cos_column, sin_column, column;
 };
 
-// A footprint prepared for pixels of given rows; `offsets` then takes their columns.
+// A footprint prepared for pixels of given rows. `look` then takes their columns and says which lie inside;
+// `form` and `slopes` finish what it left: the squared standardised offset, and the two offsets themselves.
 template <class S, bool kTangent> struct RowView;
 
 template <class S> struct RowView<S, true> {
+    struct Seen {
+        Vec<S> a, b, d, square, d2;
+    };
     Vec<S> x1, y1, z1, x2, y2, z2, xn, yn, zn, reach, horizon;
 
     GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>&, const Lens<S>& lens) {
@@ -76,20 +80,40 @@ template <class S> struct RowView<S, true> {
         xn = r[6] * c, yn = r[7] * c, zn = r[8] * s;
         reach = splat(r[kReach]), horizon = splat(lens.horizon_cosine);
     }
-    // Standardised offsets and their squared length; false if no lane lies inside the footprint.
-    GSPARC_INLINE bool offsets(const Place<S>& at, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
+    GSPARC_INLINE Mask<S> look(const Place<S>& at, Seen& seen) const {
         const Vec<S> c = at.cos_column, s = at.sin_column;
-        const Vec<S> a = fma(x1, c, fma(y1, s, z1)), b = fma(x2, c, fma(y2, s, z2)), d = fma(xn, c, fma(yn, s, zn));
-        const Vec<S> square = fma(a, a, b * b);
-        inside = at_most(square, reach * (d * d)) & at_most(horizon, d);
-        if (!any(inside)) return false;
-        const Vec<S> inverse = reciprocal(d);
-        tau1 = a * inverse, tau2 = b * inverse, form = square * (inverse * inverse);
-        return true;
+        seen.a = fma(x1, c, fma(y1, s, z1)), seen.b = fma(x2, c, fma(y2, s, z2)), seen.d = fma(xn, c, fma(yn, s, zn));
+        square(seen);
+        return at_most(seen.square, reach * seen.d2) & at_most(horizon, seen.d);
     }
+    GSPARC_INLINE void keep(const Seen& seen, bool slopes, S* to) const {
+        constexpr int n = Lanes<S>::n;
+        store(to, slopes ? seen.a : seen.square), store(to + n, slopes ? seen.b : seen.d2);
+        if (slopes) store(to + 2 * n, seen.d);
+    }
+    GSPARC_INLINE void recall(const S* from, bool slopes, Seen& seen) const {
+        constexpr int n = Lanes<S>::n;
+        if (!slopes) {
+            seen.square = load(from), seen.d2 = load(from + n);
+            return;
+        }
+        seen.a = load(from), seen.b = load(from + n), seen.d = load(from + 2 * n);
+        square(seen);
+    }
+    GSPARC_INLINE Vec<S> form(const Seen& seen) const { return seen.square * reciprocal(seen.d2); }
+    GSPARC_INLINE void slopes(const Seen& seen, Vec<S>& tau1, Vec<S>& tau2) const {
+        const Vec<S> inverse = seen.d * reciprocal(seen.d2);
+        tau1 = seen.a * inverse, tau2 = seen.b * inverse;
+    }
+
+private:
+    GSPARC_INLINE void square(Seen& seen) const { seen.square = fma(seen.a, seen.a, seen.b * seen.b), seen.d2 = seen.d * seen.d; }
 };
 
 template <class S> struct RowView<S, false> {
+    struct Seen {
+        Vec<S> tau1, form;
+    };
     Vec<S> center, root_a, shift, tau2_row, square2, reach, turn, per_turn;
 
     GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>& t, const Lens<S>&) {
@@ -97,13 +121,19 @@ template <class S> struct RowView<S, false> {
         center = splat(r[0]), root_a = splat(r[2]), shift = r[3] * q, tau2_row = r[4] * q;
         square2 = tau2_row * tau2_row, reach = splat(r[kReach]), turn = splat(t.turn), per_turn = splat(t.per_turn);
     }
-    GSPARC_INLINE bool offsets(const Place<S>& at, Vec<S>& tau1, Vec<S>& tau2, Vec<S>& form, Mask<S>& inside) const {
+    GSPARC_INLINE Mask<S> look(const Place<S>& at, Seen& seen) const {
         const Vec<S> away = at.column - center;
         const Vec<S> p = away - turn * nearest(away * per_turn);  // the nearest image of this column
-        tau1 = root_a * (p - shift), tau2 = tau2_row, form = fma(tau1, tau1, square2);
-        inside = at_most(form, reach);
-        return any(inside);
+        seen.tau1 = root_a * (p - shift), seen.form = fma(seen.tau1, seen.tau1, square2);
+        return at_most(seen.form, reach);
     }
+    GSPARC_INLINE void keep(const Seen& seen, bool slopes, S* to) const { store(to, slopes ? seen.tau1 : seen.form); }
+    GSPARC_INLINE void recall(const S* from, bool slopes, Seen& seen) const {
+        if (slopes) seen.tau1 = load(from), seen.form = fma(seen.tau1, seen.tau1, square2);
+        else seen.form = load(from);
+    }
+    GSPARC_INLINE Vec<S> form(const Seen& seen) const { return seen.form; }
+    GSPARC_INLINE void slopes(const Seen& seen, Vec<S>& tau1, Vec<S>& tau2) const { tau1 = seen.tau1, tau2 = tau2_row; }
 };
 
 // A footprint's columns as at most two runs [from, to) of the row; each pixel occurs once, also when blocks of

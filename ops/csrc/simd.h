@@ -117,6 +117,11 @@ GSPARC_INLINE Vec<float> reciprocal(Vec<float> x) {
 
 template <class S> GSPARC_INLINE Vec<S> lesser(Vec<S> a, Vec<S> b) { return select(at_most(a, b), a, b); }
 template <class S> GSPARC_INLINE Vec<S> greater(Vec<S> a, Vec<S> b) { return select(at_most(a, b), b, a); }
+#if defined(__AVX512F__)
+template <> GSPARC_INLINE Vec<float> lesser<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm512_min_ps((__m512)a, (__m512)b); }
+#elif defined(__AVX2__)
+template <> GSPARC_INLINE Vec<float> lesser<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm256_min_ps((__m256)a, (__m256)b); }
+#endif
 
 // Nearest integer, halves to even, for |x| < 2^22.
 GSPARC_INLINE Vec<float> nearest(Vec<float> x) { return (x + 12582912.0f) - 12582912.0f; }
@@ -146,6 +151,23 @@ GSPARC_INLINE Vec<double> exponential(Vec<double> x) {
     for (int i = 0; i < 13; ++i) p = fma(p, r, splat(factors[i]));
     return (Vec<double>)((Int<double>)p + ((Int<double>)shifted << 52));
 }
+
+// exp(-form / 2): what lies beyond the cut-off may come out as anything.
+template <class S> GSPARC_INLINE Vec<S> bell(Vec<S> form) { return exponential(form * S(-0.5)); }
+#if defined(__AVX512F__)
+template <> GSPARC_INLINE Vec<float> bell<float>(Vec<float> form) {  // 2^x by scaling, relative error below 2e-7
+    const Vec<float> x = form * -0.72134752f;
+    const __m512 whole = _mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
+    const Vec<float> r = x - (Vec<float>)whole;
+    Vec<float> p = splat(0.00132764654699713f);
+    p = fma(p, r, splat(0.009675545617938042f));
+    p = fma(p, r, splat(0.05550713464617729f));
+    p = fma(p, r, splat(0.24022120237350464f));
+    p = fma(p, r, splat(0.6931469440460205f));
+    p = fma(p, r, splat(1.0000001192092896f));
+    return (Vec<float>)_mm512_scalef_ps((__m512)p, whole);
+}
+#endif
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc

@@ -77,23 +77,55 @@ template <class S> struct Strip {
     int64_t slot(int rank) const { return slots[rank] + index - boxes[rank].row0 / kStripRows; }
 };
 
-// Calls visit(tile, tau1, tau2, form, inside) for each tile of the strip that a footprint touches.
-template <class S, bool kTangent, class Visit>
-GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S>& grid, const Lens<S>& lens, Visit&& visit) {
+// Calls visit(tile, tau1, tau2, form, counts) for each tile of the strip where a footprint counts in some lane:
+// inside it, and wanted(tile). Without kSlopes tau1 and tau2 mean nothing. Tiles are first found without a branch,
+// then visited: an unpredictable branch per tile costs as much as the visit.
+template <class S, bool kTangent, bool kSlopes, class Wanted, class Visit>
+GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S>& grid, const Lens<S>& lens, Wanted&& wanted, Visit&& visit) {
+    constexpr int most = 16, n = Lanes<S>::n, kept = 3 * n;
+    using View = RowView<S, kTangent>;
     const Runs runs = runs_of(strip.boxes[rank], lens.width);
     Place<S> at;
     grid.strip(strip.index, at);
-    const RowView<S, kTangent> view(strip.records + int64_t(rank) * kRecord, at, grid.tables, lens);
+    const View view(strip.records + int64_t(rank) * kRecord, at, grid.tables, lens);
+    int hits[most];
+    Mask<S> counts[most];
+    S memory[most * kept];
+    typename View::Seen seen;
     for (int run = 0; run < runs.count; ++run) {
         const int last = (runs.to[run] - 1) / kTileColumns<S>;
-        for (int tile = runs.from[run] / kTileColumns<S>; tile <= last; ++tile) {
-            Vec<S> tau1, tau2, form;
-            Mask<S> inside;
-            grid.tile(tile, at);
-            if (view.offsets(at, tau1, tau2, form, inside)) visit(tile, tau1, tau2, form, inside);
+        for (int first = runs.from[run] / kTileColumns<S>; first <= last; first += most) {
+            const int end = last < first + most ? last + 1 : first + most;
+            int count = 0;
+            for (int tile = first; tile < end; ++tile) {
+                grid.tile(tile, at);
+                const Mask<S> found = view.look(at, seen) & wanted(tile);
+                view.keep(seen, kSlopes, memory + count * kept);
+                hits[count] = tile, counts[count] = found;
+                count += any(found);
+            }
+            for (int hit = 0; hit < count; ++hit) {
+                view.recall(memory + hit * kept, kSlopes, seen);
+                Vec<S> tau1, tau2;
+                if (kSlopes) view.slopes(seen, tau1, tau2);
+                visit(hits[hit], tau1, tau2, view.form(seen), counts[hit]);
+            }
         }
     }
 }
+
+// For `wanted`: every tile.
+template <class S> struct Always {
+    GSPARC_INLINE Mask<S> operator()(int) const { return at_most(splat(S(0)), splat(S(0))); }
+};
+
+// For `wanted`: where light still arrives. The transmittances of a tile lie `step` apart.
+template <class S> struct Lit {
+    const S* before;
+    int step;
+    Vec<S> floor;
+    GSPARC_INLINE Mask<S> operator()(int tile) const { return at_most(floor, load(before + int64_t(tile) * step)); }
+};
 
 // Calls visit(tile, lane, pixel, count) for each row of each tile: `count` neighbours from lane and pixel on.
 template <class S, class Visit> inline void each_stretch(const Strip<S>& strip, int width, Visit&& visit) {

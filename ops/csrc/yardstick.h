@@ -58,8 +58,8 @@ template <class S> int64_t mark_pairs(const PlanView<S>& plan, const Lens<S>& le
         for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
             Vec<S> found = splat(S(0));
             const auto count = [&](int, Vec<S>, Vec<S>, Vec<S>, Mask<S> inside) { found += select(inside, splat(S(1)), splat(S(0))); };
-            if (lens.tangent) each_tile<S, true>(strip, *entry, grid, lens, count);
-            else each_tile<S, false>(strip, *entry, grid, lens, count);
+            if (lens.tangent) each_tile<S, true, false>(strip, *entry, grid, lens, Always<S>(), count);
+            else each_tile<S, false, false>(strip, *entry, grid, lens, Always<S>(), count);
             counts[task] += int64_t(sum<S>(found));
         }
     };

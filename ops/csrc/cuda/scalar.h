@@ -31,6 +31,7 @@ GSPARC_INLINE float exponential(float x) { return __expf(x); }  // relative erro
 GSPARC_INLINE float exponential(float x) { return expf(x); }
 #endif
 GSPARC_INLINE double exponential(double x) { return exp(x); }
+template <class S> GSPARC_INLINE S bell(S form) { return exponential(form * S(-0.5)); }
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc

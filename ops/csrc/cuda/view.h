@@ -99,8 +99,12 @@ template <class S, bool kTangent> struct Pixel {
     GSPARC_HD bool offsets(const S* record, const Lens<S>& lens, S& tau1, S& tau2, S& form) const {
         const Tables<S> circle = {nullptr, nullptr, nullptr, nullptr, nullptr, turn, per_turn};
         const Place<S> here = {cos_row, sin_row, S(row), cos_column, sin_column, number};
-        bool inside;
-        return RowView<S, kTangent>(record, here, circle, lens).offsets(here, tau1, tau2, form, inside) && real;
+        const RowView<S, kTangent> view(record, here, circle, lens);
+        typename RowView<S, kTangent>::Seen seen;
+        const bool inside = view.look(here, seen);
+        form = view.form(seen);
+        view.slopes(seen, tau1, tau2);
+        return inside && real;
     }
     GSPARC_HD int64_t place(const Lens<S>& lens) const { return int64_t(row) * lens.width + column; }
 };

@@ -1,0 +1,128 @@
+// One small network for each Gaussian (E -> H -> C with a ReLU) at B positions; hidden units are the lanes.
+// Every weight is read from memory once, whatever the batch.
+#pragma once
+#include <string.h>
+
+#include "kernels.h"
+#include "simd.h"
+#include "strips.h"
+
+namespace gsparc {
+namespace GSPARC_ISA {
+
+constexpr int kNetworkChunk = 64, kSamplesAtOnce = 4;
+
+// One Gaussian's weights for a block of lanes of hidden units: first layer, bias, and the second layer by output.
+// Lanes past the last hidden unit are zero.
+template <class S> struct HiddenBlock {
+    const S* first;  // (E, stride)
+    int stride;
+    Vec<S> bias;
+    S* second;       // (C, lanes), in scratch
+
+    GSPARC_INLINE HiddenBlock(const NetworkArgs<S>& a, int64_t i, int hidden, S* scratch) : second(scratch) {
+        constexpr int n = Lanes<S>::n;
+        const int some = a.hidden - hidden < n ? a.hidden - hidden : n;
+        const S* weight2 = a.weight2 + (i * a.hidden + hidden) * a.outputs;
+        for (int c = 0; c < a.outputs; ++c)
+            for (int h = 0; h < n; ++h) second[c * n + h] = h < some ? weight2[h * a.outputs + c] : S(0);
+        const S *weight1 = a.weight1 + i * a.inputs * a.hidden + hidden, *bias1 = a.bias1 + i * a.hidden + hidden;
+        if (some == n) {
+            first = weight1, stride = a.hidden, bias = load(bias1);
+            return;
+        }
+        S* copy = scratch + a.outputs * n;
+        S last[n] = {};
+        for (int e = 0; e < a.inputs; ++e)
+            for (int h = 0; h < n; ++h) copy[e * n + h] = h < some ? weight1[int64_t(e) * a.hidden + h] : S(0);
+        memcpy(last, bias1, some * sizeof(S));
+        first = copy, stride = n, bias = load(last);
+    }
+    static int64_t scratch(const NetworkArgs<S>& a) { return int64_t(Lanes<S>::n) * (a.outputs + a.inputs); }
+};
+
+template <class S, int kSamples> GSPARC_INLINE void hidden_units(const NetworkArgs<S>& a, const HiddenBlock<S>& block, int sample, Vec<S>* inner) {
+    const S* x = a.encoded + int64_t(sample) * a.inputs;
+    for (int b = 0; b < kSamples; ++b) inner[b] = block.bias;
+    for (int e = 0; e < a.inputs; ++e) {
+        const Vec<S> w = load(block.first + int64_t(e) * block.stride);
+        for (int b = 0; b < kSamples; ++b) inner[b] = fma(splat(x[b * a.inputs + e]), w, inner[b]);
+    }
+}
+
+template <class S, int kSamples> GSPARC_INLINE void network_outputs(const NetworkArgs<S>& a, const HiddenBlock<S>& block, int64_t i, int sample) {
+    const Vec<S> none = splat(S(0));
+    Vec<S> inner[kSamples];
+    hidden_units<S, kSamples>(a, block, sample, inner);
+    for (int c = 0; c < a.outputs; ++c) {
+        const Vec<S> w = load(block.second + c * Lanes<S>::n);
+        for (int b = 0; b < kSamples; ++b) a.out[(int64_t(sample + b) * a.count + i) * a.outputs + c] += sum<S>(greater<S>(inner[b], none) * w);
+    }
+}
+
+template <class S> void networks(const NetworkArgs<S>& a) {
+    constexpr int n = Lanes<S>::n;
+    const int64_t each = HiddenBlock<S>::scratch(a);
+    Buffer<S> memory(each * a.threads);
+    auto run = [&](int task, int worker) {
+        const int64_t begin = int64_t(task) * kNetworkChunk, end = begin + kNetworkChunk < a.count ? begin + kNetworkChunk : a.count;
+        for (int64_t i = begin; i < end; ++i) {
+            for (int b = 0; b < a.samples; ++b) memcpy(a.out + (int64_t(b) * a.count + i) * a.outputs, a.bias2 + i * a.outputs, a.outputs * sizeof(S));
+            for (int hidden = 0; hidden < a.hidden; hidden += n) {
+                const HiddenBlock<S> block(a, i, hidden, memory.data + worker * each);
+                int sample = 0;
+                for (; sample + kSamplesAtOnce <= a.samples; sample += kSamplesAtOnce) network_outputs<S, kSamplesAtOnce>(a, block, i, sample);
+                for (; sample < a.samples; ++sample) network_outputs<S, 1>(a, block, i, sample);
+            }
+        }
+    };
+    parallel_for((a.count + kNetworkChunk - 1) / kNetworkChunk, a.threads, run);
+}
+
+template <class S> void networks_backward(const NetworkBackwardArgs<S>& d) {
+    constexpr int n = Lanes<S>::n;
+    const NetworkArgs<S>& a = d.forward;
+    const int64_t block_size = HiddenBlock<S>::scratch(a), each = block_size + int64_t(n) * (a.inputs + a.outputs);
+    Buffer<S> memory(each * a.threads);
+    auto run = [&](int task, int worker) {
+        S *mine = memory.data + worker * each, *first = mine + block_size, *second = first + int64_t(n) * a.inputs;
+        const int64_t begin = int64_t(task) * kNetworkChunk, end = begin + kNetworkChunk < a.count ? begin + kNetworkChunk : a.count;
+        for (int64_t i = begin; i < end; ++i) {
+            for (int c = 0; c < a.outputs; ++c) {
+                S total = 0;
+                for (int b = 0; b < a.samples; ++b) total += d.slope[(int64_t(b) * a.count + i) * a.outputs + c];
+                d.bias2[i * a.outputs + c] = total;
+            }
+            for (int hidden = 0; hidden < a.hidden; hidden += n) {
+                const HiddenBlock<S> block(a, i, hidden, mine);
+                const int some = a.hidden - hidden < n ? a.hidden - hidden : n;
+                Vec<S> bias = splat(S(0));
+                fill(first, int64_t(n) * (a.inputs + a.outputs), S(0));
+                for (int b = 0; b < a.samples; ++b) {
+                    const S *slope = d.slope + (int64_t(b) * a.count + i) * a.outputs, *x = a.encoded + int64_t(b) * a.inputs;
+                    Vec<S> inner, back = splat(S(0));
+                    hidden_units<S, 1>(a, block, b, &inner);
+                    const Mask<S> off = at_most(inner, splat(S(0)));
+                    inner = select(off, splat(S(0)), inner);
+                    for (int c = 0; c < a.outputs; ++c) {
+                        back = fma(splat(slope[c]), load(block.second + c * n), back);
+                        store(second + c * n, fma(splat(slope[c]), inner, load(second + c * n)));
+                    }
+                    back = select(off, splat(S(0)), back);
+                    bias += back;
+                    for (int e = 0; e < a.inputs; ++e) store(first + e * n, fma(splat(x[e]), back, load(first + e * n)));
+                }
+                S lanes[n];
+                store(lanes, bias);
+                memcpy(d.bias1 + i * a.hidden + hidden, lanes, some * sizeof(S));
+                for (int e = 0; e < a.inputs; ++e) memcpy(d.weight1 + (i * a.inputs + e) * a.hidden + hidden, first + e * n, some * sizeof(S));
+                for (int h = 0; h < some; ++h)
+                    for (int c = 0; c < a.outputs; ++c) d.weight2[(i * a.hidden + hidden + h) * a.outputs + c] = second[c * n + h];
+            }
+        }
+    };
+    parallel_for((a.count + kNetworkChunk - 1) / kNetworkChunk, a.threads, run);
+}
+
+}  // namespace GSPARC_ISA
+}  // namespace gsparc
