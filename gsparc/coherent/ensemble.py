@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 TURNING = 0.4  # share of a gain's variation that is not along its phase, before it is learned
 SHARPNESS = 4  # weight of a search = (left-out error)^-4: half the error again counts a fifth
-ROUNDS_END = 0.8  # of the budget: what is left is for settling
+LAST_START, ROUNDS_END = 0.6, 0.8  # of the budget: no search starts, no search adds sources after
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Budget:
 
     Attributes:
         started: `time.monotonic()` of the fit.
-        seconds: no search starts that would end later.
+        seconds: for all searches; see `LAST_START` and `ROUNDS_END`.
     """
 
     started: float
@@ -71,12 +71,10 @@ def search_many(
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: of all together.
     """
-    threads, longest = torch.get_num_threads(), 0.0
+    threads = torch.get_num_threads()
 
     def search(number: int) -> Member | None:
-        nonlocal longest
-        begun = budget.spent
-        if number > 0 and begun + longest > budget.seconds:
+        if number > 0 and budget.spent > LAST_START * budget.seconds:
             return None
         rows = draw[number]
         deadline = budget.started + ROUNDS_END * budget.seconds
@@ -86,7 +84,6 @@ def search_many(
         )
         error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
         left_out = float(error.abs().square().sum() / rows.target.abs().square().sum())
-        longest = max(longest, budget.spent - begun)
         log.info(
             "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
             number + 1, len(draw), len(scene.words), len(scene.planes), left_out,

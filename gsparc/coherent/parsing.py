@@ -100,7 +100,8 @@ def respell(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
     base = replace(scene, planes=walls)
     spellings = all_words(list(range(len(walls))), 3)
     distance = _distances(base, spellings, sources, 1.5 * LONGER)
-    planes, words, kept, taken = [*walls], [()], [0], set()
+    planes, kept, taken = [*walls], [0], set()
+    words: list[Word] = [()]
     for i in range(1, len(sources)):
         near = [j for j in distance[i].argsort()[:6].tolist() if distance[i, j] < tolerance[i]]
         free = next((spellings[j] for j in near if spellings[j] not in taken), None)

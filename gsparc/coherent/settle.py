@@ -89,8 +89,8 @@ def _likelihood(
     by_noise = noise * slope.diagonal().sum() / 4
     leaves = [transmitter, planes, phase]
     slopes = torch.autograd.grad(waves, leaves, pulled * values[2].exp(), allow_unused=True)
-    by = [torch.zeros_like(v) if g is None else g for g, v in zip(slopes, leaves, strict=True)]
-    return factor.nll, [by[0], by[1], by_amplitude, by_noise, by[2]]
+    places = [torch.zeros_like(v) if g is None else g for g, v in zip(slopes, leaves, strict=True)]
+    return factor.nll, [places[0], places[1], by_amplitude, by_noise, places[2]]
 
 
 def learn_visibility(

@@ -57,7 +57,7 @@ class VirtualSourceGP(Method):
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
-        budget_s: no search starts that would end after this; None: 0.4 s per measurement, 120 to 480 s.
+        budget_s: what all searches may take, about; None: 0.4 s per measurement, 120 to 480 s.
         search_rows: receivers times tones that a search looks at.
         rows: receivers times tones that the final process holds.
         margin, max_sources, order: see `SearchSettings`.
@@ -163,8 +163,8 @@ class VirtualSourceGP(Method):
         waves = wave_over_band(ranges(flat, sources), torch.from_numpy(frequency))
         if gains.shape[1] == 1 or places.shape[1] > 1:
             gains = gains[:, :1]
-        predicted = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
-        predicted = predicted.reshape(len(known), -1, len(frequency)).numpy()
+        summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
+        predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
         mask = None if data.mask is None else data.mask[known]
         carrier = self.frame.carrier_hz
         found = estimate(

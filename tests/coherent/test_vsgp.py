@@ -6,6 +6,7 @@ import torch
 from conftest import invent
 from rooms import WAVELENGTH, nmse, shoebox
 
+from gsparc.coherent.pictures import plot_visibility
 from gsparc.coherent.rows import gather
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.splits import Fold
@@ -160,8 +161,32 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_pillar_hides_sources(tmp_path):
-    _, data, fold = shoebox(450, pillar=True)
-    method = VirtualSourceGP(searches=1)
+def test_a_pillar_hides_sources_and_it_is_seen_which(tmp_path):
+    told, data, fold = shoebox(450, pillar=True)
+    method = VirtualSourceGP(searches=2)
     method.fit(data, fold, tmp_path)
-    assert nmse(_predicted(method, data, fold.test).mean.numpy(), data.targets(fold.test).numpy()) <= 0.05
+    predicted = _predicted(method, data, fold.test).mean.numpy()
+    assert nmse(predicted, data.targets(fold.test).numpy()) <= 0.05
+    learned, true, names = learned_and_true_visibility(method, told, data, fold.test)
+    picture = plot_visibility(tmp_path / "visibility.png", told.rx[fold.test], learned, true, names)
+    assert picture.stat().st_size > 10_000
+    # The line of sight is cut sharply; a smooth law can only follow.
+    assert np.corrcoef(learned[:, 0], true[:, 0])[0, 1] > 0.7
+
+
+def learned_and_true_visibility(method, told, data, index, most=6):
+    """Of the strongest true sources that were found: (n, K) learned, (n, K) true, names."""
+    member = method.members[0]
+    places = torch.from_numpy(data.moving[index]) - method.frame.middle
+    gains = member.gains(places).abs()[:, :, 0].numpy() * method.frame.scale * data.site.target_scale
+    sources = (member.scene.sources + method.frame.middle).numpy() + data.site.origin
+    true = told.images.of(told.tx[0])
+    learned, seen, names = [], [], []
+    for i in np.argsort(told.images.order, kind="stable"):
+        distance = np.linalg.norm(sources - true[i], axis=-1)
+        if distance.min() < 0.5 * WAVELENGTH and len(names) < most:
+            full = abs(told.images.gain[i]) * WAVELENGTH / (4 * np.pi)
+            learned.append(gains[:, distance.argmin()] / full)
+            seen.append(told.visible[index, i])
+            names.append(f"image {told.images.cell[i].tolist()}")
+    return np.stack(learned, 1), np.stack(seen, 1), names
