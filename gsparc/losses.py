@@ -8,6 +8,8 @@ import math
 import torch
 from torch import Tensor
 
+from gsparc.ops.similarity import similarity_op
+
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
@@ -44,6 +46,23 @@ class _Similarity(torch.autograd.Function):
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
         p, t, by_mean, by_square, by_cross = ctx.saved_tensors
         slope = _spread(by_mean).addcmul_(p, _spread(by_square), value=2).addcmul_(t, _spread(by_cross))
+        return slope * upstream[:, None, None], None
+
+
+class _Kernel(torch.autograd.Function):
+    """`_Similarity` in one pass over float32 images in main memory."""
+
+    @staticmethod
+    def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
+        wanted = ctx.needs_input_grad[0]
+        value, slope = similarity_op(prediction.detach(), target.detach(), _taps(), STABILITY, wanted)
+        if wanted:
+            ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
         return slope * upstream[:, None, None], None
 
 
@@ -93,7 +112,8 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """
     if min(prediction.shape[-2:]) <= 2 * WINDOW_RADIUS:
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
-    return _Similarity.apply(prediction, target)
+    kernel = prediction.device.type == "cpu" and prediction.dtype == target.dtype == torch.float32
+    return (_Kernel if kernel else _Similarity).apply(prediction, target)
 
 
 def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from types import ModuleType
+
 import torch
 from torch import Tensor
 from torch.library import custom_op
@@ -17,15 +20,16 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         weight1, bias1: (N, E, H), (N, H).
         weight2, bias2: (N, H, C), (N, C).
     """
-    fits = (
-        encoded.dtype == torch.float32
-        and weight1.shape[1] <= MOST_INPUTS
-        and weight2.shape[2] <= MOST_OUTPUTS
-    )
-    if encoded.is_cuda and fits and not encoded.requires_grad:
-        from gsparc.ops import backends
+    if encoded.requires_grad or encoded.dtype != weight1.dtype:
+        return products(encoded, weight1, bias1, weight2, bias2)
+    if encoded.is_cuda:
+        single = encoded.dtype == torch.float32
+        if single and weight1.shape[1] <= MOST_INPUTS and weight2.shape[2] <= MOST_OUTPUTS:
+            from gsparc.ops import backends
 
-        backends.named("cuda")
+            backends.named("cuda")
+            return networks_op(encoded, weight1, bias1, weight2, bias2)
+    elif encoded.dtype in (torch.float32, torch.float64) and _kernels() is not None:
         return networks_op(encoded, weight1, bias1, weight2, bias2)
     return products(encoded, weight1, bias1, weight2, bias2)
 
@@ -43,7 +47,9 @@ def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
 @custom_op("gsparc::networks", mutates_args=(), device_types="cpu")
 def networks_op(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
     """`networks`, without a gradient for `encoded`."""
-    return products(encoded, weight1, bias1, weight2, bias2)
+    out = encoded.new_empty(encoded.shape[0], weight1.shape[0], weight2.shape[2])
+    _run("networks", *_contiguous(encoded, weight1, bias1, weight2, bias2), out)
+    return out
 
 
 @networks_op.register_fake
@@ -56,16 +62,39 @@ def networks_backward_op(
     slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of weight1, bias1, weight2, bias2 for the gradient `slope` (B, N, C) of the outputs."""
-    with torch.enable_grad():
-        leaves = [t.detach().requires_grad_() for t in (weight1, bias1, weight2, bias2)]
-        grads = torch.autograd.grad(products(encoded, *leaves), leaves, slope)
-    return grads[0].contiguous(), grads[1].contiguous(), grads[2].contiguous(), grads[3].contiguous()
+    inputs = _contiguous(encoded, weight1, bias1, weight2, bias2)
+    grads = tuple(torch.empty_like(tensor) for tensor in inputs[1:])
+    _run("networks_backward", *inputs, None, *_contiguous(slope), *grads)
+    return grads[0], grads[1], grads[2], grads[3]
 
 
 @networks_backward_op.register_fake
 def _(slope, encoded, weight1, bias1, weight2, bias2):
     shapes = (weight1.shape, bias1.shape, weight2.shape, bias2.shape)
     return tuple(slope.new_empty(shape) for shape in shapes)
+
+
+def _contiguous(*tensors: Tensor) -> list[Tensor]:
+    return [tensor.contiguous() for tensor in tensors]
+
+
+def _run(name: str, encoded: Tensor, weight1: Tensor, *rest: Tensor | None) -> None:
+    """Call a CPU kernel on contiguous tensors; rest is bias1, weight2 and what else it takes."""
+    (samples, inputs), (count, _, hidden) = encoded.shape, weight1.shape
+    weight2 = rest[1]
+    assert weight2 is not None
+    sizes = (samples, count, inputs, hidden, weight2.shape[2])
+    tensors = [0 if t is None else t.data_ptr() for t in (encoded, weight1, *rest)]
+    getattr(_kernels(), name)(encoded.dtype == torch.float64, sizes, torch.get_num_threads(), tensors)
+
+
+@functools.cache
+def _kernels() -> ModuleType | None:
+    try:
+        from gsparc.ops import _native
+    except ImportError:
+        return None
+    return _native
 
 
 def _setup(ctx, inputs, output):
