@@ -26,7 +26,7 @@ from gsparc.peers.encoding import to_real, training_targets
 
 log = logging.getLogger(__name__)
 
-QUERY_CHUNK = 16  # spectra drawn at a time: they stay in the cache
+QUERY_CHUNK = 4  # spectra drawn at a time: they stay in the cache
 
 
 class ArrayField(Method):
@@ -117,16 +117,15 @@ class ArrayField(Method):
         """
         if self.field is None or self.renderer is None:
             raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
-        if len(tx) > QUERY_CHUNK:
-            parts = [self._predict(part) for part in tx.split(QUERY_CHUNK)]
-            return Prediction(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
-        return Prediction(*self._predict(tx))
-
-    def _predict(self, tx: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        assert self.field is not None and self.renderer is not None
-        vectors = self.field(tx)
-        left = vectors[:, -1].real.square()
-        return self.renderer.draw(vectors), 1 - left, self.error[0] + self.error[1] * left
+        mean = torch.empty(len(tx), *self.renderer.square.shape)
+        left = torch.empty(len(tx))
+        with torch.inference_mode():  # the results are ordinary tensors, made before
+            for start in range(0, len(tx), QUERY_CHUNK):
+                part = slice(start, start + QUERY_CHUNK)
+                vectors = self.field(tx[part])
+                torch.square(vectors[:, -1].real, out=left[part])
+                self.renderer.draw(vectors, mean[part])
+        return Prediction(mean, 1 - left, self.error[0] + self.error[1] * left)
 
     def state(self) -> dict[str, Any]:
         """Packets, background, error model."""

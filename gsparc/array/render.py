@@ -1,4 +1,4 @@
-"""The frozen small matrix of a static array: vectors and a noise floor in, whole spectra out."""
+"""The frozen small matrices of a static array: vectors and a noise floor in, whole spectra out."""
 
 from __future__ import annotations
 
@@ -6,18 +6,21 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.array.response import Lags, lags, steering
+from gsparc.array.response import lags, steering
 from gsparc.data.schema import Site
 
 TINY = 1e-9  # of a squared spectrum: keeps the slope of the square root finite
+SILENT = 1e-9  # harmonics this much weaker than the strongest are none: float32 would not see them
 
 
 class SpectrumRenderer(nn.Module):
     """`sqrt(|A^H h|^2 + f^2 b^2)`: spectra of array vectors h over an incoherent background b of share f.
 
-    The square is a product with a fixed matrix of lag numbers (response.py). For a planar array on a grid
-    that closes the circle the cosines are equal and the sines opposite half a turn apart, so that half the
-    rows serve all pixels: 50 x 16,200 instead of 32 x 64,800 multiplications for 4 x 4 elements, exactly.
+    The square is linear in the lag numbers of h (response.py), and an array a few wavelengths wide sees few
+    harmonics of the azimuth: lag numbers to harmonics of each row, harmonics to pixels. For a planar array
+    real lag numbers make the even harmonics and imaginary ones the odd, so that half the columns are computed
+    and the others follow by a sign. For 4 x 4 elements on 90 x 360 pixels this reads 0.6 MB where `A^H h`
+    itself would read 8.3 MB; nothing is approximated.
 
     Args:
         site: array, wavelength and grid.
@@ -25,69 +28,76 @@ class SpectrumRenderer(nn.Module):
     """
 
     pairs: Tensor
-    even: Tensor
-    odd: Tensor
+    square: Tensor
 
     def __init__(self, site: Site, background: Tensor) -> None:
         super().__init__()
         assert site.array is not None and site.grid is not None and site.wavelength is not None
         grid, known = site.grid, lags(site.array, site.wavelength)
-        self.height, self.width = grid.height, grid.width
         planar = float(np.ptp(site.array[:, 2])) < 1e-6 * site.wavelength
         self.half_turn = planar and grid.periodic and grid.width % 2 == 0
-        basis = known.basis(grid, site.wavelength)
-        square = background.double().square().reshape(-1, 1)
-        self.count = len(known.difference)
-        if self.half_turn:
-            shape = (grid.height, 2, grid.width // 2)
-            near = basis.reshape(*shape, -1)[:, 0].flatten(0, 1)
-            here, there = square.reshape(shape).unbind(1)
-            even = torch.cat([near[:, : self.count], (here + there).reshape(-1, 1) / 2], 1)
-            odd = torch.cat([near[:, self.count :], (here - there).reshape(-1, 1) / 2], 1)
-        else:
-            even = torch.cat([basis[:, : self.count], square], 1)
-            odd = torch.cat([basis[:, self.count :], torch.zeros_like(square)], 1)
-        self.register_buffer("even", even.T.float().contiguous())
-        self.register_buffer("odd", odd.T.float().contiguous())
-        self.register_buffer("pairs", _extended_pairs(known))
+        pairs = torch.stack([known.real_pairs, known.imag_pairs], 1).flatten(0, 1)
+        self.register_buffer("pairs", pairs.float())
+        self.register_buffer("square", background.float().square())
+        basis = known.basis(grid, site.wavelength).view(grid.height, grid.width, -1)
+        count = len(known.difference)
+        self.spans = [slice(0, count), slice(count, None)] if self.half_turn else [slice(None)]
+        columns = grid.width // 2 if self.half_turn else grid.width
+        for number, span in enumerate(self.spans):
+            table, waves = _harmonics(basis[..., span], columns, grid.periodic)
+            self.register_buffer(f"table{number}", table.float().contiguous())
+            self.register_buffer(f"waves{number}", waves.float().contiguous())
 
     def forward(self, vectors: Tensor) -> Tensor:
         """Spectra (B, H, W) of (B, M + 1) complex64: array vectors and last the share f; differentiable."""
-        even, odd = self._halves(vectors)
-        square = torch.cat([even + odd, even - odd], 2) if self.half_turn else even + odd
-        return square.clamp_min(TINY).sqrt()
+        parts = self._parts(vectors)
+        square = torch.cat([parts[0] + parts[1], parts[0] - parts[1]], 2) if self.half_turn else parts[0]
+        share = vectors[:, -1].real.square()[:, None, None]
+        return (square + share * self.square).clamp_min(TINY).sqrt()
 
-    @torch.no_grad()
-    def draw(self, vectors: Tensor) -> Tensor:
-        """The same, cut off at 1, in as few passes over the pixels as there can be."""
-        even, odd = self._halves(vectors)
+    def draw(self, vectors: Tensor, out: Tensor) -> None:
+        """The same, cut off at 1, written to `out` (B, H, W) in as few passes over it as there can be."""
+        parts, half = self._parts(vectors), out.shape[2] // 2
         if self.half_turn:
-            square = even.new_empty(len(even), self.height, self.width)
-            torch.add(even, odd, out=square[:, :, : self.width // 2])
-            torch.sub(even, odd, out=square[:, :, self.width // 2 :])
+            torch.add(*parts, out=out[:, :, :half])
+            torch.sub(*parts, out=out[:, :, half:])
         else:
-            square = even.add_(odd)
-        return square.clamp_(TINY, 1).sqrt_()
+            out.copy_(parts[0])
+        share = vectors[:, -1].real.square()[:, None, None]
+        out.addcmul_(share, self.square).clamp_(TINY, 1).sqrt_()
 
-    def _halves(self, vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Parts of the square that keep and that change sign half a turn on: (B, H, W / 2), or (B, H, W)."""
-        products = torch.view_as_real(vectors[:, :, None] * vectors[:, None, :].conj())
+    def _parts(self, vectors: Tensor) -> list[Tensor]:
+        """The coherent square (B, H, W), or what of it stays and what flips half a turn on (B, H, W / 2)."""
+        h = vectors[:, :-1]
+        products = torch.view_as_real(h[:, :, None] * h[:, None, :].conj())
         r = products.flatten(1) @ self.pairs
-        even, odd = r[:, : self.count + 1] @ self.even, r[:, self.count + 1 :] @ self.odd
-        width = self.width // 2 if self.half_turn else self.width
-        return even.view(-1, self.height, width), odd.view(-1, self.height, width)
+        found = []
+        for number, span in enumerate(self.spans):
+            table, waves = getattr(self, f"table{number}"), getattr(self, f"waves{number}")
+            rows = (r[:, span] @ table).view(-1, len(waves))
+            found.append((rows @ waves).view(len(vectors), self.square.shape[0], -1))
+        return found
 
 
-def _extended_pairs(known: Lags) -> Tensor:
-    """(2 (M + 1)^2, 2 L + 1): which products of M + 1 numbers add to which lag number; f^2 goes to both."""
-    m, size = known.elements, known.count
-    pairs = torch.zeros(m + 1, m + 1, 2, size + 2, dtype=torch.float64)
-    half = len(known.difference)
-    columns = torch.cat([torch.arange(half), torch.arange(half + 1, size + 1)])
-    pairs[:m, :m, 0, columns] = known.real_pairs.view(m, m, -1)
-    pairs[:m, :m, 1, columns] = known.imag_pairs.view(m, m, -1)
-    pairs[m, m, 0, half] = pairs[m, m, 0, size + 1] = 1.0
-    return pairs.flatten(0, 2).float()
+def _harmonics(basis: Tensor, columns: int, periodic: bool) -> tuple[Tensor, Tensor]:
+    """Lag numbers to harmonics (l, H * K) and harmonics to the first `columns` pixels of a row (K, columns).
+
+    Args:
+        basis: (H, W, l) float64.
+        columns: as wanted.
+        periodic: whether the columns close the circle; else pixels are their own harmonics.
+    """
+    _, width, numbers = basis.shape
+    if not periodic:
+        return basis.permute(2, 0, 1).reshape(numbers, -1), torch.eye(width, dtype=basis.dtype)
+    spectrum = torch.fft.rfft(basis, dim=1) / width
+    loud = spectrum.abs().amax((0, 2))
+    kept = torch.nonzero(loud > SILENT * loud.max()).squeeze(1)
+    twice = torch.where((kept == 0) | (2 * kept == width), 1.0, 2.0).double()
+    turn = 2 * torch.pi / width * kept[:, None] * torch.arange(columns, dtype=torch.float64)
+    waves = torch.stack([twice[:, None] * turn.cos(), -twice[:, None] * turn.sin()], 1).flatten(0, 1)
+    table = torch.view_as_real(spectrum[:, kept]).permute(2, 0, 1, 3).reshape(numbers, -1)
+    return table, waves
 
 
 def spectra(site: Site, vectors: Tensor) -> Tensor:
