@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import functools
-from types import ModuleType
-
 import torch
 from torch import Tensor
 from torch.library import custom_op
+
+from gsparc.ops import built
 
 MOST_INPUTS, MOST_OUTPUTS = 256, 4  # of the CUDA kernels, whose weights pass through registers
 
@@ -29,7 +28,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
 
             backends.named("cuda")
             return networks_op(encoded, weight1, bias1, weight2, bias2)
-    elif encoded.dtype in (torch.float32, torch.float64) and _kernels() is not None:
+    elif encoded.dtype in (torch.float32, torch.float64) and built.kernels() is not None:
         return networks_op(encoded, weight1, bias1, weight2, bias2)
     return products(encoded, weight1, bias1, weight2, bias2)
 
@@ -85,16 +84,7 @@ def _run(name: str, encoded: Tensor, weight1: Tensor, *rest: Tensor | None) -> N
     assert weight2 is not None
     sizes = (samples, count, inputs, hidden, weight2.shape[2])
     tensors = [0 if t is None else t.data_ptr() for t in (encoded, weight1, *rest)]
-    getattr(_kernels(), name)(encoded.dtype == torch.float64, sizes, torch.get_num_threads(), tensors)
-
-
-@functools.cache
-def _kernels() -> ModuleType | None:
-    try:
-        from gsparc.ops import _native
-    except ImportError:
-        return None
-    return _native
+    getattr(built.kernels(), name)(encoded.dtype == torch.float64, sizes, torch.get_num_threads(), tensors)
 
 
 def _setup(ctx, inputs, output):

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor
 from torch.library import custom_op
 
+from gsparc.ops import built
+
 
 @custom_op("gsparc::similarity", mutates_args=(), device_types="cpu")
 def similarity_op(
@@ -17,15 +19,15 @@ def similarity_op(
 
     `taps` is one axis of a separable window of odd length, `stability` the constants C1 and C2.
     """
-    from gsparc.ops import _native
-
+    kernels = built.kernels()
+    assert kernels is not None, "the caller has looked"
     inputs = [torch.tensor(taps, dtype=torch.float32), prediction.contiguous(), target.contiguous()]
     value = prediction.new_empty(len(prediction))
     slopes = torch.empty_like(inputs[1]) if slope else None
     outputs = [value.data_ptr(), 0 if slopes is None else slopes.data_ptr()]
     sizes = (*prediction.shape, len(taps) // 2)
     addresses = [tensor.data_ptr() for tensor in inputs] + outputs
-    _native.similarity(sizes, stability, torch.get_num_threads(), addresses)
+    kernels.similarity(sizes, stability, torch.get_num_threads(), addresses)
     return value, prediction.new_empty(0) if slopes is None else slopes
 
 

@@ -210,6 +210,33 @@ void similarity(const Ints& sizes, const Reals& stability, int threads, const Ad
     kernels<float>().similarity(a);
 }
 
+template <class S> ChannelArgs<S> read_channels(Reader& in, const Ints& sizes, const Reals& tones, int threads) {
+    ChannelArgs<S> a;
+    a.samples = sizes.at(0), a.count = sizes.at(1), a.antennas = sizes.at(2), a.subcarriers = sizes.at(3), a.threads = threads;
+    a.first = tones.at(0), a.step = tones.at(1);
+    a.gains = in.next<const S>(), a.steering = in.next<const S>(), a.delays = in.next<const double>(), a.out = in.next<S>();
+    return a;
+}
+
+void channels(bool twice, const Ints& sizes, const Reals& tones, int threads, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        kernels<S>().channels(read_channels<S>(in, sizes, tones, threads));
+    });
+}
+
+void channels_backward(bool twice, const Ints& sizes, const Reals& tones, int threads, const Addresses& tensors) {
+    with_scalar(twice, [&](auto zero) {
+        using S = decltype(zero);
+        Reader in{tensors};
+        ChannelBackwardArgs<S> b;
+        b.forward = read_channels<S>(in, sizes, tones, threads);
+        b.slope = in.next<const S>(), b.gains = in.next<S>(), b.steering = in.next<S>(), b.delays = in.next<double>();
+        kernels<S>().channels_backward(b);
+    });
+}
+
 // Exponentials accumulated by `tasks` tasks of the yardstick.
 int64_t mark_exponentials(int tasks, int threads) {
     nb::gil_scoped_release unlocked;
@@ -249,6 +276,8 @@ NB_MODULE(_native, module) {
     module.def("networks", &networks);
     module.def("networks_backward", &networks_backward);
     module.def("similarity", &similarity);
+    module.def("channels", &channels);
+    module.def("channels_backward", &channels_backward);
     module.def("mark_exponentials", &mark_exponentials);
     module.def("mark_copy", &mark_copy);
     module.def("mark_pairs", &mark_pairs);

@@ -73,6 +73,22 @@ template <class S> struct NetworkBackwardArgs {
     S *weight1, *bias1, *weight2, *bias2;
 };
 
+// Factored channels H = sum over sources of gain, steering and delay; complex numbers are pairs.
+template <class S> struct ChannelArgs {
+    int samples, count, antennas, subcarriers, threads;
+    double first, step;             // frequencies [Hz]
+    const S *gains, *steering;      // (B, N, 2), (N, A, 2)
+    const double* delays;           // (N,) [s]
+    S* out;                         // (B, A, K, 2)
+};
+
+template <class S> struct ChannelBackwardArgs {
+    ChannelArgs<S> forward;         // out unused
+    const S* slope;                 // (B, A, K, 2)
+    S *gains, *steering;
+    double* delays;
+};
+
 // B images (H, W), seen through a separable window of 2 radius + 1 taps.
 struct SimilarityArgs {
     int count, height, width, radius, threads;
@@ -93,6 +109,8 @@ template <class S> struct Kernels {
     void (*networks)(const NetworkArgs<S>&);
     void (*networks_backward)(const NetworkBackwardArgs<S>&);
     void (*similarity)(const SimilarityArgs&);
+    void (*channels)(const ChannelArgs<S>&);
+    void (*channels_backward)(const ChannelBackwardArgs<S>&);
     void (*mark_exponentials)(int tasks, int threads, float* sums);  // see yardstick.h
     void (*mark_copy)(const char* from, char* to, int64_t bytes, int threads);
     int64_t (*mark_pairs)(const PlanView<S>&, const Lens<S>&, int threads);

@@ -1,0 +1,16 @@
+"""Whether the CPU kernels are here."""
+
+from __future__ import annotations
+
+import functools
+from types import ModuleType
+
+
+@functools.cache
+def kernels() -> ModuleType | None:
+    """The compiled CPU kernels, or None in an install without a compiler."""
+    try:
+        from gsparc.ops import _native
+    except ImportError:
+        return None
+    return _native
