@@ -46,7 +46,7 @@ class ArrayField(Method):
     def __init__(
         self,
         packets: PacketSettings | None = None,
-        rows: int = 3000,
+        rows: int = 5000,
         refit: bool = True,
         cache: bool = True,
         seed: int = 0,
@@ -104,7 +104,7 @@ class ArrayField(Method):
         )  # fmt: skip
         teacher = learn_process(vectors, places, partner, tuned.kernel)
         self.site, self.seen, self.error = site, len(rows), tuned.error_model()
-        self.field = distil(teacher, self.packets, self.seed).requires_grad_(False)
+        self.field = distil(teacher, self.packets, site.wavelength, self.seed).requires_grad_(False)
         self.background = torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width)
         self.renderer = SpectrumRenderer(site, self.background)
 

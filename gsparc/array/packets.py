@@ -23,7 +23,8 @@ FEWEST_PACKETS = 256
 
 @dataclass(frozen=True)
 class PacketSettings:
-    """Number and shape of the packets, and where the teacher is asked. Lengths are in the teacher's lengths.
+    """Number and shape of the packets, and where the teacher is asked. Lengths are in
+    units of the teacher's length, at most a wavelength.
 
     Attributes:
         count: number of packets; None takes 8 per sample, at least 256 and at most 2,048.
@@ -96,10 +97,13 @@ def student_t(count: int, rng: np.random.Generator) -> np.ndarray:
     return rng.standard_normal((count, 3)) / np.sqrt(rng.chisquare(3, (count, 1)) / 3)
 
 
-def distil(teacher: VectorProcess, settings: PacketSettings, seed: int) -> WavePackets:
-    """The packets that answer like the teacher at and around its samples, by ridge regression."""
+def distil(teacher: VectorProcess, settings: PacketSettings, wavelength: float, seed: int) -> WavePackets:
+    """The packets that answer like the teacher at and around its samples, by ridge regression.
+
+    However far the teacher's correlations reach, no packet is larger for it than for one wavelength [m].
+    """
     rng = np.random.default_rng([seed, 7])
-    places, length = teacher.positions, teacher.kernel.length
+    places, length = teacher.positions, min(teacher.kernel.length, wavelength)
     n, m = teacher.vectors.shape
     count = settings.count or int(np.clip(8 * n, FEWEST_PACKETS, MOST_PACKETS))
     widths = length * np.resize(settings.widths, count)

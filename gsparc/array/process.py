@@ -19,6 +19,7 @@ from scipy.spatial.distance import cdist
 SHORT_SHARE = 0.15  # of the variance; least leave-out error on training spectra, flat from 0.1 to 0.3
 SHORT_RATIO = 1 / 3  # of the lengths
 SWEEPS = 30
+QUERIES = 2048  # answered at a time: bounds the memory for thousands of samples
 SETTLED = 1e-3  # mean change per vector and sweep, relative to its length
 TWIN_MARGIN = 1.02  # a twin must be this much likelier to be taken
 
@@ -136,9 +137,15 @@ class VectorProcess:
 
     def posterior(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (B, M) complex and remaining share of the variance (B,) in [0, 1] at (B, 3) [m]."""
-        cross = self.kernel.cross(queries, self.positions)
-        explained = np.einsum("ij,ij->i", cross @ self.inverse, cross)
-        return cross @ (self.inverse @ self.vectors), np.clip(1 - explained, 0.0, 1.0)
+        weights = self.inverse @ self.vectors
+        mean = np.empty((len(queries), weights.shape[1]), dtype=np.complex128)
+        left = np.empty(len(queries))
+        for start in range(0, len(queries), QUERIES):
+            part = slice(start, start + QUERIES)
+            cross = self.kernel.cross(queries[part], self.positions)
+            mean[part] = cross @ weights
+            left[part] = 1 - np.einsum("ij,ij->i", cross @ self.inverse, cross)
+        return mean, np.clip(left, 0.0, 1.0)
 
 
 def settle(

@@ -122,11 +122,13 @@ def test_leave_out_with_gaps_equals_refitting(known_campaign):
     assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
 
 
-def test_packets_answer_like_their_teacher(known_campaign):
+@pytest.mark.parametrize("length", [0.15, 1.5])
+def test_packets_answer_like_their_teacher(known_campaign, length):
+    """Also a teacher that remembers over metres: its packets stay as small as the waves."""
     data, truth = known_campaign
     scale = truth / np.abs(truth).max()
-    teacher = learn_process(scale, data.tx, None, Kernel(0.15, 1e-3))
-    packets = distil(teacher, PacketSettings(count=600, samples=2500), seed=0)
+    teacher = learn_process(scale, data.tx, None, Kernel(length, 1e-3))
+    packets = distil(teacher, PacketSettings(count=600, samples=2500), 0.3259, seed=0)
     asked = data.tx[::7] + 0.01
     mean, left = teacher.posterior(asked)
     with torch.no_grad():
