@@ -9,8 +9,9 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsparc.benchmark import kernels
+from gsparc.benchmark import kernels, layers
 from gsparc.benchmark.case import Call
+from gsparc.benchmark.measure import Machine, measure
 from gsparc.benchmark.scene import Scene, scene
 from gsparc.clock import ClockSettings, interleaved
 from gsparc.ops.settings import Projection
@@ -40,17 +41,25 @@ class Claim:
 
 @torch.no_grad()
 def claims(
-    projection: Projection, counts: Sequence[int], threads: int, batch: int, clock: ClockSettings
+    projection: Projection,
+    counts: Sequence[int],
+    threads: int,
+    batch: int,
+    machine: Machine,
+    clock: ClockSettings,
 ) -> list[Claim]:
     """Every promise for one projection; `counts` ascending, the middle one for the static receiver."""
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        middle = scene(counts[len(counts) // 2], projection)
+        fields = [scene(count, projection) for count in counts]
+        middle = fields[len(fields) // 2]
         return [
             *_backward(middle, clock),
+            *_forward(fields[1:], machine, clock),
             *_frozen(middle, batch, clock),
-            *_growth([scene(count, projection) for count in counts], clock),
+            *_channels(middle, clock),
+            *_growth(fields, clock),
         ]
     finally:
         torch.set_num_threads(before)
@@ -59,6 +68,16 @@ def claims(
 def _backward(field: Scene, clock: ClockSettings) -> list[Claim]:
     ratio = _ratio(kernels.backward(field, 1).kernel, kernels.moving(field, 1).kernel, clock)
     return [Claim(f"backward / forward at {len(field)}", ratio, 3.0)]
+
+
+def _forward(fields: list[Scene], machine: Machine, clock: ClockSettings) -> list[Claim]:
+    rows = [measure(kernels.moving(field, 1), machine, None, clock, references=False) for field in fields]
+    return [Claim(f"forward / limit at {row.case.count}", row.over, 3.0) for row in rows]
+
+
+def _channels(field: Scene, clock: ClockSettings) -> list[Claim]:
+    one, many = (_whole(layers.channel(field, *shape, 1)) for shape in ((1, 1), layers.MANY))
+    return [Claim(f"1664 channels / 1 at {len(field)}", _ratio(many, one, clock), 2.0)]
 
 
 def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:

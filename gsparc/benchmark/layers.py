@@ -1,4 +1,4 @@
-"""The rows that time what stands around the rasterizer: emission networks and the loss."""
+"""The rows that time what stands around the rasterizer: emission networks, channels and the loss."""
 
 from __future__ import annotations
 
@@ -6,11 +6,15 @@ import torch
 from torch import Tensor
 
 from gsparc.benchmark.case import Case, Work, size
-from gsparc.benchmark.scene import DEFAULT, GRID, PAPER, places, scene
+from gsparc.benchmark.scene import DEFAULT, GRID, PAPER, Scene, places, receivers, scene
 from gsparc.emission import Emission, EmissionSettings
 from gsparc.losses import spectrum_loss
+from gsparc.ops import mean_weights
+from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
 
+TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
+MANY = (64, 26)  # antennas and subcarriers of the Argos release: 1,664 channels
 NAMES = {PAPER: "emission 3-16-2", DEFAULT: "emission, default network"}
 
 
@@ -65,6 +69,28 @@ def loss(batch: int) -> Case:
         work=Work(5 * target.nbytes),
         kernel=kernel,
         unaffordable="its own kernel is plain PyTorch",
+    )
+
+
+def channel(field: Scene, antennas: int, subcarriers: int, batch: int) -> Case:
+    """Antennas x subcarriers at a moving receiver: the factored sum (kernel); all of the query (whole)."""
+    count, draw = len(field), torch.Generator().manual_seed(0)
+    steering = torch.randn(count, antennas, 2, generator=draw)
+    delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
+    gains = torch.randn(batch, count, 2, generator=draw)
+    poses, tx = receivers(batch), places(batch) + 1
+
+    def whole() -> Tensor:
+        share = mean_weights(field.plan(poses, channels=True), *field.geometry).share
+        emitted = field.model.features(tx, poses)
+        return channels(share.unsqueeze(-1) * emitted, steering, delays, *TONES, subcarriers)
+
+    return Case(
+        *(f"channel of {antennas} x {subcarriers}", field.projection, count, batch),
+        work=Work(size((gains, steering, delays)) + 8 * batch * antennas * subcarriers),
+        kernel=lambda: channels(gains, steering, delays, *TONES, subcarriers),
+        whole=whole,
+        reference=lambda: summed(gains, steering, delays, TONES, subcarriers),
     )
 
 

@@ -56,10 +56,11 @@ class Machine:
 
 @torch.no_grad()
 def measure(
-    case: Case, machine: Machine, threads: int, clock: ClockSettings, *, references: bool = True
+    case: Case, machine: Machine, threads: int | None, clock: ClockSettings, *, references: bool = True
 ) -> Row:
-    """Time a case on `threads` threads, one call of everything per round; the reference once."""
+    """Time a case on `threads` threads (None: as now), one call of everything per round; the reference once."""
     before = torch.get_num_threads()
+    threads = threads or before
     torch.set_num_threads(threads)
     try:
         moved, counted = machine.copy(), machine.exponentials()

@@ -31,6 +31,23 @@ def test_opcheck(hides):
     opcheck(native.weights_op, (*leaves, hidden, *view, buffers, *numbers))
 
 
+@pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
+@pytest.mark.parametrize("behind", [False, True], ids=["image", "transmittance"])
+def test_opcheck_of_the_gradients(hides, behind):
+    scene, pose = random_scene(n=7, samples=2, hides=hides), poses(2)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
+    common = (*model, scene.extinctions)
+    view = (pose.position, pose.rotation, list(plan.buffers), *native._numbers(GRID, plan.optics))
+    before, buffers = (pose.position, pose.rotation), list(plan.buffers)
+    raster = composite(plan, *model, scene.features, extinctions=scene.extinctions)
+    light = torch.ones_like(raster.transmittance) if behind else None
+    images = (torch.ones_like(raster.image), light, raster.image, raster.transmittance)
+    opcheck(native.composite_backward_op, (*images, *common, scene.features, *view))
+    seen = native.weights_op(*common, *before, buffers, *native._numbers(GRID, plan.optics))
+    opcheck(native.weights_backward_op, (*[torch.ones_like(part) for part in seen], *common, *view))
+
+
 def test_bare_import_is_refused_with_a_reason():
     code = "import gsparc.ops, sys; sys.path.insert(0, '.'); import ops"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
