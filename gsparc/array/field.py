@@ -16,7 +16,7 @@ from gsparc.array.process import learn_process, mirror_elements
 from gsparc.array.render import SpectrumRenderer
 from gsparc.array.response import site_problem, steering
 from gsparc.array.store import recovered, report
-from gsparc.array.tuning import tune
+from gsparc.array.tuning import LEAST_LEFT, tune
 from gsparc.baselines import platform_cache
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -125,7 +125,7 @@ class ArrayField(Method):
                 vectors = self.field(tx[part])
                 torch.square(vectors[:, -1].real, out=left[part])
                 self.renderer.draw(vectors, mean[part])
-        return Prediction(mean, 1 - left, self.error[0] + self.error[1] * left)
+        return Prediction(mean, 1 - left, self.error[0] * (left + LEAST_LEFT) ** self.error[1])
 
     def state(self) -> dict[str, Any]:
         """Packets, background, error model."""

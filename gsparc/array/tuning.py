@@ -20,6 +20,7 @@ PIXELS = 600  # drawn from the grid
 ROWS = 384  # neighbouring samples the choice is made on
 CENTRES = 160  # of them predicted
 STEPS = 36
+LEAST_LEFT = 1e-3  # of the variance is always unknown: quantisation, recovery
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
 
 
@@ -38,10 +39,15 @@ class Tuned:
     error: np.ndarray
 
     def error_model(self) -> tuple[float, float]:
-        """(a, b), both at least 0: the expected squared error of a pixel is about a + b * left."""
-        design = np.stack([np.ones_like(self.left), self.left], 1)
-        a, b = np.linalg.lstsq(design, self.error, rcond=None)[0]
-        return max(float(a), float(self.error.min())), max(float(b), 0.0)
+        """(a, p): the expected squared error of a pixel is about `a (left + LEAST_LEFT)^p`.
+
+        A line through the logarithms, then scaled so that the mean error is right.
+        """
+        x, y = np.log(self.left + LEAST_LEFT), np.log(self.error + 1e-9)
+        spread = x - x.mean()
+        power = float(np.clip((spread @ y) / max(float(spread @ spread), 1e-12), 0.0, 2.0))
+        shape = np.exp(power * x)
+        return float(self.error.mean() / shape.mean()), power
 
 
 def tune(
