@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import invent
-from rooms import WAVELENGTH, nmse, shoebox
+from rooms import WAVELENGTH, furnished, nmse, shoebox
 
 from gsparc.coherent.pictures import plot_visibility
 from gsparc.coherent.rows import gather
@@ -172,6 +172,15 @@ def test_a_pillar_hides_sources_and_it_is_seen_which(tmp_path):
     assert picture.stat().st_size > 10_000
     # The line of sight is cut sharply; a smooth law can only follow.
     assert np.corrcoef(learned[:, 0], true[:, 0])[0, 1] > 0.7
+
+
+@pytest.mark.slow
+def test_a_furnished_room(tmp_path):
+    told, data, fold = furnished(600)
+    method = VirtualSourceGP(searches=2, budget_s=150)
+    method.fit(data, fold, tmp_path)
+    assert found_share(method, told, within=0.5, order=1) == 1.0
+    assert nmse(_predicted(method, data, fold.test).mean.numpy(), data.targets(fold.test).numpy()) <= 0.1
 
 
 def learned_and_true_visibility(method, told, data, index, most=6):
