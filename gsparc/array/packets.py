@@ -114,14 +114,17 @@ def distil(teacher: VectorProcess, settings: PacketSettings, wavelength: float, 
     field = WavePackets(c, s, w, origin, m).double()
     reach = np.exp(rng.uniform(np.log(settings.near), np.log(settings.far), (settings.samples, 1))) * length
     around = places[rng.integers(0, n, settings.samples)] + reach * rng.standard_normal((settings.samples, 3))
-    asked = np.concatenate([places, places, around])
-    mean, left = teacher.posterior(asked)
+    asked = np.concatenate([places, around])
+    mean, left = (
+        np.concatenate(p) for p in zip(teacher.at_samples(), teacher.posterior(around), strict=True)
+    )
     # Pairs of real and imaginary parts; the unknown share is learned as its distance from 1.
     wanted = np.concatenate([mean, np.sqrt(left)[:, None] - 1], 1).view(np.float64)
+    weight = np.where(np.arange(len(asked)) < n, 2.0**0.5, 1.0)[:, None]  # the samples themselves count twice
     with torch.no_grad():
-        features = field.features(torch.from_numpy(asked)).numpy()
+        features = weight * field.features(torch.from_numpy(asked)).numpy()
         gram = features.T @ features
         gram[np.diag_indices_from(gram)] += settings.ridge * np.trace(gram) / len(gram)
-        gains = cho_solve(cho_factor(gram, lower=True, overwrite_a=True), features.T @ wanted)
+        gains = cho_solve(cho_factor(gram, lower=True, overwrite_a=True), features.T @ (weight * wanted))
         field.gains.copy_(torch.from_numpy(gains))
     return field.float()

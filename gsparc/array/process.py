@@ -147,6 +147,12 @@ class VectorProcess:
             left[part] = 1 - np.einsum("ij,ij->i", cross @ self.inverse, cross)
         return mean, np.clip(left, 0.0, 1.0)
 
+    def at_samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """`posterior(positions)` from `K = (K + noise) - noise`, without products of n x n matrices."""
+        noise = self.kernel.noise
+        mean = self.vectors - noise * (self.inverse @ self.vectors)
+        return mean, np.clip(noise - noise**2 * np.diag(self.inverse), 0.0, 1.0)
+
 
 def settle(
     vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
@@ -156,14 +162,16 @@ def settle(
     The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams 2006,
     eq. 5.12).
     """
-    settled = vectors.copy()
+    settled = np.ascontiguousarray(vectors, dtype=np.complex128)
+    settled = settled.copy() if settled is vectors else settled
+    parts = settled.view(np.float64)  # a real row times complex columns would be made complex first
     diagonal = np.diag(inverse)
     size = np.linalg.norm(vectors, axis=1).sum()
     for _ in range(sweeps):
         change = 0.0
         for i in range(len(settled)):
-            old = settled[i]
-            expected = old - (inverse[i] @ settled) / diagonal[i]
+            old = settled[i].copy()
+            expected = old - (inverse[i] @ parts).view(np.complex128) / diagonal[i]
             new, overlap = old, np.vdot(old, expected)
             if partner is not None:
                 other = twin(old, partner)

@@ -129,6 +129,8 @@ def test_packets_answer_like_their_teacher(known_campaign, length):
     scale = truth / np.abs(truth).max()
     teacher = learn_process(scale, data.tx, None, Kernel(length, 1e-3))
     packets = distil(teacher, PacketSettings(count=600, samples=2500), 0.3259, seed=0)
+    for quick, whole in zip(teacher.at_samples(), teacher.posterior(data.tx), strict=True):
+        np.testing.assert_allclose(quick, whole, atol=1e-8)
     asked = data.tx[::7] + 0.01
     mean, left = teacher.posterior(asked)
     with torch.no_grad():
