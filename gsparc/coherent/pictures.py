@@ -16,7 +16,7 @@ def plot_visibility(
     true: np.ndarray,
     names: Sequence[str],
 ) -> Path:
-    """Write a PNG: a column per source, learned above true; grey is unseen, yellow is fully seen.
+    """Write a PNG: a column per source, learned above true; blue is unseen, yellow is fully seen.
 
     Args:
         path: of the PNG; its folder is made.
