@@ -11,7 +11,7 @@ import torch
 
 from gsparc.benchmark import kernels, layers
 from gsparc.benchmark.case import Call
-from gsparc.benchmark.measure import Machine, measure
+from gsparc.benchmark.measure import Machine, measure, undisturbed
 from gsparc.benchmark.scene import Scene, scene
 from gsparc.clock import ClockSettings, interleaved
 from gsparc.ops.settings import Projection
@@ -23,7 +23,7 @@ class Claim:
 
     Attributes:
         name: what is promised.
-        ratio: median over rounds of one time over the other.
+        ratio: one time over the other, both of the same rounds.
         bound: what the ratio is compared with.
         at_least: whether the ratio must be at least, rather than at most, the bound.
     """
@@ -87,10 +87,10 @@ def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
     )
     times = _times({"moving": moving, "one": one, "many": many}, clock)
     return [
-        Claim(f"moving / frozen at {len(field)}", _median(times["moving"] / times["one"]), 3.0, True),
+        Claim(f"moving / frozen at {len(field)}", times["moving"] / times["one"], 3.0, True),
         Claim(
             f"moving / frozen, {batch} at once, per query",
-            *(_median(batch * times["moving"] / times["many"]), 10.0, True),
+            *(batch * times["moving"] / times["many"], 10.0, True),
         ),
     ]
 
@@ -102,7 +102,7 @@ def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
     found = []
     for small, large in pairwise(fields):
         doublings = np.log2(len(large) / len(small))
-        growth = _median(times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
+        growth = (times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
         found.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
     return found
 
@@ -114,15 +114,12 @@ def _whole(case) -> Call:
 
 def _ratio(above: Call, below: Call, clock: ClockSettings) -> float:
     times = _times({"above": above, "below": below}, clock)
-    return _median(times["above"] / times["below"])
+    return times["above"] / times["below"]
 
 
-def _times(calls: dict[str, Call], clock: ClockSettings) -> dict[str, np.ndarray]:
+def _times(calls: dict[str, Call], clock: ClockSettings) -> dict[str, float]:
     def ignoring(call: Call) -> Callable[[int], object]:
         return lambda turn: call()
 
-    return interleaved({name: ignoring(call) for name, call in calls.items()}, clock)
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values))
+    times = interleaved({name: ignoring(call) for name, call in calls.items()}, clock)
+    return {name: undisturbed(values) for name, values in times.items()}

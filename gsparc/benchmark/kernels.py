@@ -61,7 +61,7 @@ def static(scene: Scene, batch: int) -> Case:
         work=_blending(scene, pose, batch * COMPLEX),
         kernel=lambda: composite(made, *scene.geometry, features).image,
         whole=whole,
-        **_reference(scene, 1, lambda: composite(dense, *scene.geometry, features).image if dense else None),
+        **_reference(scene, 1, lambda: dense and composite(dense, *scene.geometry, features).image),
     )
 
 
@@ -84,15 +84,16 @@ def backward(scene: Scene, batch: int) -> Case:
     """Gradients of blending (kernel); a training step's forward and backward (whole)."""
     pose = receiver()
     made = scene.plan(pose)
-    leaves = [tensor.clone().requires_grad_() for tensor in scene.geometry]
+    means, quats, scales, opacities = (tensor.clone().requires_grad_() for tensor in scene.geometry)
     features = scene.features.expand(batch, -1, -1).clone().requires_grad_()
+    leaves = (means, quats, scales, opacities, features)
     with torch.enable_grad():
-        image = composite(made, *leaves, features).image
+        image = composite(made, *leaves).image
     slope = torch.rand(image.shape, generator=torch.Generator().manual_seed(0))
     tx, rx = places(batch) + 1, Pose.identity(places(batch))
 
     def kernel() -> object:
-        return torch.autograd.grad(image, [*leaves, features], slope, retain_graph=True)
+        return torch.autograd.grad(image, leaves, slope, retain_graph=True)
 
     def whole() -> None:
         with torch.enable_grad():

@@ -73,8 +73,8 @@ def scene(count: int, projection: Projection, emission: EmissionSettings = PAPER
         model = ComplexSpectra(settings, _site())
         _scatter(model.gaussians)
         features = torch.rand(count, COMPLEX)
-    geometry = tuple(tensor.detach() for tensor in model._geometry())
-    return Scene(model, geometry, features, projection)
+    means, quats, scales, opacities = (tensor.detach() for tensor in model._geometry())
+    return Scene(model, (means, quats, scales, opacities), features, projection)
 
 
 def places(count: int) -> Tensor:
@@ -95,7 +95,7 @@ def receiver() -> Pose:
 
 @torch.no_grad()
 def _scatter(field: GaussianField) -> None:
-    field.log_scales += 0.5 * torch.randn_like(field.log_scales)
+    field.log_scales.add_(torch.randn_like(field.log_scales), alpha=0.5)
     field.quats.copy_(torch.randn_like(field.quats))
     field.opacity_logits.copy_(1.5 * torch.randn_like(field.opacity_logits) - 1)
 

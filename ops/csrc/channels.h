@@ -28,7 +28,7 @@ inline Turned turned(double turns) {
 template <class S> inline void tones(const ChannelArgs<S>& a, double delay, S* out) {
     constexpr int n = Lanes<S>::n;
     const int padded = padded_tones<S>(a.subcarriers);
-    Turned lanes[n], step = turned(a.step * delay);
+    Turned lanes[n], step = a.subcarriers > 1 ? turned(a.step * delay) : Turned{1, 0};
     lanes[0] = turned(a.first * delay);
     for (int width = 1; width < n; width *= 2, step = step * step)
         for (int k = 0; k < width; ++k) lanes[width + k] = lanes[k] * step;

@@ -2,8 +2,8 @@
 
 Remedy: boxes by extent, never by mean (csrc/boxes.h). Shown: the sum over the visible rows follows the
 integral of the footprint over them, without a jump: one step of the sweep is worth at most 8 % of the whole.
-Tolerance 0.2 % of the whole for `equirect` (measured 0.14 %: the width of the footprint is linearised) and 1 %
-for `tangent` (measured 0.75 %: the plane bends away from the sphere).
+Tolerance 0.2 % of the whole for `equirect` (measured 0.14 %: the footprint's width is linearised) and 1 % for
+`tangent` (measured 0.75 %: the plane bends away from the sphere).
 """
 
 import math
