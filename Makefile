@@ -3,6 +3,8 @@ SHELL := /bin/bash
 PYTHON ?= python3
 VENV ?= .venv
 RUN := $(VENV)/bin/python
+# Torch's threads would otherwise spin for one another beside a busy process.
+export OMP_WAIT_POLICY ?= passive
 SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
