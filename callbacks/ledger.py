@@ -32,6 +32,12 @@ class CostLedger(L.Callback):
         ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
         return ledgers[0].paused() if ledgers else nullcontext()
 
+    @staticmethod
+    def seconds_in(trainer: L.Trainer) -> float | None:
+        """Seconds on the trainer's ledger [s]; None when it keeps none."""
+        ledgers = [c for c in trainer.callbacks if isinstance(c, CostLedger)]  # type: ignore[attr-defined]
+        return ledgers[0].elapsed() if ledgers else None
+
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Stop the watch for work that is not training."""

@@ -24,13 +24,14 @@ class StepProgress(L.Callback):
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Draw the bar."""
         self._bar = Progress(
-            TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+            TextColumn("{task.description}{task.completed:.0f}/{task.total:.0f}"),
             BarColumn(bar_width=8),
             TimeRemainingColumn(elapsed_when_finished=True),
             TextColumn("{task.fields[figures]}"),
         )
         self._bar.start()
-        self._bar.add_task("train", total=trainer.max_steps, completed=trainer.global_step, figures="")
+        stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
+        self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Advance; figures are read now and then, not at every step."""

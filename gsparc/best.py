@@ -69,7 +69,8 @@ class Gsparc(LearnedField):
         else:
             if self.training.resume is not None:
                 raise ValueError(
-                    f"ckpt_path: effects.{self._chosen} trains in one piece, there is nothing to go on from"
+                    f"ckpt_path: effects.{self._chosen} trains in one piece, there is nothing to go on from "
+                    "(the splatted field, effects.*=false, resumes)"
                 )
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             report = self._models[self._chosen].fit(data, fold, run_dir)

@@ -32,6 +32,13 @@ class Predictor:
     def __init__(self, method: Method, site: Site) -> None:
         self.method, self.site = method, site
 
+    def __repr__(self) -> str:
+        low, high = (self.site.box + self.site.origin).round(2).tolist()
+        return (
+            f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
+            f"the {self.site.moving_end} moves, measured from {low} to {high} m)"
+        )
+
     def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
         """Power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
 

@@ -18,6 +18,8 @@ from rich.table import Table
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 
+BUSY = 1.2  # 1-minute load per core above which times are said to be inflated
+
 
 def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     """Write flat `facts` as JSON, atomically; keys sorted.
@@ -65,7 +67,7 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
     elif power:
         wanted = (("rmse_db", ".2f"), ("mae_db", ".2f"), ("nmse", ".4f"), ("skill", ".3f"))
     else:
-        wanted = (("nmse", ".4f"), ("nmse_scalar", ".4f"), ("snr_db", ".2f"), ("skill", ".3f"))
+        wanted = (("nmse", ".3g"), ("nmse_scalar", ".3g"), ("snr_db", ".2f"), ("skill", ".3f"))
     table = Table(title=title)
     table.add_column("method")
     for name in (*(name for name, _ in wanted), "train s", "query ms p50"):
@@ -77,6 +79,25 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
         cells += [_shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
         table.add_row(name, *cells, style="bold" if name == method and figures == prefix else None)
     return table
+
+
+def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
+    """What a reader of the table must know besides: stand-ins, a busy machine, a simpler method that wins."""
+    found = []
+    if facts.get("dataset/stand_in"):
+        release = facts["dataset/stand_in"]
+        found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here speaks of it")
+    load = facts.get("machine/load")
+    if load is not None and load > BUSY:
+        found.append(f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so")
+    figure, sign = ("psnr_db", -1) if f"{prefix}/psnr_db" in facts else ("nmse", 1)
+    own = facts.get(f"{prefix}/{figure}")
+    keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
+    better = [k for k in keys if None not in (own, facts[k]) and sign * facts[k] < sign * own]
+    if better:
+        best = min(better, key=lambda k: sign * facts[k]).split("/")[1]
+        found.append(f"{best} has the better {figure} here: for this data and split it is the better choice")
+    return found
 
 
 def _rank(name: str) -> tuple[int, str]:

@@ -42,6 +42,12 @@ class TrainerSettings:
     gradient_clip: float | None = None
     accelerator: str = "cpu"
 
+    def __post_init__(self) -> None:
+        for name in ("max_steps", "batch_size", "val_every", "checkpoint_every"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+                raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 1 is needed")
+
 
 @dataclass
 class Training:

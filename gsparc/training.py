@@ -24,11 +24,14 @@ from gsparc.data.splits import Split, write_split
 from gsparc.evaluation import Evaluation, evaluate
 from gsparc.learned import LearnedField
 from gsparc.method import Method
+from gsparc.pictures import draw_predictions
 from gsparc.registry import build
-from gsparc.summary import provenance, results_table, write_samples, write_summary
+from gsparc.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)
+
+LEAST_ROWS = 4  # fewer training rows than this teach nothing
 
 
 @dataclass(frozen=True)
@@ -64,8 +67,10 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     """
     if config.threads is not None:
         torch.set_num_threads(int(config.threads))
+    _anchor(config)
     data = load(_plain(config.dataset))
     split = split_for(_plain(config.split), data)
+    _refuse_empty(split)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     config_yaml = OmegaConf.to_yaml(config, resolve=True)
     methods, files, seconds = [], [], []
@@ -100,13 +105,36 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         facts = {**found.facts, **provenance(), "seed": int(config.seed)}
         for logger in loggers:
             logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
+    draw_predictions(
+        methods[0],
+        data,
+        split.folds[0],
+        f"{data.site.name}: test rows of {methods[0].name}",
+        run_dir / "test.png",
+    )
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_summary(run_dir / "summary.json", facts)
     return facts, Objects(tuple(methods), tuple(files), data, split, found)
 
 
 def _plain(node: DictConfig) -> dict[str, Any]:
-    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
+
+
+def _anchor(config: DictConfig) -> None:
+    """Data paths become absolute, so that a checkpoint finds its data from any folder."""
+    for key in ("root", "file"):
+        if not OmegaConf.is_missing(config.dataset, key) and config.dataset.get(key):
+            config.dataset[key] = str(Path(config.dataset[key]).resolve())
+
+
+def _refuse_empty(split: Split) -> None:
+    for number, fold in enumerate(split.folds):
+        if len(fold.train) < LEAST_ROWS or not len(fold.test):
+            raise ValueError(
+                f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
+                f"rows; at least {LEAST_ROWS} and 1 are needed"
+            )
 
 
 def _callbacks(config: DictConfig) -> list[Any]:
@@ -118,6 +146,8 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     if config.ckpt_path is None:
         return None
     path = Path(config.ckpt_path)
+    if not path.exists():
+        raise ValueError(f"ckpt_path={path}: no such file")
     if folds == 1:
         return path
     own = path / f"fold{number}" / "last.ckpt"
@@ -151,6 +181,8 @@ def task(config: DictConfig) -> float | None:
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
     console = Console()
     console.print(results_table(facts, facts["model/name"], title, config.eval_on))
+    for remark in remarks(facts, config.eval_on):
+        console.print(remark, highlight=False)
     console.print(f"written to {run_dir}", highlight=False)
     return facts.get(f"{config.eval_on}/psnr_db", facts.get(f"{config.eval_on}/nmse"))
 

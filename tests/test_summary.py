@@ -14,7 +14,7 @@ import torch
 from rich.console import Console
 
 import gsparc.summary
-from gsparc.summary import provenance, results_table, write_samples, write_summary
+from gsparc.summary import provenance, remarks, results_table, write_samples, write_summary
 
 
 def test_numbers_strings_and_null(tmp_path):
@@ -78,3 +78,15 @@ def test_commit_is_known_inside_the_tree_only(tmp_path):
     code = f"import runpy; print(runpy.run_path({str(outside)!r})['provenance']()['git'])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "None"
+
+
+def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
+    facts = {"dataset/stand_in": "rfid", "machine/load": 3.0, "test/nmse": 0.2}
+    facts |= {"baseline/gp/nmse": 0.1, "baseline/idw/nmse": 0.3}
+    said = " | ".join(remarks(facts))
+    for words in ("SIMULATED stand-in", "load 3.0", "gp has the better nmse"):
+        assert words in said
+    assert "idw" not in said
+    quiet = {"dataset/stand_in": None, "machine/load": 0.5, "test/psnr_db": 30.0, "baseline/gp/psnr_db": 29.0}
+    assert remarks(quiet) == []
+    assert "gp" in remarks({**quiet, "baseline/gp/psnr_db": 31.0})[0]

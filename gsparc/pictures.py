@@ -1,0 +1,102 @@
+"""What was measured beside what was predicted, as a person looks at it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.method import Method
+
+
+def draw_predictions(
+    method: Method, data: Measurements, fold: Fold, title: str, path: Path, count: int = 4
+) -> None:
+    """Draw test rows: `count` spectra, or all channels or powers as points.
+
+    Args:
+        method: fitted on `fold`.
+        data, fold: where the test rows come from.
+        title: above everything.
+        path: PNG file.
+        count: number of spectra.
+    """
+    spectra = data.site.kind == "spectrum"
+    few = np.linspace(0, len(fold.test) - 1, min(count, len(fold.test))).astype(int)
+    rows = fold.test[few] if spectra else fold.test
+    batch = data.batch(rows)
+    predicted = method.predict(batch.tx, batch.rx).mean.numpy()
+    if spectra:
+        draw_spectra(batch.target.numpy(), predicted, rows, title, path)
+    else:
+        draw_points(batch.target.numpy(), predicted, title, path)
+
+
+def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path) -> None:
+    """Save a figure of predicted against measured strength, and of the error of the phase where there is one.
+
+    Args:
+        target, predicted: (B, ...) complex channels or real powers, in stored units.
+        title: above everything.
+        path: PNG file.
+    """
+    channels = np.iscomplexobj(target)
+    figure = Figure(figsize=(11 if channels else 5.5, 4.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2 if channels else 1, squeeze=False)[0]
+    tiny, factor = np.finfo(np.float32).tiny, 20 if channels else 10
+    true_db, guess_db = (factor * np.log10(np.maximum(np.abs(x).ravel(), tiny)) for x in (target, predicted))
+    low, high = np.percentile(true_db, [0.5, 100])
+    axes[0].plot([low, high], [low, high], color="grey", linewidth=1)
+    axes[0].scatter(true_db, guess_db, s=6, alpha=0.5)
+    axes[0].set(
+        xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), xlabel="measured [dB]", ylabel="predicted [dB]"
+    )
+    axes[0].set_title("strength, relative to unit power")
+    if channels:
+        turn = np.degrees(np.angle(predicted.ravel() * target.ravel().conj()))
+        axes[1].scatter(true_db, turn, s=6, alpha=0.5)
+        axes[1].set(xlabel="measured strength [dB]", ylabel="phase error [degrees]", ylim=(-180, 180))
+        axes[1].set_title(f"phase error, median {np.median(np.abs(turn)):.1f} degrees")
+    figure.suptitle(title)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=90)
+
+
+def draw_spectra(target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, title: str, path: Path) -> None:
+    """Save a figure: a line per sample, with measured, predicted and difference beside each other.
+
+    Args:
+        target, predicted: (B, H, W) in [0, 1].
+        rows: (B,) dataset rows, for the labels.
+        title: above everything.
+        path: PNG file.
+    """
+    figure = Figure(figsize=(13, 1.6 * len(target) + 0.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(len(target), 3, squeeze=False, sharex=True, sharey=True)
+    for line, (true, guess, row) in enumerate(zip(target, predicted, rows, strict=True)):
+        options: dict[str, Any] = {"origin": "lower", "aspect": "auto"}
+        options["extent"] = (0, true.shape[1], 0, true.shape[0])
+        power = axes[line, 0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
+        axes[line, 1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
+        error = axes[line, 2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
+        axes[line, 0].set_ylabel(f"sample {row}\nelevation row")
+        axes[line, 2].text(
+            0.99, 0.95, f"rms {np.sqrt(np.mean((guess - true) ** 2)):.3f}", ha="right", va="top",
+            transform=axes[line, 2].transAxes,
+        )  # fmt: skip
+    for axis, name in zip(axes[0], ("measured", "predicted", "predicted - measured"), strict=True):
+        axis.set_title(name)
+    for axis in axes[-1]:
+        axis.set_xlabel("azimuth column")
+    figure.colorbar(power, ax=axes[:, 1], label="relative strength")
+    figure.colorbar(error, ax=axes[:, 2], label="difference")
+    figure.suptitle(title)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=80)

@@ -1,0 +1,30 @@
+"""Every kind of target leaves a picture of its test rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsparc.data.splits import Fold
+from gsparc.peers.mean import Mean
+from gsparc.pictures import draw_points, draw_predictions
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
+def test_test_rows_are_drawn(campaign, tmp_path, kind):
+    data = campaign(kind)
+    rows = np.arange(len(data))
+    fold = Fold(rows[::2], rows[:0], rows[1::2])
+    method = Mean()
+    method.fit(data, fold, tmp_path)
+    draw_predictions(method, data, fold, "title", tmp_path / "deep" / "test.png")
+    with Image.open(tmp_path / "deep" / "test.png") as image:
+        assert len(np.unique(np.asarray(image.convert("L")))) > 20
+
+
+def test_silent_channels_do_not_break_the_picture(tmp_path):
+    target = np.zeros((5, 1, 1), np.complex64)
+    target[0] = 1
+    draw_points(target, target * 0.5, "title", tmp_path / "points.png")
+    assert (tmp_path / "points.png").stat().st_size > 1000
