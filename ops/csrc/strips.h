@@ -11,11 +11,16 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
-// Plain memory, freed at the end of the scope; std::vector would be compiled per instruction set under one name.
+// Plain memory of zeros, freed at the end of the scope; std::vector would be compiled per instruction set under
+// one name. It starts on a cache line: a vector across two of them costs twice, and more when read back.
 template <class T> struct Buffer {
-    T* data;
-    explicit Buffer(int64_t size) : data(static_cast<T*>(calloc(size > 0 ? size : 1, sizeof(T)))) {}
-    ~Buffer() { free(data); }
+    static constexpr uintptr_t line = 64;
+    void* const memory;
+    T* const data;
+    explicit Buffer(int64_t size)
+        : memory(calloc((size > 0 ? size : 1) * sizeof(T) + line, 1)),
+          data(reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(memory) + line - 1) / line * line)) {}
+    ~Buffer() { free(memory); }
     Buffer(const Buffer&) = delete;
     T& operator[](int64_t i) { return data[i]; }
 };
@@ -90,7 +95,7 @@ GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S
     const View view(strip.records + int64_t(rank) * kRecord, at, grid.tables, lens);
     int hits[most];
     Mask<S> counts[most];
-    S memory[most * kept];
+    alignas(64) S memory[most * kept];
     typename View::Seen seen;
     for (int run = 0; run < runs.count; ++run) {
         const int last = (runs.to[run] - 1) / kTileColumns<S>;
