@@ -93,9 +93,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     figure, sign = ("psnr_db", -1) if f"{prefix}/psnr_db" in facts else ("nmse", 1)
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
-    better = [k for k in keys if None not in (own, facts[k]) and sign * facts[k] < sign * own]
-    if better:
-        best = min(better, key=lambda k: sign * facts[k]).split("/")[1]
+    known = {k.split("/")[1]: sign * float(facts[k]) for k in keys if facts[k] is not None}
+    best = min(known, key=lambda name: known[name], default=None)
+    if best is not None and own is not None and known[best] < sign * float(own):
         found.append(f"{best} has the better {figure} here: for this data and split it is the better choice")
     return found
 
