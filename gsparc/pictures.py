@@ -30,9 +30,11 @@ def draw_predictions(
     few = np.linspace(0, len(fold.test) - 1, min(count, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
-    predicted = method.predict(batch.tx, batch.rx).mean.numpy()
+    found = method.predict(batch.tx, batch.rx)
+    predicted = found.mean.numpy()
     if spectra:
-        draw_spectra(batch.target.numpy(), predicted, rows, title, path)
+        sure = None if found.confidence is None else found.confidence.numpy()
+        draw_spectra(batch.target.numpy(), predicted, rows, title, path, sure)
     else:
         draw_points(batch.target.numpy(), predicted, title, path)
 
@@ -68,7 +70,14 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
     figure.savefig(path, dpi=90)
 
 
-def draw_spectra(target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, title: str, path: Path) -> None:
+def draw_spectra(
+    target: np.ndarray,
+    predicted: np.ndarray,
+    rows: np.ndarray,
+    title: str,
+    path: Path,
+    confidence: np.ndarray | None = None,
+) -> None:
     """Save a figure: a line per sample, with measured, predicted and difference beside each other.
 
     Args:
@@ -76,6 +85,7 @@ def draw_spectra(target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, ti
         rows: (B,) dataset rows, for the labels.
         title: above everything.
         path: PNG file.
+        confidence: (B,) in [0, 1], written into the predictions.
     """
     figure = Figure(figsize=(13, 1.6 * len(target) + 0.9), layout="constrained")
     FigureCanvasAgg(figure)
@@ -86,6 +96,11 @@ def draw_spectra(target: np.ndarray, predicted: np.ndarray, rows: np.ndarray, ti
         power = axes[line, 0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
         axes[line, 1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
         error = axes[line, 2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
+        if confidence is not None:
+            axes[line, 1].text(
+                0.99, 0.95, f"confidence {confidence[line]:.2f}", ha="right", va="top", color="white",
+                transform=axes[line, 1].transAxes,
+            )  # fmt: skip
         axes[line, 0].set_ylabel(f"sample {row}\nelevation row")
         axes[line, 2].text(
             0.99, 0.95, f"rms {np.sqrt(np.mean((guess - true) ** 2)):.3f}", ha="right", va="top",
