@@ -36,7 +36,7 @@ class Predictor:
         low, high = (self.site.box + self.site.origin).round(2).tolist()
         return (
             f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
-            f"the {self.site.moving_end} moves, measured from {low} to {high} m)"
+            f"the {self.site.moving_end} moves, scene from {low} to {high} m)"
         )
 
     def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
