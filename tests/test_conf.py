@@ -112,7 +112,7 @@ def test_a_sweep_over_hidden_units_has_a_directory_per_job(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     folders = sorted(p.parent.name for p in (tmp_path / "sweep").glob("*/summary.json"))
-    assert len(folders) == 2 and "hidden=0" in folders[0] and "hidden=8" in folders[1]
+    assert len(folders) == 2 and "hidden-0" in folders[0] and "hidden-8" in folders[1]
     logs = [(tmp_path / "sweep" / folder / "training.log") for folder in folders]
     said = [next(path.parent.glob("*.log")).read_text() for path in logs]
     assert "warm_start=auto -> true" in said[0] and "warm_start=auto -> false" in said[1]
