@@ -31,6 +31,10 @@ def load(config: Mapping[str, Any]) -> Measurements:
         close = difflib.get_close_matches(name, LOADERS, n=1, cutoff=0.4)
         hint = f"; did you mean {close[0]!r}?" if close else ""
         raise DataError(f"dataset: {name!r} is none of {', '.join(LOADERS)}{hint}")
+    wrong = "file" if name in FOLDERS else "root"
+    if config.get(wrong) is not None:
+        right = "root" if name in FOLDERS else "file"
+        raise DataError(f"dataset.{wrong} is not a setting of dataset={name}; say dataset.{right}=...")
     return LOADERS[name](config)
 
 
@@ -95,6 +99,8 @@ def _own(config: Mapping[str, Any]) -> Measurements:
 
     return load_own(_required_file(config))
 
+
+FOLDERS = ("rfid", "rfid_sim")  # datasets that are a folder; the others are one file
 
 LOADERS: dict[str, Callable[[Mapping[str, Any]], Measurements]] = {
     "rfid": _rfid,

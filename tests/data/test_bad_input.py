@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from gsparc.data.errors import DataError, Problems
+from gsparc.data.load import load
 from gsparc.data.newrf import load_newrf
 from gsparc.data.own import from_arrays, load_own, write_own
 from gsparc.data.rfid import load_rfid
@@ -404,3 +405,9 @@ def test_many_bad_rows_stay_readable():
     problems = Problems("file")
     problems.add_rows("file, csi", (f"row {i}" for i in range(6000)), "not finite")
     assert len(problems) == Problems.LIMIT + 1 and "5980 more rows" in problems[-1]
+
+
+@pytest.mark.parametrize(("name", "key"), [("rfid", "file"), ("own", "root"), ("newrf", "root")])
+def test_a_path_of_another_dataset_is_not_ignored(name, key):
+    with pytest.raises(DataError, match=rf"dataset\.{key} is not a setting of dataset={name}"):
+        load({"name": name, key: "somewhere"})
