@@ -24,9 +24,6 @@ DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
 
-#: Larger is better for these; everything else is an error.
-HIGHER_IS_BETTER = frozenset({"ssim", "ssim_median", "ssim_gauss", "psnr_db", "snr_db", "skill"})
-
 
 class SampleMetric(Metric):
     """Base: one float64 per sample and quantity, kept in the order of the updates.

@@ -51,8 +51,9 @@ def test_a_pause_of_a_stopped_watch_does_not_start_it(clock):
 
 
 def test_no_ledger_nothing_to_pause():
-    with CostLedger.paused_in(trainer()):
-        pass
+    with CostLedger.paused_in(trainer()) as nothing:
+        assert nothing is None
+    assert CostLedger.seconds_in(trainer()) is None
 
 
 def test_the_curve_has_accuracy_beside_seconds(clock, tmp_path):
