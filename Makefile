@@ -8,7 +8,7 @@ export OMP_WAIT_POLICY ?= passive
 SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup cuda demo test test-slow bench lint typecheck format clean
+.PHONY: help setup sionna cuda demo test test-slow bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -27,13 +27,20 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES)
 	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[dev,sweep]'
 	@touch $@
 
+sionna: $(VENV)/.sionna ## what `python -m gsparc.simulate` needs: Sionna and an LLVM that works with it, without root
+
+$(VENV)/.sionna: $(VENV)/.installed
+	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna
+	$(RUN) -m gsparc.simulate.llvm
+	@touch $@
+
 demo: setup ## train on a small simulated site, print the table, draw the spectra (about two minutes)
 	$(RUN) train.py experiment=demo hydra.run.dir=demo
 
 test: setup ## fast tests (under 10 minutes on two cores)
 	$(RUN) -m pytest -m "not slow" --durations=10
 
-test-slow: setup ## slow tests: whole training runs, kills, sanitizers
+test-slow: setup sionna ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(RUN) -m pytest -m slow --durations=10
 
 bench: setup ## timings of the kernels as ratios

@@ -1,0 +1,67 @@
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gsparc.simulate import llvm
+
+needs_sionna = pytest.mark.skipif(
+    importlib.util.find_spec("sionna") is None, reason="Sionna is not installed: make sionna"
+)
+
+
+@pytest.fixture(autouse=True)
+def forget():
+    llvm.fault.cache_clear()
+
+
+def test_a_library_named_by_the_user_is_the_only_candidate(monkeypatch):
+    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
+    assert llvm.candidates() == [Path("/nowhere/libLLVM.so")]
+    monkeypatch.delenv(llvm.VARIABLE)
+    assert Path("/nowhere/libLLVM.so") not in llvm.candidates()
+
+
+def test_a_library_that_kills_its_process_is_named_not_fatal(monkeypatch, tmp_path):
+    """LLVM 15 imports and then aborts at the first solve."""
+    library = tmp_path / "libLLVM-15.so"
+    library.touch()
+    monkeypatch.setattr(
+        llvm, "TINY_SOLVE", "import os, sys; print('LLVM ERROR: fmaximum', file=sys.stderr); os.abort()"
+    )
+    wrong = llvm.fault(library)
+    assert wrong is not None and "signal 6" in wrong and "fmaximum" in wrong
+
+
+@needs_sionna
+def test_no_good_library_names_file_fault_and_remedy(monkeypatch):
+    monkeypatch.setenv(llvm.VARIABLE, "/nowhere/libLLVM.so")
+    with pytest.raises(llvm.SimulatorMissing) as raised:
+        llvm.prepare()
+    for words in ("/nowhere/libLLVM.so", "no such file", "gsparc.simulate.llvm"):
+        assert words in str(raised.value)
+
+
+def test_without_sionna_the_remedy_is_named(monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, package=None: None)
+    with pytest.raises(llvm.SimulatorMissing, match="make sionna"):
+        llvm.prepare()
+
+
+def test_nothing_else_imports_the_ray_tracer():
+    """Only `gsparc.simulate` may, and even there not before it is asked to trace."""
+    code = (
+        "import sys, gsparc, gsparc.training, gsparc.evaluate, gsparc.data.load, gsparc.simulate\n"
+        "bad = [m for m in ('mitsuba', 'drjit', 'sionna.rt') if m in sys.modules]\n"
+        "assert not bad, bad"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+@pytest.mark.slow
+@needs_sionna
+def test_a_working_library_is_found():
+    library = llvm.prepare()
+    assert library.exists() and llvm.fault(library) is None
