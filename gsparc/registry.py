@@ -18,11 +18,22 @@ METHODS = {
     "nearest": "gsparc.peers.nearest.Nearest",
     "idw": "gsparc.peers.idw.InverseDistance",
     "gp": "gsparc.peers.gp.GaussianProcess",
+    "kriging": "gsparc.peers.kriging.Kriging",
+    "gsrf": "gsparc.peers.gsrf.GSRF",
+    "wrfgs": "gsparc.peers.wrfgs.WRFGSPlus",
+    "swiftwrf": "gsparc.peers.swiftwrf.SwiftWRF",
+    "nerf2": "gsparc.peers.nerf2.NeRF2",
+    "ngrf": "gsparc.peers.ngrf.NGRF",
+    "newrf": "gsparc.peers.newrf.NeWRF",
+    "ridge": "gsparc.peers.ridge.Ridge",
+    "fire": "gsparc.peers.fire.Fire",
+    "uplink": "gsparc.uplink.method.UplinkField",
     "complex_gp": "gsparc.coherent.complex_gp.ComplexGP",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "array": "gsparc.array.field.ArrayField",
     "array_mirrored": "gsparc.array.mirrored_field.MirroredField",
     "gsparc": "gsparc.best.Gsparc",
+    "committee": "gsparc.committee.Committee",
 }
 
 
@@ -55,7 +66,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
     if target is None:
         raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
     if not trusted:
-        for path in _targets(OmegaConf.to_container(node, resolve=False)):
+        for path in targets(OmegaConf.to_container(node, resolve=False)):
             _refuse_foreign(path)
     method = instantiate(node)
     if not isinstance(method, Method):
@@ -63,16 +74,17 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
     return method
 
 
-def _targets(node: Any) -> Iterator[Any]:
+def targets(node: Any) -> Iterator[Any]:
+    """Every `_target_` in a config, at any depth."""
     if isinstance(node, dict):
         for key, value in node.items():
             if key == "_target_":
                 yield value
             else:
-                yield from _targets(value)
+                yield from targets(value)
     elif isinstance(node, list):
         for value in node:
-            yield from _targets(value)
+            yield from targets(value)
 
 
 def _refuse_foreign(path: Any) -> None:

@@ -1,0 +1,178 @@
+"""`python -m gsparc.compare`: methods x datasets x splits under equal budgets, one table, one figure."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.markdown import Markdown
+
+from gsparc import cli
+from gsparc.baselines import platform_cache
+from gsparc.comparison import figure, table
+from gsparc.comparison.cells import Cell, contenders, plan
+from gsparc.comparison.fitting import Filled, Prepared, Room, fill, kept_in, open_room, prepare
+from gsparc.comparison.latency import Latency, latencies
+from gsparc.summary import provenance, write_summary
+
+log = logging.getLogger(__name__)
+
+FREE_S = 5.0  # guessed for a method without a budget, until one was seen
+
+
+def task(config: DictConfig) -> list[table.Row]:
+    """Fill the cells that are asked for and not there yet, time all methods, and report."""
+    if config.threads is not None:
+        torch.set_num_threads(int(config.threads))
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    methods = contenders(settings["methods"])
+    rooms = _rooms(settings)
+    budgets = [(float(b["seconds"]), [int(s) for s in b["seeds"]]) for b in settings["budgets"]]
+    wanted = plan([(r.dataset, r.split, r.data.site.kind) for r in rooms], methods, budgets, settings["only"])
+    by_name = {(r.dataset, r.split): r for r in rooms}
+    kept = kept_in(settings["cells"], platform_cache())
+    prepared = [
+        prepare(c, methods[c.method], settings["datasets"][c.dataset], by_name[c.dataset, c.split], kept)
+        for c in wanted
+    ]
+    limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
+    filled = fill_all(prepared, by_name, bool(settings["train"]), limit_s)
+    if not filled:
+        raise ValueError("no cell is filled: nothing to report (train=true fills them)")
+    timed = _timed(filled, by_name, kept, bool(settings["latency"]))
+    return report(filled, timed, str(settings["ours"]), run_dir)
+
+
+def _rooms(settings: Mapping[str, Any]) -> list[Room]:
+    """Every dataset with a path under every split, splits outermost: the best-known rooms come first."""
+    absent = [name for name, paths in settings["datasets"].items() if not any((paths or {}).values())]
+    for name in absent:
+        log.warning("%s is left out: say datasets.%s.root=DIR or .file=FILE", name, name)
+    present = {name: paths for name, paths in settings["datasets"].items() if name not in absent}
+    if not present:
+        raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
+    rooms = []
+    for split in settings["splits"]:
+        for name, paths in present.items():
+            wanted = [str(p) for p in settings["only"]]
+            if not wanted or any(_may_match(p, name, split) for p in wanted):
+                rooms.append(open_room(name, paths, split))
+    if not rooms:
+        raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
+    return rooms
+
+
+def _may_match(pattern: str, dataset: str, split: str) -> bool:
+    """Whether a pattern of cells can speak of this room, so that others need not be loaded."""
+    parts = pattern.split("/")
+    named = (dataset, split)
+    return all("*" in part or fnmatchcase(name, part) for part, name in zip(parts, named, strict=False))
+
+
+def fill_all(
+    prepared: Sequence[Prepared],
+    rooms: Mapping[tuple[str, str], Room],
+    train: bool = True,
+    limit_s: float | None = None,
+) -> list[Filled]:
+    """Find or fill one cell after another, saying how far it is and how long it will take.
+
+    A cell that cannot be filled is said and left out; the others go on.
+    """
+    filled: list[Filled] = []
+    open_cells = [p for p in prepared if p.found() is None]
+    log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(open_cells))
+    started = time.monotonic()
+    left = sum(_expected_s(p.cell, rooms) for p in open_cells) if train else 0.0
+    for number, one in enumerate(prepared, 1):
+        found = one.found()
+        if found is None and train:
+            expected = _expected_s(one.cell, rooms)
+            if limit_s is not None and time.monotonic() - started + expected > limit_s:
+                log.warning("max_hours: %s is not started", one.cell)
+                continue
+            log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
+            left -= expected
+            try:
+                found = fill(one, rooms[one.cell.dataset, one.cell.split])
+            except (ValueError, RuntimeError) as error:
+                log.warning("%s cannot be filled: %s", one.cell, cli.one_line(error))
+                continue
+            score = table.score_db(found.facts["dataset/kind"], found.facts)
+            log.info("%s: %.2f dB after %.1f s", one.cell, score, found.facts["time/train_s"])
+        if found is not None:
+            filled.append(found)
+    return filled
+
+
+def _expected_s(cell: Cell, rooms: Mapping[tuple[str, str], Room]) -> float:
+    """Seconds a cell will take: its budget on every fold, and something for scoring [s]."""
+    folds = len(rooms[cell.dataset, cell.split].folds.folds)
+    return folds * ((cell.budget_s or FREE_S) + 2.0)
+
+
+def _timed(
+    filled: Sequence[Filled], rooms: Mapping[tuple[str, str], Room], kept: Path, measure: bool
+) -> dict[str, dict[str, Latency]]:
+    """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
+    found: dict[str, dict[str, Latency]] = {}
+    for dataset in dict.fromkeys(one.cell.dataset for one in filled):
+        here = [one for one in filled if one.cell.dataset == dataset]
+        split = here[0].cell.split
+        file = kept / f"latency-{dataset}.json"
+        if measure:
+            log.info("%s: timing single queries of every method in turns", dataset)
+            first = [one for one in here if one.cell.split == split]
+            found[dataset] = latencies(first, rooms[dataset, split])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            rows = {name: asdict(one) for name, one in found[dataset].items()}
+            file.write_text(json.dumps(rows, indent=2))
+        elif file.exists():
+            stored = json.loads(file.read_text())
+            found[dataset] = {name: Latency(**values) for name, values in stored.items()}
+    return found
+
+
+def report(
+    filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
+) -> list[table.Row]:
+    """Write `compare.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
+    rows = table.rows(filled, timed)
+    blocks = table.blocks(rows)
+    page = table.markdown(blocks, ours)
+    table.write_csv(rows, run_dir / "compare.csv")
+    (run_dir / "compare.md").write_text(page, encoding="utf-8")
+    figure.draw(rows, run_dir / "compare.png", ours)
+    facts: dict[str, Any] = {"cells": len(filled), **provenance()}
+    for block in blocks:
+        room = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
+        facts[f"{room}/first"] = block.rows[0].method
+        for row in block.rows:
+            facts[f"{room}/{row.method}/score_db"] = row.score_db
+            facts[f"{room}/{row.method}/train_s"] = row.train_s
+            facts[f"{room}/{row.method}/query_ms_p50"] = row.query_ms
+    write_summary(run_dir / "summary.json", facts)
+    console = Console()
+    console.print(Markdown(page))
+    console.print(f"written to {run_dir}", highlight=False)
+    return rows
+
+
+def main() -> None:
+    """Entry point."""
+    cli.run(task, "compare")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,178 @@
+"""Which trainings a comparison consists of, and when one that was done before is still the same."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from gsparc.registry import targets
+
+ANY = "any"  # stands for the budget or seed of a method that has none
+
+
+@dataclass(frozen=True)
+class Contender:
+    """A method as the comparison's configuration names it.
+
+    Attributes:
+        name: in tables.
+        choose: overrides of train.yaml that select it.
+        budget: overrides with `{budget_s}`; empty when its time cannot be chosen.
+        kinds: of data it serves; empty for all.
+        reserve_s: part of the budget that its own `budget_s` does not count [s].
+        only_longest: too slow for any but the longest budget.
+    """
+
+    name: str
+    choose: tuple[str, ...]
+    budget: tuple[str, ...] = ()
+    kinds: tuple[str, ...] = ()
+    reserve_s: float = 0.0
+    only_longest: bool = False
+
+    def serves(self, kind: str) -> bool:
+        """Whether data of this kind can be predicted."""
+        return not self.kinds or kind in self.kinds
+
+    def overrides(self, budget_s: float | None, seed: int | None) -> list[str]:
+        """Overrides of train.yaml for one cell."""
+        left = None if budget_s is None else max(budget_s - self.reserve_s, 1.0)
+        timed = [] if left is None else [text.format(budget_s=f"{left:g}") for text in self.budget]
+        return [*self.choose, *timed, f"seed={seed or 0}"]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One training and its result.
+
+    Attributes:
+        dataset, split, method: names.
+        budget_s: seconds per model [s]; None for a method without budget.
+        seed: None for a method without one.
+    """
+
+    dataset: str
+    split: str
+    method: str
+    budget_s: float | None
+    seed: int | None
+
+    def __str__(self) -> str:
+        budget = ANY if self.budget_s is None else f"{self.budget_s:g}"
+        return f"{self.dataset}/{self.split}/{self.method}/{budget}/{ANY if self.seed is None else self.seed}"
+
+
+def contenders(config: Mapping[str, Any]) -> dict[str, Contender]:
+    """The group `methods` of conf/compare.yaml.
+
+    Raises:
+        ValueError: an entry with an unknown setting, or without `choose`.
+    """
+    found = {}
+    for name, entry in config.items():
+        try:
+            lists = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()}
+            found[str(name)] = Contender(str(name), **lists)
+        except TypeError as error:
+            raise ValueError(f"methods.{name}: {str(error).partition('() ')[2]}") from None
+    return found
+
+
+def plan(
+    rooms: Sequence[tuple[str, str, str]],
+    methods: Mapping[str, Contender],
+    budgets: Sequence[tuple[float, Sequence[int]]],
+    only: Sequence[str] = (),
+) -> list[Cell]:
+    """All cells, the most useful first: a whole table before further seeds and longer budgets.
+
+    Args:
+        rooms: (dataset, split, kind of data), the most wanted first.
+        methods: who takes part.
+        budgets: seconds and their seeds.
+        only: patterns of `str(cell)`; empty for all.
+
+    Raises:
+        ValueError: a pattern that no cell matches.
+    """
+    longest = max((seconds for seconds, _ in budgets), default=0.0)
+    cells = []
+    for dataset, split, kind in rooms:
+        able = [m for m in methods.values() if m.serves(kind)]
+        cells += [Cell(dataset, split, m.name, None, None) for m in able if not m.budget]
+        for seconds, seeds in budgets:
+            timed = [m for m in able if m.budget and (seconds == longest or not m.only_longest)]
+            cells += [
+                Cell(dataset, split, m.name, seconds, s)
+                for s in seeds
+                for m in timed
+                if not (m.only_longest and s != seeds[0])
+            ]
+    for pattern in only:
+        if not any(fnmatchcase(str(cell), pattern) for cell in cells):
+            raise ValueError(
+                f"only: {pattern!r} matches no cell; they are dataset/split/method/budget/seed, "
+                f"like {cells[0] if cells else 'rfid/random/gp/any/any'}"
+            )
+    return [c for c in cells if not only or any(fnmatchcase(str(c), pattern) for pattern in only)]
+
+
+def key(model: Mapping[str, Any], trainer: Mapping[str, Any], data_sha: str, split_sha: str) -> str:
+    """Name of a result: what it was learned from, by what settings and by which source text."""
+    text = json.dumps([model, trainer, data_sha, split_sha, code_version(model)], sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
+
+
+def code_version(model: Mapping[str, Any]) -> str:
+    """Hash of the program text behind a model's configuration.
+
+    That is every class it names, their bases, and what these import from their own packages. The shared
+    ground (rasterizer, loaders, metrics) is not part of it: having changed that, start with an empty folder.
+    """
+    classes = [
+        getattr(import_module(module), name)
+        for path in targets(model)
+        for module, _, name in [path.rpartition(".")]
+    ]
+    open_ends = {
+        base.__module__ for cls in classes for base in cls.__mro__ if base.__module__.startswith("gsparc.")
+    } - {"gsparc.method"}
+    sources: dict[str, str] = {}
+    while open_ends:
+        name = open_ends.pop()
+        spec = find_spec(name)
+        if name in sources or spec is None or spec.origin is None or spec.submodule_search_locations:
+            continue
+        tree = ast.parse(Path(spec.origin).read_bytes())
+        package = name.rpartition(".")[0]
+        open_ends |= {m for m in _imports(tree) if m.rpartition(".")[0] == package}
+        sources[name] = _meaning(tree)
+    text = json.dumps(sources, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def _meaning(tree: ast.Module) -> str:
+    """The program without layout, comments and docstrings: better words do not make another method."""
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list) and body and isinstance(body[0], ast.Expr):
+            value = body[0].value
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                body[0] = ast.Pass()
+    return ast.dump(tree)
+
+
+def _imports(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)

@@ -1,0 +1,55 @@
+"""Accuracy against what it costs: seconds of training on the left, milliseconds of a query on the right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gsparc.comparison.table import Row
+
+LEAST_S = 1e-3  # faster fits are drawn here
+MARKS = "osD^vP*X<>ph"
+LABEL = {"psnr_db": "PSNR [dB]", "nmse": "-10 log10 NMSE [dB]", "rmse_db": "-RMSE [dB]"}
+
+
+def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
+    """A line of panels per dataset and split; a method keeps its colour, a line joins its budgets."""
+    rooms = list(dict.fromkeys((r.dataset, r.split) for r in rows))
+    names = list(dict.fromkeys(r.method for r in rows))
+    palette = matplotlib.colormaps["tab20"]
+    looks = {name: (palette(i % 20), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
+    figure = Figure(figsize=(11, 3.4 * len(rooms) + 0.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = figure.subplots(len(rooms), 2, squeeze=False, sharey="row")
+    for line, (dataset, split) in zip(grid, rooms, strict=True):
+        here = [r for r in rows if (r.dataset, r.split) == (dataset, split)]
+        for name in names:
+            colour, mark = looks[name]
+            own = sorted((r for r in here if r.method == name), key=lambda r: r.budget_s or 0)
+            style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 7, "capsize": 2}
+            for axis, horizontal in ((line[0], "train_s"), (line[1], "query_ms")):
+                points = [r for r in own if getattr(r, horizontal) is not None]
+                if points:
+                    axis.errorbar(
+                        [max(getattr(r, horizontal), LEAST_S) for r in points],
+                        [r.score_db for r in points],
+                        [r.spread_db or 0.0 for r in points],
+                        label=name,
+                        **style,
+                    )
+        line[0].set_ylabel(LABEL[here[0].figure])
+        line[0].set_title(f"{dataset}, split {split}", loc="left", fontsize=10)
+        line[0].set_xlabel("training of one model [s]")
+        line[1].set_xlabel("one query, median [ms]")
+        for axis in line:
+            axis.set_xscale("log")
+            axis.grid(alpha=0.3)
+    handles: dict[str, object] = {}
+    for axis in grid.flat:
+        handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=7, fontsize=9)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,163 @@
+"""A cell filled: composed, trained on every fold, scored, and kept."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc import checkpoint
+from gsparc.clock import machine_facts
+from gsparc.comparison.cells import Cell, Contender, key
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
+from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.learned import LearnedField
+from gsparc.registry import build
+from gsparc.scoring import score
+from gsparc.summary import provenance, write_summary
+from gsparc.trainer import Training
+
+log = logging.getLogger(__name__)
+
+RESULT = "cell.json"
+
+
+@dataclass(frozen=True)
+class Room:
+    """One dataset under one split.
+
+    Attributes:
+        dataset, split: names.
+        data: measurements.
+        folds: which rows learn and which test.
+    """
+
+    dataset: str
+    split: str
+    data: Measurements
+    folds: Split
+
+
+def open_room(dataset: str, settings: dict[str, Any], split: str) -> Room:
+    """Load what `conf/dataset` and `conf/split` name, with the given paths."""
+    config = compose(dataset, settings, split, [])
+    data = load(_plain(config.dataset))
+    return Room(dataset, split, data, split_for(_plain(config.split), data))
+
+
+def compose(dataset: str, settings: dict[str, Any], split: str, overrides: list[str]) -> DictConfig:
+    """The configuration `train.py` would see."""
+    chosen = [f"dataset={dataset}", f"split={split}", "logger=none", "~callbacks.pictures", *overrides]
+    config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
+    OmegaConf.update(config, "dataset", settings, merge=True)
+    return config
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A cell with its result.
+
+    Attributes:
+        cell: which.
+        folder: where its checkpoints are.
+        facts: flat, as in `summary.json`: `test/*`, `time/*`, `model/*`, `dataset/*`, `machine/*`.
+    """
+
+    cell: Cell
+    folder: Path
+    facts: dict[str, Any]
+
+    @property
+    def checkpoint(self) -> Path:
+        """Of the first fold."""
+        return self.folder / "fold0.ckpt"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A cell, composed but not yet trained."""
+
+    cell: Cell
+    config: DictConfig
+    folder: Path
+
+    def found(self) -> Filled | None:
+        """The kept result, if there is a whole one."""
+        try:
+            facts = json.loads((self.folder / RESULT).read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError):
+            return None
+        return Filled(self.cell, self.folder, facts)
+
+
+def prepare(cell: Cell, contender: Contender, settings: dict[str, Any], room: Room, kept: Path) -> Prepared:
+    """Compose a cell's configuration and name the folder of its result."""
+    config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
+    model, trainer = _plain(config.model), _plain(config.trainer)
+    name = key(model, trainer, room.data.site.sha256, room.folds.sha256)
+    return Prepared(cell, config, kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}")
+
+
+def fill(prepared: Prepared, room: Room) -> Filled:
+    """Train on every fold, score on the test rows, write checkpoints and then the result.
+
+    Raises:
+        ValueError: the method does not serve these data.
+        RuntimeError: training diverged.
+    """
+    config, folder = prepared.config, prepared.folder
+    methods, seconds, processor, notes = [], [], [], []
+    for number, fold in enumerate(room.folds.folds):
+        method = build(config.model)
+        if isinstance(method, LearnedField):
+            method.training = Training(
+                settings=instantiate(config.trainer),
+                seed=int(config.seed),
+                callbacks=lambda: [instantiate(node) for node in config.callbacks.values()],
+                config_yaml=OmegaConf.to_yaml(config, resolve=True),
+            )
+        before = time.process_time()
+        report = method.fit(room.data, fold, folder / f"fold{number}")
+        processor.append(time.process_time() - before)
+        seconds.append(report.seconds)
+        notes += [note for note in report.notes if number == 0]
+        extra = {"train_s": report.seconds, "fold": number, "split_sha256": room.folds.sha256}
+        yaml = OmegaConf.to_yaml(config, resolve=True)
+        checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
+        methods.append(method)
+    started = time.perf_counter()
+    scores = score(methods, room.data, room.folds)
+    facts = {f"test/{name}": value for name, value in scores.figures().items()}
+    facts |= {
+        "time/train_s": sum(seconds) / len(seconds),
+        "time/train_cpu_s": sum(processor) / len(processor),
+        "time/score_s": time.perf_counter() - started,
+        "model/name": prepared.cell.method,
+        "model/num_gaussians": methods[0].size(),
+        "model/effects": getattr(methods[0], "effects", None),
+        "model/notes": "; ".join(notes),
+        "seed": prepared.cell.seed,
+        "budget_s": prepared.cell.budget_s,
+    }
+    facts |= dataset_facts(room.data) | split_facts(room.folds) | machine_facts() | provenance()
+    write_summary(folder / RESULT, facts)  # last: a cell without it does not count
+    return Filled(prepared.cell, folder, facts)
+
+
+def kept_in(folder: str | None, cache: Path) -> Path:
+    """Where cells live: the folder asked for, else the platform's cache."""
+    return Path(os.path.expanduser(folder)) if folder else cache / "comparison"
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]

@@ -1,0 +1,92 @@
+"""From directions of arrival to virtual transmitters, and back to directions where none were measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+MISS = 0.01  # [m], two rays that pass this close to each other meet
+MERGE = 0.05  # [m], meeting points this close are one virtual transmitter
+NEIGHBOURS = 8  # receivers whose rays are intersected with those of one receiver
+LEAST_ANGLE = 0.02  # [rad], more parallel rays meet nowhere in particular
+
+
+def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Points where rays of several receivers meet, and which of them every receiver sees.
+
+    Args:
+        places: (n, 3) [m].
+        rays: n arrays (paths, 3) of unit vectors in the frame of the places.
+
+    Returns:
+        (V, 3) [m], and n arrays of rows of it, one entry per ray (-1: the ray meets no other).
+    """
+    distances = [np.full(len(r), np.nan) for r in rays]
+    near = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[1]
+    meetings: list[list[list[float]]] = [[[] for _ in r] for r in rays]
+    for i, row in enumerate(np.atleast_2d(near)):
+        for j in row:
+            if j == i:
+                continue
+            along, miss = _closest(places[i], rays[i], places[j], rays[j])
+            a, b = np.nonzero(miss < MISS)
+            for p, q in zip(a, b, strict=True):
+                meetings[i][p].append(float(along[p, q]))
+    for i, found in enumerate(meetings):
+        for p, values in enumerate(found):
+            if values:
+                distances[i][p] = np.median(values)
+    points = [
+        places[i] + distances[i][:, None] * rays[i] for i in range(len(places))
+    ]  # NaN where a ray meets no other
+    owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
+    flat = np.concatenate(points) if points else np.zeros((0, 3))
+    met = np.isfinite(flat[:, 0])
+    centres, labels = _merged(flat[met])
+    rows = np.full(len(flat), -1)
+    rows[met] = labels
+    return centres, [rows[owner == i] for i in range(len(points))]
+
+
+def _closest(
+    a: np.ndarray, along_a: np.ndarray, b: np.ndarray, along_b: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where each ray of `a` passes each ray of `b`: distance along it, and by how much it misses, (P, Q) [m].
+
+    Rays that meet behind their receivers, or are nearly parallel, miss by infinity.
+    """
+    offset = b - a
+    cosine = along_a @ along_b.T
+    first, second = (along_a @ offset)[:, None], (along_b @ offset)[None, :]
+    sine2 = np.maximum(1 - cosine**2, LEAST_ANGLE**2)
+    s, t = (first - cosine * second) / sine2, (cosine * first - second) / sine2
+    gap = offset + t[..., None] * along_b[None] - s[..., None] * along_a[:, None]
+    miss = np.linalg.norm(gap, axis=-1)
+    return s, np.where((s > 0) & (t > 0) & (1 - cosine**2 > LEAST_ANGLE**2), miss, np.inf)
+
+
+def _merged(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Greedy clusters of radius MERGE, the densest first: centres (V, 3) and the label of every point."""
+    labels = np.full(len(points), -1)
+    if not len(points):
+        return np.zeros((0, 3)), labels
+    tree = cKDTree(points)
+    around = tree.query_ball_point(points, MERGE)
+    centres: list[np.ndarray] = []
+    for seed in sorted(range(len(points)), key=lambda k: -len(around[k])):
+        if labels[seed] >= 0:
+            continue
+        members = [k for k in around[seed] if labels[k] < 0]
+        labels[members] = len(centres)
+        centres.append(np.median(points[members], axis=0))
+    return np.stack(centres), labels
+
+
+def votes(places: np.ndarray, seen: list[np.ndarray], count: int) -> Tensor:
+    """How many rays of each receiver point at each virtual transmitter: (n, V) float32."""
+    table = np.zeros((len(places), count), dtype=np.float32)
+    for i, rows in enumerate(seen):
+        np.add.at(table[i], rows[rows >= 0], 1.0)
+    return torch.from_numpy(table)

@@ -1,0 +1,73 @@
+"""Where the Gaussians of a peer start, and how they are seen."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsparc.field import FieldSettings, GaussianField, initial_field
+from gsparc.model import FULL_SPHERE_ROWS
+from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
+from gsparc.peers.network import Scene
+
+MARGIN = 2.0  # [m] around the moving end's box
+OPACITY = 0.3
+
+
+def gaussians_of(scene: Scene, count: int) -> GaussianField:
+    """All around a static receiver between 1 and 6 m; for a moving one uniform in its box and 2 m around."""
+    static = scene.receiver
+    settings = FieldSettings(
+        count, "sphere" if static is not None else "uniform", margin=MARGIN, opacity=OPACITY
+    )
+    return initial_field(
+        settings,
+        scene.box,
+        None if static is None else static.position,
+        None if static is None else static.rotation,
+    )
+
+
+class Screen:
+    """The grid a scene is seen on, and the thresholds that go with it.
+
+    Args:
+        scene: spectra bring their grid; channels are seen on the full sphere, with relative cut-offs.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        image = scene.site.kind == "spectrum"
+        self.grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
+        self.optics: dict[str, Any] = {} if image else {"cutoff": Cutoff(1e-3, relative=True)}
+
+    @staticmethod
+    def geometry(field: GaussianField) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, quaternions, scales and opacities, as the rasterizer takes them."""
+        return field.means, field.quats, field.scales, field.opacities
+
+
+def render_each(
+    geometry: tuple[Tensor, Tensor, Tensor, Tensor],
+    features: Tensor,
+    pose: Pose,
+    grid: SphereGrid,
+    **optics: Any,
+) -> Tensor:
+    """Samples that each have Gaussians of their own, one plan each.
+
+    Args:
+        geometry: means (B, N, 3), quaternions (B, N, 4), scales (B, N, 3), opacities (B, N).
+        features: (B, N, C).
+        pose: one shared or B.
+        grid, **optics: see `gsparc.ops.rasterize`.
+
+    Returns:
+        (B, C, H, W).
+    """
+    images = [
+        rasterize(*one, feature, pose[i] if pose.batched else pose, grid, **optics).image[0]
+        for i, (*one, feature) in enumerate(zip(*geometry, features, strict=True))
+    ]
+    return torch.stack(images)

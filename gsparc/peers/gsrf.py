@@ -1,0 +1,133 @@
+"""GSRF: complex-valued Gaussians whose radiance is a Fourier-Legendre series of direction.
+
+K. Yang, G. Dong, S. Ji, W. Du, M. Srivastava, "GSRF: Complex-Valued 3D Gaussian Splatting for Efficient
+Radio-Frequency Data Synthesis", NeurIPS 2025. Its forerunner RFSPM (K. Yang et al., "Scalable 3D Gaussian
+Splatting-Based RF Signal Spatial Propagation Modeling", 2025) had a network per Gaussian instead.
+
+Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum, the loss
+in the frequency domain. Left out: the phase of the transmittance (ours hides, it does not turn; radiances
+take up what is turned behind others), adaptive density control, orthographic splatting onto a sphere of rays
+(our footprints lie on the tangent plane).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Kind
+from gsparc.model import ChannelResponse
+from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
+from gsparc.peers.gaussians import Screen, gaussians_of
+from gsparc.peers.network import Network, Scene
+from gsparc.peers.radiance import fourier_legendre, terms
+from gsparc.peers.trained import TrainedPeer
+
+TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
+
+
+class GSRF(TrainedPeer):
+    """Spectra and channels.
+
+    Args:
+        count: Gaussians.
+        degree, order: largest Legendre degree and Fourier order of the radiance.
+        fourier_weight: share of the loss in the frequency domain (spectra).
+        **training: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
+    rates: ClassVar[dict[str, float]] = {
+        "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        count: int = 500,
+        degree: int = 3,
+        order: int = 3,
+        fourier_weight: float = 0.05,
+        name: str = "gsrf",
+        **training,
+    ) -> None:
+        super().__init__(name, **training)
+        self.count, self.degree, self.order, self.fourier_weight = count, degree, order, fourier_weight
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`."""
+        return ComplexGaussians(scene, self.count, self.degree, self.order, self.fourier_weight)
+
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return self.count
+
+
+class ComplexGaussians(Network):
+    """N Gaussians, each with K complex coefficients."""
+
+    def __init__(self, scene: Scene, count: int, degree: int, order: int, fourier_weight: float) -> None:
+        super().__init__()
+        self.scene, self.degree, self.order = scene, degree, order
+        self.fourier_weight = fourier_weight
+        self.field = gaussians_of(scene, count)
+        self.screen = Screen(scene)
+        self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(degree, order), 2))
+        with torch.no_grad():
+            self.coefficients[:, 0, 0] += 0.3
+        channels = scene.site.kind == "csi"
+        self.response = ChannelResponse(count, *scene.shape) if channels else None
+        self._frozen: FrozenPlan | None = None
+
+    def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
+        """What each Gaussian sends (B, N, 2), by the direction in which it sees the moving end."""
+        towards = self.scene.moving(tx, rx)[:, None] - self.field.means
+        distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
+        series = fourier_legendre(towards / distance, self.degree, self.order)
+        sent = torch.einsum("bnk,nkc->bnc", series, self.coefficients)
+        if self.response is None:
+            return sent
+        # Channels of a moving end turn with its distance to every source.
+        assert self.scene.site.wavelength is not None
+        turns = torch.polar(1 / distance, -2 * torch.pi / self.scene.site.wavelength * distance)
+        return torch.view_as_real(torch.view_as_complex(sent.contiguous()) * turns.squeeze(-1))
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Spectra (B, H, W) or channels (B, A, K)."""
+        sent, geometry = self.radiance(tx, rx), self.screen.geometry(self.field)
+        plan = make_plan(*geometry, rx, self.screen.grid, **self.screen.optics)
+        if self.response is not None:
+            seen = mean_weights(plan, *geometry).share
+            return self.response(seen * torch.view_as_complex(sent.contiguous()))
+        return _magnitude(composite(plan, *geometry, sent).image)
+
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""
+        plain = super().loss(batch, draw)
+        if self.response is not None or batch.mask is not None or not self.fourier_weight:
+            return plain
+        difference = torch.fft.rfft2(self(batch.tx, batch.rx) - batch.target, norm="ortho").abs().mean()
+        return plain + self.fourier_weight * difference
+
+    def train(self, mode: bool = True) -> ComplexGaussians:
+        """A view kept for inference ends with further training."""
+        self._frozen = None
+        super().train(mode)
+        return self
+
+    @torch.no_grad()
+    def answer(self, tx: Tensor, rx: Pose) -> Tensor:
+        """A static receiver's view is frozen once."""
+        if self.response is not None or rx.batched or self.training:
+            return self(tx, rx)
+        if self._frozen is None:
+            geometry = self.screen.geometry(self.field)
+            plan = make_plan(*geometry, rx, self.screen.grid, **self.screen.optics)
+            self._frozen = freeze(plan, *geometry, version=0)
+        return _magnitude(self._frozen.render(self.radiance(tx, rx), 0))
+
+
+def _magnitude(image: Tensor) -> Tensor:
+    """(B, 2, H, W) -> (B, H, W)."""
+    return (image.square().sum(1) + TINY).sqrt()

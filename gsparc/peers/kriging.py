@@ -1,0 +1,150 @@
+"""Ordinary kriging of log power: the classical map of coverage.
+
+N. Cressie, "Statistics for Spatial Data" (1993), chapters 2 and 3; the exponential law is that of shadowing,
+M. Gudmundson, "Correlation model for shadow fading in mobile radio systems", Electronics Letters 27 (1991).
+Power is kriged in decibels; spectra pixel by pixel with one variogram for all, so that one set of weights
+serves them. Left out: drift with distance (universal kriging), anisotropy, search neighbourhoods.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import lu_factor, lu_solve
+from scipy.optimize import curve_fit
+from scipy.spatial.distance import cdist, pdist
+
+from gsparc.method import Prediction
+from gsparc.peers.encoding import entry_variance, to_real
+from gsparc.peers.interpolation import Interpolator
+
+FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
+BINS = 24
+PAIRS = 200_000  # looked at for the variogram
+SIDE = 2048  # pixels of an image looked at for it
+JITTER = 1e-9  # of the variance, only so that a system without nugget can be solved
+
+
+@dataclass(frozen=True)
+class Variogram:
+    """`nugget + sill (1 - exp(-distance / range))` beyond distance 0, where it is 0.
+
+    Attributes:
+        nugget, sill: [dB^2].
+        range: [m].
+    """
+
+    nugget: float
+    sill: float
+    range: float
+
+    @property
+    def total(self) -> float:
+        """Variance of a measurement far from all others [dB^2]."""
+        return self.nugget + self.sill
+
+
+def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> Variogram:
+    """Least squares, weighed by the number of pairs, on the empirical variogram up to half the extent.
+
+    Args:
+        positions: (n, 3) [m].
+        values: (n, D) [dB].
+    """
+    rng = np.random.default_rng(seed)
+    columns = rng.permutation(values.shape[1])[:SIDE]
+    chosen = rng.permutation(len(positions))[: int(np.sqrt(2 * PAIRS))]
+    apart = pdist(positions[chosen])
+    half = pdist(values[chosen][:, columns].astype(np.float64), "sqeuclidean") / (2 * len(columns))
+    spread = float(half.mean()) if len(half) else 1.0
+    limit = apart.max() / 2 if len(apart) else 1.0
+    edges = np.unique(np.quantile(apart[apart <= limit], np.linspace(0, 1, BINS + 1))) if len(apart) else []
+    if len(edges) < 5 or spread <= 0:  # too few distances to see a law
+        return Variogram(0.0, max(spread, 1e-9), max(limit, 1e-3))
+    which = np.clip(np.digitize(apart, edges) - 1, 0, len(edges) - 2)
+    near = apart <= limit
+    number = np.bincount(which[near], minlength=len(edges) - 1)
+    filled = number > 0
+    distance = np.bincount(which[near], apart[near], len(edges) - 1)[filled] / number[filled]
+    gamma = np.bincount(which[near], half[near], len(edges) - 1)[filled] / number[filled]
+
+    def law(r: np.ndarray, nugget: float, sill: float, length: float) -> np.ndarray:
+        return nugget + sill * -np.expm1(-r / length)
+
+    low, high = [0, 0, limit * 1e-3], [spread * 3, spread * 10, limit * 10]
+    start = [float(gamma[0]) / 2, spread, limit / 5]
+    start = [min(max(s, a), b) for s, a, b in zip(start, low, high, strict=True)]
+    found, _ = curve_fit(law, distance, gamma, start, 1 / np.sqrt(number[filled]), bounds=(low, high))
+    return Variogram(*(float(v) for v in found))
+
+
+class Kriging(Interpolator):
+    """Powers and spectra; `ValueError` for channels, whose phase has no logarithm of power."""
+
+    name = "kriging"
+    kinds = ("spectrum", "rssi")
+
+    def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        assert self.site is not None
+        if self.site.kind not in self.kinds:
+            raise ValueError(
+                "kriging: predicts powers and spectra; this dataset holds csi (model=complex_gp)"
+            )
+        # Repeated places would make the system singular: their mean is kriged.
+        self.positions, group = np.unique(positions, axis=0, return_inverse=True)
+        decibels = self._decibels(targets)
+        total = np.zeros((len(self.positions), decibels.shape[1]))
+        np.add.at(total, group.reshape(-1), decibels)
+        self.values = (total / np.bincount(group.reshape(-1))[:, None]).astype(np.float32)
+        self.variogram = fit_variogram(positions, decibels)
+        self._solve()
+        v = self.variogram
+        return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m",)
+
+    def _decibels(self, targets: np.ndarray) -> np.ndarray:
+        assert self.site is not None
+        rows = to_real(targets, self.site.kind)
+        if self.site.kind == "rssi":
+            return rows  # already decibels
+        return 10 * np.log10(np.maximum(rows, np.float32(10 ** (FLOOR_DB / 10))))
+
+    def _solve(self) -> None:
+        """Factor the system of the weights and of the multiplier that makes them sum to one."""
+        n = len(self.positions)
+        system = np.ones((n + 1, n + 1))
+        system[:n, :n] = self._covariance(cdist(self.positions, self.positions))
+        system[np.arange(n), np.arange(n)] += self.variogram.nugget + JITTER * self.variogram.total
+        system[n, n] = 0.0
+        self.system = lu_factor(system)
+
+    def _covariance(self, distance: np.ndarray) -> np.ndarray:
+        return self.variogram.sill * np.exp(-distance / self.variogram.range)
+
+    def _look_up(self, queries: np.ndarray) -> Prediction:
+        assert self.site is not None
+        right = np.ones((len(self.positions) + 1, len(queries)))
+        right[:-1] = self._covariance(cdist(self.positions, queries))  # without the nugget: noise is not kept
+        weights = lu_solve(self.system, right)
+        decibels = torch.from_numpy(weights[:-1].T).float() @ torch.from_numpy(self.values)
+        left = np.clip(self.variogram.total - (weights * right).sum(0), 0.0, None)
+        variance = torch.from_numpy(left).float()
+        power = self.site.kind == "rssi"
+        mean = self._decode(decibels if power else 10 ** (decibels / 10))
+        sure = (1 - variance / self.variogram.total).clamp(0, 1)
+        return Prediction(mean, sure, entry_variance(variance, mean, "rssi") if power else None)
+
+    def _learned(self) -> dict[str, Any]:
+        v = self.variogram
+        return {
+            "positions": torch.from_numpy(self.positions),
+            "values": torch.from_numpy(self.values),
+            "variogram": [v.nugget, v.sill, v.range],
+        }
+
+    def _relearn(self, state: dict[str, Any]) -> None:
+        self.positions, self.values = state["positions"].numpy(), state["values"].numpy()
+        self.variogram = Variogram(*(float(v) for v in state["variogram"]))
+        self._solve()

@@ -1,0 +1,67 @@
+"""What every network of a peer knows of its scene, and what is asked of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Site
+from gsparc.losses import channel_loss, spectrum_loss
+from gsparc.ops import Pose
+
+SSIM_WEIGHT = 0.2
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What a network may know of a site before it is trained.
+
+    Attributes:
+        site: the fixed facts.
+        shape: of one target: (H, W), (antennas, subcarriers) or (1,).
+        receiver: pose of the static receiver; None when it moves.
+        transmitter: (3,) [m], the static transmitter; None when it moves.
+    """
+
+    site: Site
+    shape: tuple[int, ...]
+    receiver: Pose | None
+    transmitter: Tensor | None
+
+    @property
+    def box(self) -> Tensor:
+        """(2, 3) float32 [m], lower and upper corner of where the moving end was."""
+        return torch.as_tensor(self.site.box).float()
+
+    @property
+    def reach(self) -> float:
+        """A length in which the scene is large [m]: from the static end to the far side of the box."""
+        low, high = self.box
+        still = self.receiver.position if self.receiver is not None else self.transmitter
+        middle = (low + high) / 2
+        apart = 0.0 if still is None else float((still - middle).norm())
+        return max(apart + float((high - low).norm()) / 2, 1.0)
+
+    def moving(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Position of the moving end (B, 3) [m]."""
+        return tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3)
+
+
+class Network(nn.Module):
+    """Positions in, targets out: called with tx (B, 3) [m] and one shared or B receiver poses."""
+
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Training loss () of a batch; `draw` for whatever is drawn at random."""
+        prediction = self(batch.tx, batch.rx)
+        if prediction.is_complex():
+            return channel_loss(prediction, batch.target, batch.mask).mean()
+        if batch.mask is not None:
+            prediction = torch.where(batch.mask, prediction, batch.target)
+        return spectrum_loss(prediction, batch.target, SSIM_WEIGHT).mean()
+
+    @torch.no_grad()
+    def answer(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The prediction at inference, where something may be kept between calls."""
+        return self(tx, rx)

@@ -1,0 +1,176 @@
+"""NeWRF: rays along the directions of arrival only, marched for virtual transmitters.
+
+H. Lu, C. Vattheuer, B. Mirzasoleiman, O. Abari, "NeWRF: A Deep Learning Framework for Wireless Radiation
+Field Reconstruction and Channel Prediction", ICML 2024.
+
+Kept: training rays along measured directions of arrival, a network of place and direction that says where on
+the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's phase over the marched
+distance; at a query the directions are *searched* (rays of training receivers are intersected, the nearest
+receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
+a query has (the neighbours' mean is taken), and hierarchical resampling, in whose place half of the samples
+lie around the distance that the intersection found.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Kind, Measurements
+from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.ops import Pose
+from gsparc.peers.deformation import perceptron
+from gsparc.peers.directions import virtual_transmitters, votes
+from gsparc.peers.network import Network, Scene
+from gsparc.peers.trained import TrainedPeer
+
+NEAR = 0.1  # [m] from the receiver, where rays begin
+AROUND = 0.1  # [m], half the interval of the fine samples
+DENSITY = 3.0  # [1/m] per unit of the network's output
+LAST = 1e-3  # [m], the interval behind the last sample
+
+
+class NeWRF(TrainedPeer):
+    """Channels of one antenna and one tone, with directions of arrival.
+
+    Args:
+        width, depth, octaves: of the network.
+        samples: points per ray, half of them fine.
+        neighbours: training receivers that vote at a query.
+        **training: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("csi",)
+
+    def __init__(
+        self,
+        width: int = 128,
+        depth: int = 4,
+        octaves: int = 8,
+        samples: int = 64,
+        neighbours: int = 6,
+        name: str = "newrf",
+        **training,
+    ) -> None:
+        super().__init__(name, **training)
+        self.shape = (width, depth, octaves, samples, neighbours)
+
+    def look(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Virtual transmitters, and which of them every training receiver sees.
+
+        Raises:
+            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
+        """
+        if data.directions is None:
+            raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
+        if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
+            raise ValueError(
+                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
+            )
+        places = data.rx_position[rows]
+        rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
+        centres, seen = virtual_transmitters(places, rays)
+        if not len(centres):
+            raise ValueError(f"{self.name}: the directions of arrival meet nowhere")
+        return {
+            "places": torch.from_numpy(places).float(),
+            "virtual": torch.from_numpy(centres).float(),
+            "votes": votes(places, seen, len(centres)),
+        }
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`."""
+        return DirectedRays(scene, found, *self.shape)
+
+    def size(self) -> int:
+        """Number of virtual transmitters."""
+        return len(self.found["virtual"]) if self.found else 0
+
+
+class DirectedRays(Network):
+    """The network and the march."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        found: dict[str, Tensor],
+        width: int,
+        depth: int,
+        octaves: int,
+        samples: int,
+        neighbours: int,
+    ) -> None:
+        super().__init__()
+        assert scene.site.wavelength is not None
+        self.scene, self.found = scene, found
+        self.samples, self.neighbours = samples, min(neighbours, len(found["places"]))
+        self.wavenumber = 2 * math.pi / scene.site.wavelength
+        self.paths = max(1, round(float((found["votes"] > 0).sum(1).float().mean())))
+        reach = (found["virtual"][:, None] - found["places"][None]).norm(dim=-1)
+        self.far = float(torch.quantile(reach[found["votes"].T > 0], 0.99)) + AROUND
+        around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
+        self.place = PositionEncoding(EncodingSettings("fourier", octaves), around)
+        self.heading = PositionEncoding(EncodingSettings("fourier", 2), torch.tensor([[-1.0] * 3, [1.0] * 3]))
+        self.network = perceptron(self.place.width + self.heading.width, 3, width, depth)
+
+    def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
+        """Virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and whether each is (B, P).
+
+        Training receivers (`skip_self`) see what they were measured to see.
+        """
+        distance = torch.cdist(places, self.found["places"])
+        table = self.found["votes"]
+        if skip_self:
+            counts = table[distance.argmin(1)]
+            width = int((table > 0).sum(1).max())
+        else:
+            near = distance.topk(self.neighbours, largest=False).indices
+            counts, width = (table[near] > 0).float().sum(1), self.paths
+        best = counts.topk(min(width, counts.shape[1]), dim=1)
+        return self.found["virtual"][best.indices], best.values > 0
+
+    def march(self, places: Tensor, goals: Tensor, likely: Tensor, draw: torch.Generator | None) -> Tensor:
+        """Channels (B,) of rays from places (B, 3) towards goals (B, P, 3) [m], those likely (B, P)."""
+        towards = goals - places[:, None]
+        apart = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
+        heading = towards / apart
+        half = self.samples // 2
+        shape = (*heading.shape[:2], half)
+        jitter = torch.full((2, *shape), 0.5) if draw is None else torch.rand((2, *shape), generator=draw)
+        steps = torch.arange(half)
+        coarse = NEAR + (self.far - NEAR) * (steps + jitter[0]) / half
+        fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
+        depth = torch.cat([coarse, fine], -1).sort(-1).values
+        points = places[:, None, None] + depth[..., None] * heading[:, :, None]
+        inputs = torch.cat(
+            [
+                self.place(points.reshape(-1, 3)).view(*depth.shape, -1),
+                self.heading(heading.reshape(-1, 3))
+                .view(*heading.shape[:2], 1, -1)
+                .expand(-1, -1, self.samples, -1),
+            ],
+            -1,
+        )
+        out = self.network(inputs)
+        density = DENSITY * nn.functional.softplus(out[..., 2])
+        thick = density * nn.functional.pad(depth.diff(dim=-1), (0, 1), value=LAST)
+        opaque = -torch.expm1(-thick)
+        weight = (-(thick.cumsum(-1) - thick)).exp() * opaque
+        gain = torch.view_as_complex(out[..., :2].contiguous())
+        wave = torch.polar(weight / depth, -self.wavenumber * depth)
+        return ((gain * wave).sum(-1) * likely).sum(-1)
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Channels (B, 1, 1) at searched directions."""
+        places = rx.position.reshape(-1, 3)
+        return self.march(places, *self.search(places, False), None).view(-1, 1, 1)
+
+    def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
+        """Mean squared error along measured directions."""
+        places = batch.rx.position.reshape(-1, 3)
+        seen = self.march(places, *self.search(places, True), draw).view(-1, 1, 1)
+        return (seen - batch.target).abs().square().mean()

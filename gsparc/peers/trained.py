@@ -1,0 +1,197 @@
+"""What all peers trained by gradient share: one loop under a budget of seconds, one way to store."""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import abstractmethod
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+from typing import Any, ClassVar
+
+import lightning.pytorch as L
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.module import order
+from gsparc.data.schema import Kind, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.method import FitReport, Method, Prediction
+from gsparc.ops import Pose
+from gsparc.peers.network import Network, Scene
+
+FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
+WARMUP = 0.02  # share of the training over which rates rise
+QUERY_CHUNK = 32  # bounds the memory of one prediction call
+
+
+class TrainedPeer(Method):
+    """Learns from `fold.train` and `fold.val` together for a given time; nothing is chosen on `val`.
+
+    Args:
+        budget_s: seconds of training in processor time per thread, so that a busy machine gives the same
+            training (on a quiet one they are the clock's); the learning-rate schedule stretches to them.
+        max_steps: ends training earlier; null for no limit (with it a run repeats exactly).
+        batch_size: samples per step.
+        rate: Adam's learning rate where `rates` names no other.
+        seed: of initial weights and order of the samples.
+        name: as it appears in tables.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]]
+    rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
+
+    def __init__(
+        self,
+        name: str,
+        budget_s: float = 60.0,
+        max_steps: int | None = None,
+        batch_size: int = 8,
+        rate: float = 2e-3,
+        seed: int = 0,
+    ) -> None:
+        if not budget_s > 0 or batch_size < 1:
+            raise ValueError(
+                f"{name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {batch_size}"
+            )
+        self.name = name
+        self.budget_s, self.max_steps, self.batch_size = budget_s, max_steps, batch_size
+        self.rate, self.seed = rate, seed
+        self.site: Site | None = None
+        self.scene: Scene | None = None
+        self.network: Network | None = None
+        self.found: dict[str, Tensor] = {}
+        self.steps = 0
+
+    @abstractmethod
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """The untrained network of a scene."""
+
+    def look(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """What is read off the training rows (n,) before training; stored with the weights."""
+        return {}
+
+    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+        """Train until the budget is spent.
+
+        Raises:
+            ValueError: a kind of data the method does not serve, or no training rows.
+            RuntimeError: the loss became NaN or infinite.
+        """
+        started, watch = time.perf_counter(), _Stopwatch()
+        rows = np.sort(np.concatenate([fold.train, fold.val]))
+        if data.site.kind not in self.kinds:
+            raise ValueError(
+                f"{self.name}: predicts {' and '.join(self.kinds)}; this dataset holds {data.site.kind}"
+            )
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        L.seed_everything(self.seed, verbose=False)
+        self.site, self.scene = data.site, _scene(data, int(rows[0]))
+        self.found = self.look(data, rows)
+        self.network = self.build(self.scene, self.found)
+        self._train(data, rows, watch)
+        self.network.eval()
+        note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
+        return FitReport(time.perf_counter() - started, (note,))
+
+    def _train(self, data: Measurements, rows: np.ndarray, watch: _Stopwatch) -> None:
+        network = self.fitted()
+        optimizer = torch.optim.Adam(self._groups(network), eps=1e-15)
+        base = [group["lr"] for group in optimizer.param_groups]
+        draw = torch.Generator().manual_seed(self.seed)
+        for step in count():
+            progress = self._progress(step, watch.seconds())
+            if progress >= 1:
+                break
+            for group, rate in zip(optimizer.param_groups, base, strict=True):
+                group["lr"] = rate * rate_factor(progress)
+            batch = data.batch(order(self.seed, step, self.batch_size, rows))
+            optimizer.zero_grad(set_to_none=True)
+            loss = network.loss(batch, draw)
+            if not torch.isfinite(loss):
+                raise RuntimeError(
+                    f"{self.name}: the loss became NaN or infinite at step {step}; lower model.rate"
+                )
+            loss.backward()
+            optimizer.step()
+            self.steps = step + 1
+
+    def _progress(self, step: int, elapsed_s: float) -> float:
+        """Share of the training that is over; step 0 is always taken."""
+        if self.max_steps is None:
+            return elapsed_s / self.budget_s if step else 0.0
+        return max(step / self.max_steps, elapsed_s / self.budget_s if step else 0.0)
+
+    def _groups(self, network: nn.Module) -> Iterator[dict[str, Any]]:
+        for name, parameter in network.named_parameters():
+            known = [prefix for prefix in self.rates if name.startswith(prefix)]
+            rate = self.rates[max(known, key=len)] if known else self.rate
+            yield {"params": [parameter], "lr": rate}
+
+    def fitted(self) -> Network:
+        """The network; `ValueError` before `fit` or `restore`."""
+        if self.network is None:
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.network
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; these peers give no confidence."""
+        network = self.fitted()
+        parts = [
+            network.answer(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
+            for i in range(0, len(tx), QUERY_CHUNK)
+        ]
+        mean = torch.cat(parts)
+        return Prediction(mean if mean.is_complex() else mean.clamp(0, 1))
+
+    def state(self) -> dict[str, Any]:
+        """Weights, and what the network is built from."""
+        scene, network = self.scene, self.fitted()
+        assert scene is not None
+        receiver = scene.receiver
+        return {
+            "shape": list(scene.shape),
+            "receiver": None if receiver is None else [receiver.position, receiver.rotation],
+            "transmitter": scene.transmitter,
+            "found": self.found,
+            "network": network.state_dict(),
+            "steps": self.steps,
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        receiver = None if state["receiver"] is None else Pose(*state["receiver"])
+        self.site = site
+        self.scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"])
+        self.found, self.steps = dict(state["found"]), int(state["steps"])
+        self.network = self.build(self.scene, self.found)
+        self.network.load_state_dict(state["network"])
+        self.network.eval()
+
+
+class _Stopwatch:
+    """Processor time of this process since it was made, per thread."""
+
+    def __init__(self) -> None:
+        self.started = time.process_time()
+
+    def seconds(self) -> float:
+        return (time.process_time() - self.started) / torch.get_num_threads()
+
+
+def rate_factor(progress: float) -> float:
+    """Learning rate at a share of the training in [0, 1], relative to the largest: a rise, then a cosine."""
+    rise = min((progress + 1e-3) / WARMUP, 1.0)
+    return rise * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+
+
+def _scene(data: Measurements, row: int) -> Scene:
+    one = data.batch(np.array([row]))
+    shape = tuple(data.target.shape[1:])
+    if data.site.static_end == "rx":
+        return Scene(data.site, shape, one.rx, None)
+    return Scene(data.site, shape, None, one.tx[0])

@@ -1,0 +1,89 @@
+"""WRF-GS+: 3D Gaussians that a network deforms for every position of the transmitter.
+
+C. Wen, J. Tong, Y. Hu, Z. Lin, J. Zhang, "Neural Representation for Wireless Radiation Field Reconstruction:
+A 3D Gaussian Splatting Approach" (WRF-GS and WRF-GS+), 2025.
+
+Kept: a static part (the Gaussians) and a dynamic part (a network of a Gaussian's place and the query) that
+moves, turns, stretches, fades and re-lights them; one projection per query; L1 and SSIM. Left out: adaptive
+density control and the authors' own initial grid of Gaussians (ours start around the receiver).
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Kind
+from gsparc.ops import Pose
+from gsparc.peers.deformation import Deformation
+from gsparc.peers.gaussians import Screen, gaussians_of, render_each
+from gsparc.peers.network import Network, Scene
+from gsparc.peers.trained import TrainedPeer
+
+CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
+SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
+
+
+class WRFGSPlus(TrainedPeer):
+    """Spectra.
+
+    Args:
+        count: Gaussians.
+        width, depth, octaves: of the deforming network.
+        **training: see `TrainedPeer`.
+    """
+
+    kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
+    rates: ClassVar[dict[str, float]] = {
+        "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
+        "signals": 1e-2,
+    }  # fmt: skip
+
+    def __init__(
+        self,
+        count: int = 500,
+        width: int = 64,
+        depth: int = 3,
+        octaves: int = 5,
+        name: str = "wrfgs",
+        **training,
+    ) -> None:
+        super().__init__(name, **training)
+        self.count, self.width, self.depth, self.octaves = count, width, depth, octaves
+
+    def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
+        """See `TrainedPeer.build`."""
+        return DeformedGaussians(scene, self.count, self.width, self.depth, self.octaves)
+
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return self.count
+
+
+class DeformedGaussians(Network):
+    """Static Gaussians and the network that deforms them."""
+
+    def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
+        super().__init__()
+        self.scene, self.screen = scene, Screen(scene)
+        self.field = gaussians_of(scene, count)
+        self.signals = nn.Parameter(torch.zeros(count))
+        low, high = self.field.means.detach().amin(0), self.field.means.detach().amax(0)
+        places = torch.stack([low, high])
+        self.deformation = Deformation(places, scene.box, sum(CHANGES), width, depth, octaves)
+
+    def forward(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Spectra (B, H, W)."""
+        field = self.field
+        changes = self.deformation(field.means, self.scene.moving(tx, rx))
+        place, turn, stretch, fade, light = changes.split(CHANGES, -1)
+        geometry = (
+            field.means + SHIFT * place,
+            field.quats + turn,
+            (field.log_scales + stretch.clamp(-3, 3)).exp(),
+            torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
+        )
+        signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
+        return render_each(geometry, signal, rx, self.screen.grid, **self.screen.optics).squeeze(1)
