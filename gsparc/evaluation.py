@@ -8,15 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from gsparc.baselines import BASELINES, Fitted, baseline, mean_seconds
 from gsparc.clock import COPY, ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
 from gsparc.method import Method
 from gsparc.metrics import paired_values
-from gsparc.ops import Pose
 from gsparc.scoring import Scores, rows_of, score
 
 REFERENCE = "gp"  # differences are paired with it
@@ -163,19 +161,16 @@ def split_facts(split: Split) -> dict[str, Any]:
     return {"split/name": split.name, "split/sha256": split.sha256, "split/folds": len(split.folds), **counts}
 
 
-def _queries(data: Measurements, rows: np.ndarray, size: int) -> list[tuple[Tensor, Pose]]:
-    """Positions of `size` of the `rows`, another set each time."""
+def _queries(data: Measurements, rows: np.ndarray, size: int) -> list[Batch]:
+    """What is known of `size` of the `rows`, another set each time."""
     picks = [np.take(rows, np.arange(turn, turn + size), mode="wrap") for turn in range(min(len(rows), 64))]
     where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
-    batches = [where.batch(pick) for pick in picks]
-    return [(batch.tx, batch.rx) for batch in batches]
+    return [where.batch(pick) for pick in picks]
 
 
-def _calls(
-    methods: Mapping[str, Method], queries: Sequence[tuple[Tensor, Pose]]
-) -> dict[str, Callable[[int], object]]:
+def _calls(methods: Mapping[str, Method], queries: Sequence[Batch]) -> dict[str, Callable[[int], object]]:
     def call(method: Method) -> Callable[[int], object]:
-        return lambda turn: method.predict(*queries[turn % len(queries)])
+        return lambda turn: method.answer(queries[turn % len(queries)])
 
     return {name: call(method) for name, method in methods.items()}
 

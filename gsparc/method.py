@@ -9,7 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.ops import Pose
 
@@ -54,6 +54,10 @@ class Method(ABC):
     @abstractmethod
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses, all in local coordinates."""
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Predict a batch; a method that reads the fresh uplink of its snapshots overrides this."""
+        return self.predict(batch.tx, batch.rx)
 
     @abstractmethod
     def state(self) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def draw_predictions(
     few = np.linspace(0, len(fold.test) - 1, min(count, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
-    found = method.predict(batch.tx, batch.rx)
+    found = method.answer(batch)
     predicted = found.mean.numpy()
     if spectra:
         sure = None if found.confidence is None else found.confidence.numpy()

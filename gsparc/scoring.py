@@ -87,7 +87,7 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
         variance: list[np.ndarray] = []
         for start in range(0, len(rows), CHUNK):
             batch = data.batch(rows[start : start + CHUNK])
-            prediction = method.predict(batch.tx, batch.rx)
+            prediction = method.answer(batch)
             metric.update(prediction.mean, batch.target, batch.mask)
             for values, given in ((confidence, prediction.confidence), (variance, prediction.variance)):
                 none = np.full(len(batch), np.nan)

@@ -100,11 +100,53 @@ def _own(config: Mapping[str, Any]) -> Measurements:
     return load_own(_required_file(config))
 
 
-FOLDERS = ("rfid", "rfid_sim")  # datasets that are a folder; the others are one file
+def _argos(config: Mapping[str, Any]) -> Measurements:
+    from gsparc.data.argos import describe_missing as describe_missing_argos
+
+    root = config.get("root")
+    if root is None or not Path(root).exists():
+        log.warning("%s Using the SIMULATED stand-in argos-sim instead.", describe_missing_argos(root))
+        return _argos_sim(config)
+    return _argos_folder(Path(root), config)
+
+
+def _argos_sim(config: Mapping[str, Any]) -> Measurements:
+    from gsparc.simulate.argos_sim import ensure_argos_sim
+
+    stand_in = config.get("stand_in") or {}
+    folder = ensure_argos_sim(
+        Path(stand_in.get("root", "outputs/stand-ins")),
+        count=int(stand_in.get("count", 4000)),
+        seed=int(stand_in.get("seed", 0)),
+        offsets=bool(stand_in.get("offsets", True)),
+    )
+    log.warning("argos-sim: SIMULATED data in the layout of the Argos release, at %s", folder)
+    return _argos_folder(folder, config)
+
+
+def _argos_folder(folder: Path, config: Mapping[str, Any]) -> Measurements:
+    from gsparc.data.argos import load_argos
+    from gsparc.encoder.autoencoder import EncoderSettings
+    from gsparc.encoder.store import encoder_for
+
+    given = dict(config.get("encoder") or {})
+    file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
+    return load_argos(
+        folder,
+        encoder_for(room, EncoderSettings(**given), file),
+        antenna=config.get("antenna", 0),
+        positions=str(config.get("positions", "encoder")),
+        align=bool(config.get("align", True)),
+    )
+
+
+FOLDERS = ("rfid", "rfid_sim", "argos", "argos_sim")  # datasets that are a folder; the others are one file
 
 LOADERS: dict[str, Callable[[Mapping[str, Any]], Measurements]] = {
     "rfid": _rfid,
     "rfid_sim": _rfid_sim,
+    "argos": _argos,
+    "argos_sim": _argos_sim,
     "newrf": _newrf,
     "own": _own,
 }

@@ -36,6 +36,9 @@ class Site:
         convergence_error: NMSE between two solver seeds for simulated data; else None.
         static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown.
         rx_rotation: (3, 3) float64, how the first row's receiver is turned; None when unknown.
+        uplink_array: (U, 3) float64 [m] antennas that hear a snapshot's uplink; None where there is none.
+        uplink_hz: (L,) absolute frequencies of the uplink [Hz].
+        antennas: (A,) rows of `uplink_array` that the target's antennas are.
     """
 
     name: str
@@ -54,6 +57,9 @@ class Site:
     convergence_error: float | None = None
     static_position: np.ndarray | None = None
     rx_rotation: np.ndarray | None = None
+    uplink_array: np.ndarray | None = None
+    uplink_hz: np.ndarray | None = None
+    antennas: np.ndarray | None = None
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
@@ -77,6 +83,7 @@ class Batch:
         target: (B, H, W) float32, or (B, antennas, subcarriers) complex64, or (B, 1) float32.
         mask: like target, bool, True where measured; None when everything was.
         noise_variance: (B,) float32 in target units; None when unknown.
+        uplink: (B, U, L) complex64 heard at the same moment, in target units; None where there is none.
     """
 
     index: Tensor
@@ -85,6 +92,7 @@ class Batch:
     target: Tensor
     mask: Tensor | None = None
     noise_variance: Tensor | None = None
+    uplink: Tensor | None = None
 
     @property
     def shared_pose(self) -> bool:
@@ -119,6 +127,7 @@ class Measurements:
         row_names: what a user calls each row (file name, CSV line), for messages.
         release_split: (train, test) int64 rows that the data themselves name, or None.
         provenance: where the data came from, as their makers wrote it down.
+        uplink: (S, U, L) complex64 heard at the same moment as the target, in its units, or None.
     """
 
     site: Site
@@ -132,6 +141,7 @@ class Measurements:
     row_names: list[str] = field(default_factory=list)
     release_split: tuple[np.ndarray, np.ndarray] | None = None
     provenance: dict[str, str] = field(default_factory=dict)
+    uplink: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.target)
@@ -161,6 +171,7 @@ class Measurements:
             target=self.targets(rows),
             mask=None if self.mask is None else torch.from_numpy(self.mask[rows]),
             noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
+            uplink=None if self.uplink is None else torch.from_numpy(self.uplink[rows]),
         )
 
     @staticmethod

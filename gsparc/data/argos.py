@@ -1,0 +1,215 @@
+"""The Argos release's layout: `csidata.npy` [N, 8, 52] and `base-station.yml`, uplink in, downlink out.
+
+The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Nobody noted where the
+users were: positions come from an encoder of the uplink (`gsparc.encoder`), or from the stand-in's truth.
+Whoever predicts here has heard a fresh uplink of the very snapshot, if only to know where the user is.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gsparc.data.assemble import assemble, one_decibel_rms
+from gsparc.data.errors import DataError
+from gsparc.data.schema import Measurements
+
+log = logging.getLogger(__name__)
+
+UPLINK = 26  # tones
+CARRIER_HZ = 2.4e9
+SPACING_HZ = 312.5e3
+TONES = (*range(-26, 0), *range(1, 27))
+STAND_IN = "argos-sim"
+
+Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+def describe_missing(root: str | Path | None) -> str:
+    """Why the release is not used, and how to get it."""
+    where = "dataset.root is not set" if root is None else f"{root} is not there"
+    return (
+        f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
+        "csidata.npy and base-station.yml into a folder and say dataset.root=FOLDER."
+    )
+
+
+def load_argos(
+    root: str | Path,
+    encode: Encoder | None = None,
+    *,
+    antenna: int | str = 0,
+    positions: str = "encoder",
+    align: bool = True,
+) -> Measurements:
+    """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, 26) complex64.
+
+    Args:
+        root: the folder; `csidata-64.npy` is preferred where a folder has it.
+        encode: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
+        antenna: number of the antenna to predict, or `all`.
+        positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
+        align: turn every snapshot by the phase and the mean delay of its own uplink. They are the
+            snapshot's, not the place's; multiplying by a number of modulus 1 changes no error.
+
+    Raises:
+        DataError: anything is missing or wrong.
+    """
+    root = Path(root)
+    description = _description(root)
+    csi = _channels(root)
+    places = _antennas(root, description, csi.shape[1])
+    chosen = _chosen(antenna, csi.shape[1])
+    tones = np.array(description.get("tones", TONES), dtype=np.float64)
+    spacing = float(description.get("spacing_hz", SPACING_HZ))
+    carrier = float(description.get("carrier_hz", CARRIER_HZ))
+    if align:
+        csi = aligned(csi, tones)
+    scale = one_decibel_rms(csi)
+    csi = (csi / scale).astype(np.complex64)
+    uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
+    split = _split(root, len(csi))
+    where = _positions(root, positions, encode, uplink, split)
+    simulated = description.get("dataset_name") == STAND_IN
+    noise = description.get("noise_power")
+    base, frequency = places.mean(axis=0), carrier + tones * spacing
+    data = assemble(
+        name=STAND_IN if simulated else "argos",
+        stand_in="argos" if simulated else None,
+        kind="csi",
+        static_end="tx",
+        tx=np.tile(base, (len(csi), 1)),
+        rx=where,
+        rx_rotation=np.tile(np.eye(3), (len(csi), 1, 1)),
+        target=target,
+        target_scale=scale,
+        carrier_hz=carrier,
+        subcarriers_hz=frequency[UPLINK:],
+        noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
+        release_split=split,
+        row_names=[f"snapshot {i}" for i in range(len(csi))],
+        provenance={"layout": "argos", "positions": positions, "aligned": str(align)},
+    )
+    heard = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
+    return replace(data, site=replace(data.site, **heard), uplink=np.ascontiguousarray(uplink))
+
+
+def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
+    """Snapshots (S, A, K) without the mean delay and the phase of their uplink (its tones come first)."""
+    uplink, numbers = csi[..., :UPLINK], tones[:UPLINK]
+    step = np.diff(numbers)[0]
+    turn = np.angle((uplink[..., 1:] * uplink[..., :-1].conj()).sum((1, 2))) / step
+    middle = numbers.mean()
+    straight = csi * np.exp(-1j * turn[:, None] * (tones - middle))[:, None]
+    # The phase of what all antennas and tones hear together; of the loudest entry where that is silence.
+    phase = np.angle(straight[..., :UPLINK].sum((1, 2)))
+    return straight * np.exp(-1j * phase)[:, None, None]
+
+
+def peers_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex, float]:
+    """Mean and spread that published loaders remove: one complex number and one scale for all entries.
+
+    Args:
+        values: (S, A, K) targets.
+        train: rows they are taken over.
+    """
+    chosen = values[train].astype(np.complex128)
+    mean = complex(chosen.mean())
+    return mean, float(np.sqrt((np.abs(chosen - mean) ** 2).mean()))
+
+
+def _description(root: Path) -> Mapping[str, Any]:
+    path = root / "base-station.yml"
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: missing; expected the antennas' positions") from None
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise DataError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(content, Mapping):
+        raise DataError(f"{path}: expected `base_station:` with a list of antenna positions [m]")
+    return content
+
+
+def _channels(root: Path) -> np.ndarray:
+    path = root / "csidata-64.npy"
+    path = path if path.exists() else root / "csidata.npy"
+    try:
+        csi = np.load(path, allow_pickle=False)
+    except FileNotFoundError:
+        raise DataError(f"{path}: missing; expected complex channels [N, antennas, 52]") from None
+    except (ValueError, OSError) as error:
+        raise DataError(f"{path}: not readable ({' '.join(str(error).split())})") from None
+    if csi.ndim != 3 or csi.shape[2] != 2 * UPLINK or csi.dtype.kind != "c":
+        raise DataError(
+            f"{path}: expected complex [N, antennas, {2 * UPLINK}], found {csi.dtype} {csi.shape}"
+        )
+    bad = np.flatnonzero(~np.isfinite(csi).all((1, 2)))
+    if len(bad):
+        raise DataError(f"{path}, snapshot {bad[0]}: NaN or Inf; expected finite channels")
+    silent = np.flatnonzero(~np.abs(csi[..., :UPLINK]).any((1, 2)))
+    if len(silent):
+        raise DataError(
+            f"{path}, snapshot {silent[0]}: its uplink is silent; expected a packet that was heard"
+        )
+    return csi
+
+
+def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndarray:
+    key = f"base_station_{count}" if f"base_station_{count}" in description else "base_station"
+    try:
+        places = np.array(description.get(key), dtype=np.float64)
+    except (TypeError, ValueError):
+        places = np.zeros(0)
+    if places.shape != (count, 3) or not np.isfinite(places).all():
+        raise DataError(
+            f"{root / 'base-station.yml'}: {key} has shape {places.shape}; expected {count} x 3 metres, "
+            "an antenna a line"
+        )
+    return places
+
+
+def _chosen(antenna: int | str, count: int) -> np.ndarray:
+    if antenna == "all":
+        return np.arange(count)
+    if not isinstance(antenna, int) or isinstance(antenna, bool) or not 0 <= antenna < count:
+        raise DataError(f"dataset.antenna={antenna}: expected all, or a number from 0 to {count - 1}")
+    return np.array([antenna])
+
+
+def _split(root: Path, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
+    paths = [root / f"{name}_index.txt" for name in ("train", "test")]
+    if not all(path.exists() for path in paths):
+        return None
+    try:
+        train, test = (np.loadtxt(path, dtype=np.int64, ndmin=1) for path in paths)
+    except ValueError as error:
+        raise DataError(f"{paths[0].parent}: an index file is not a list of row numbers ({error})") from None
+    every = np.concatenate([train, test])
+    if len(np.unique(every)) != len(every) or every.min() < 0 or every.max() >= rows:
+        raise DataError(f"{root}: the index files name a row twice, or one outside 0 to {rows - 1}")
+    return train, test
+
+
+def _positions(
+    root: Path,
+    positions: str,
+    encode: Encoder | None,
+    uplink: np.ndarray,
+    split: tuple[np.ndarray, np.ndarray] | None,
+) -> np.ndarray:
+    if positions == "true":
+        path = root / "positions.npy"
+        if not path.exists():
+            raise DataError(f"{path}: missing; true positions exist in the stand-in only")
+        return np.load(path, allow_pickle=False).astype(np.float64)
+    if positions != "encoder" or encode is None:
+        raise DataError(f"dataset.positions={positions!r}: expected encoder or true")
+    rows = np.arange(len(uplink)) if split is None else split[0]
+    return encode(uplink, rows)

@@ -1,0 +1,42 @@
+"""What of an uplink depends on the place and not on the snapshot: no phase, no timing, no common gain."""
+
+from __future__ import annotations
+
+import numpy as np
+
+ANTENNA_PAIRS = 64  # pairs of antennas that are compared, at most; drawn with a fixed seed
+FLOOR = 1e-12
+
+
+def features(uplink: np.ndarray) -> np.ndarray:
+    """Real features (S, F) float32 of uplinks (S, A, L) complex.
+
+    Logarithmic power, correlations between antennas (directions), between tones (delays up to one common
+    delay, of which only the modulus is kept), and the logarithmic power of each antenna relative to all.
+    """
+    power = (np.abs(uplink) ** 2).mean((1, 2)) + FLOOR
+    unit = uplink / np.sqrt(power)[:, None, None]
+    first, second = _pairs(uplink.shape[1])
+    across = np.einsum("spl,spl->sp", unit[:, first], unit[:, second].conj()) / uplink.shape[2]
+    tones = uplink.shape[2]
+    along = np.stack(
+        [
+            (unit[..., lag:] * unit[..., : tones - lag].conj()).mean((1, 2))
+            for lag in range(1, tones // 2 + 1)
+        ],
+        axis=1,
+    )
+    # A timing error turns lag l by l times one angle: relative to lag 1 the shape of the profile is left.
+    turn = np.angle(along[:, :1])
+    along = along * np.exp(-1j * turn * np.arange(1, along.shape[1] + 1))
+    each = np.log10((np.abs(unit) ** 2).mean(2) + 1e-3)
+    parts = [10 * np.log10(power)[:, None] / 10, across.real, across.imag, along.real, along.imag, each]
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def _pairs(antennas: int) -> tuple[np.ndarray, np.ndarray]:
+    first, second = np.triu_indices(antennas, 1)
+    if len(first) > ANTENNA_PAIRS:
+        keep = np.sort(np.random.default_rng(0).permutation(len(first))[:ANTENNA_PAIRS])
+        first, second = first[keep], second[keep]
+    return first, second

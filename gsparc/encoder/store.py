@@ -1,0 +1,96 @@
+"""Encoders on disk: trained once per data and settings, frozen from then on."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsparc.data.assemble import content_hash
+from gsparc.data.errors import DataError
+from gsparc.encoder.autoencoder import Autoencoder, EncoderSettings, train
+from gsparc.encoder.features import features
+
+log = logging.getLogger(__name__)
+
+FORMAT = "gsparc-encoder-1"
+
+
+def save(path: Path, model: Autoencoder) -> None:
+    """Write an encoder atomically."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {
+        "format": FORMAT,
+        "settings": asdict(model.settings),
+        "width": len(model.mean),
+        "model": model.state_dict(),
+    }
+    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    with os.fdopen(handle, "wb") as file:
+        torch.save(content, file)
+    os.replace(partial, path)
+
+
+def load(path: str | Path) -> Autoencoder:
+    """Read an encoder; runs no code from the file.
+
+    Raises:
+        DataError: missing, or not an encoder.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(f"{path}: no such encoder")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']!r}")
+        model = Autoencoder(int(content["width"]), EncoderSettings(**content["settings"]))
+        model.load_state_dict(content["model"])
+    except Exception as error:  # whatever a damaged file raises
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0]
+        raise DataError(f"{path}: not a gsparc encoder ({reason})") from None
+    return model.eval().requires_grad_(False)
+
+
+def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
+    """Places (S, 3) float64 of uplinks (S, A, L), of the order of metres.
+
+    Raises:
+        DataError: the encoder was made for other antennas or tones.
+    """
+    seen = torch.from_numpy(features(uplink))
+    if seen.shape[1] != len(model.mean):
+        raise DataError(
+            f"the encoder was trained on {len(model.mean)} features, these uplinks have {seen.shape[1]}"
+        )
+    with torch.no_grad():
+        return model.code(seen).double().numpy() * model.settings.size_m / 2
+
+
+def encoder_for(
+    folder: Path, settings: EncoderSettings, file: str | Path | None = None
+) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """What `load_argos` asks for places: a given encoder file, or one trained once and kept in `folder`."""
+
+    def encode(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        if file is not None:
+            return places(load(file), uplink)
+        known = {f.name: np.array(getattr(settings, f.name)) for f in fields(settings)}
+        content = content_hash({"uplink": uplink[rows], **known})
+        path = folder / f"{hashlib.sha256(content.encode()).hexdigest()[:24]}.pt"
+        if not path.exists():
+            started = time.perf_counter()
+            model = train(torch.from_numpy(features(uplink[rows])), settings)
+            save(path, model)
+            log.info("encoder trained in %.1f s: %s", time.perf_counter() - started, path)
+        return places(load(path), uplink)
+
+    return encode

@@ -1,0 +1,193 @@
+"""`argos-sim`: a stand-in for the Argos release, in its layout, from rays among city blocks.
+
+Loudly not real data. 4,000 users walk in open and blocked streets before an 8 x 8 array at 2.4 GHz; each
+snapshot carries a phase, a timing and a frequency offset of its own, as measured ones do. Besides the
+release's files (`csidata.npy` of 8 antennas, `base-station.yml`) there are all 64 antennas
+(`csidata-64.npy`) and what no release tells: where the users were (`positions.npy`).
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from gsparc.simulate.streets import LIGHT, Rays, Streets, trace
+
+STAND_IN = "argos-sim"  # `dataset_name` of the simulated replacement
+CARRIER_HZ = 2.4e9
+SPACING_HZ = 312.5e3  # 20 MHz in 64 tones, of which 52 carry something
+TONES = np.concatenate([np.arange(-26, 0), np.arange(1, 27)])
+FFT = 64
+SIDE = 8
+LOWER, UPPER = np.array([-140.0, -105.0]), np.array([140.0, 105.0])  # [m] where users walk
+HEIGHT_M = (1.0, 1.9)
+MEDIAN_SNR_DB = 25.0
+HEARD_DB = 5.0  # a weaker packet is not decoded, so no snapshot of it exists
+CHUNK = 250  # users whose responses are in memory at once
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """What every snapshot has of its own; 0 switches one off.
+
+    Attributes:
+        phase: 1 for a phase drawn from the whole circle.
+        timing_s: largest timing error to either side [s]; one sample of 20 MHz is 50 ns.
+        frequency: largest residual frequency offset to either side, in tone spacings.
+    """
+
+    phase: float = 1.0
+    timing_s: float = 100e-9
+    frequency: float = 0.01
+
+
+def scene(seed: int = 0) -> Streets:
+    """Nine blocks, a base station in the middle street, lamp posts and parked cars along the kerbs."""
+    rng = np.random.default_rng([seed, 1])
+    centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
+    half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
+    buildings = np.stack([centres - half, centres + half], axis=1)
+    streets = Streets(
+        buildings=buildings,
+        reflection=-rng.uniform(0.7, 0.9, 9),
+        scatterers=np.zeros((0, 3)),
+        cross_section=np.zeros(0),
+        scatterer_phase=np.zeros(0),
+        base=np.array([-50.0, 37.0, 9.0]),
+    )
+    places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (400, 2))
+    places = places[streets.open(places)][:60]
+    return Streets(
+        buildings=streets.buildings,
+        reflection=streets.reflection,
+        scatterers=np.column_stack([places, rng.uniform(1, 6, len(places))]),
+        cross_section=10 ** rng.uniform(2.5, 4.5, len(places)),
+        scatterer_phase=rng.uniform(0, 2 * np.pi, len(places)),
+        base=streets.base,
+    )
+
+
+def array() -> np.ndarray:
+    """Element positions (64, 3) [m] about the base: an upright half-wavelength square, row by row."""
+    step = LIGHT / CARRIER_HZ / 2 * (np.arange(SIDE) - (SIDE - 1) / 2)
+    across = np.array([1.0, -1.0, 0.0]) / np.sqrt(2)  # it faces both streets of the crossing
+    z, x = np.meshgrid(step, step, indexing="ij")
+    return x.reshape(-1, 1) * across + z.reshape(-1, 1) * np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class World:
+    """Users, their rays and the noise: what makes the snapshots, without their offsets.
+
+    Attributes:
+        users: (S, 3) [m].
+        rays: their paths.
+        noise_power: per antenna and tone.
+    """
+
+    users: np.ndarray
+    rays: Rays
+    noise_power: float
+
+    def response(self, frequency_hz: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """True channels (S, 64, K) complex64 at absolute frequencies (K,) [Hz]; some `rows` only."""
+        rows = np.arange(len(self.users)) if rows is None else rows
+        parts = []
+        for some in np.array_split(rows, max(1, len(rows) // CHUNK)):
+            rays = Rays(self.rays.gain[some], self.rays.delay[some], self.rays.direction[some])
+            parts.append(rays.response(array(), CARRIER_HZ, frequency_hz).astype(np.complex64))
+        return np.concatenate(parts)
+
+
+def world(count: int, seed: int = 0) -> World:
+    """`count` users that the base station hears, in streets open to it and blocked from it."""
+    streets, rng = scene(seed), np.random.default_rng([seed, 2])
+    drawn = rng.uniform(LOWER, UPPER, (8 * count, 2))
+    drawn = drawn[streets.open(drawn)][: 2 * count]
+    users = np.column_stack([drawn, rng.uniform(*HEIGHT_M, len(drawn))])
+    rays = trace(streets, users, LIGHT / CARRIER_HZ)
+    power = (np.abs(rays.gain) ** 2).sum(axis=1)
+    noise = float(np.median(power)) / 10 ** (MEDIAN_SNR_DB / 10)
+    heard = np.flatnonzero(power > noise * 10 ** (HEARD_DB / 10))[:count]
+    if len(heard) < count:
+        raise ValueError(f"argos-sim: only {len(heard)} of {count} users are heard")
+    kept = Rays(rays.gain[heard], rays.delay[heard], rays.direction[heard])
+    return World(users[heard], kept, noise)
+
+
+def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
+    """Measured channels (S, 64, 52) complex64: truth, offsets, noise."""
+    rng = np.random.default_rng([seed, 3])
+    count = len(truth.users)
+    clean = truth.response(CARRIER_HZ + TONES * SPACING_HZ)
+    phase = offsets.phase * rng.uniform(0, 2 * np.pi, count)
+    timing = offsets.timing_s * rng.uniform(-1, 1, count)
+    drift = offsets.frequency * rng.uniform(-1, 1, count)
+    pilot = rng.choice([-1.0, 1.0], len(TONES))
+    measured = np.empty_like(clean)
+    for some in np.array_split(np.arange(count), max(1, count // CHUNK)):
+        turn = phase[some, None] - 2 * np.pi * timing[some, None] * TONES * SPACING_HZ
+        signal = clean[some] * np.exp(1j * turn)[:, None]
+        # A frequency offset turns the samples of a symbol, which leaks tones into one another.
+        grid = np.zeros((*signal.shape[:2], FFT), complex)
+        grid[..., TONES % FFT] = signal * pilot
+        turning = np.exp(2j * np.pi * np.outer(drift[some], np.arange(FFT)) / FFT)
+        samples = np.fft.ifft(grid) * turning[:, None]
+        received = np.fft.fft(samples)[..., TONES % FFT] * pilot
+        noise = rng.normal(size=(*received.shape, 2)) @ np.array([1, 1j]) * np.sqrt(truth.noise_power / 2)
+        measured[some] = received + noise
+    return measured
+
+
+def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets) -> None:
+    """Write `count` snapshots in the release's layout; the folder must not exist."""
+    truth = world(count, seed)
+    measured = snapshots(truth, offsets, seed)
+    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial.mkdir(parents=True)
+    np.save(partial / "csidata.npy", measured[:, :SIDE])
+    np.save(partial / "csidata-64.npy", measured)
+    np.save(partial / "positions.npy", truth.users)
+    description = {
+        "dataset_name": STAND_IN,
+        "carrier_hz": CARRIER_HZ,
+        "spacing_hz": SPACING_HZ,
+        "tones": TONES.tolist(),
+        "noise_power": truth.noise_power,
+        "base_station": (scene(seed).base + array()[:SIDE]).round(6).tolist(),
+        "base_station_64": (scene(seed).base + array()).round(6).tolist(),
+        "count": count,
+        "seed": seed,
+    }
+    (partial / "base-station.yml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
+    order = np.random.default_rng(seed).permutation(count)
+    test = max(round(0.2 * count), 1)
+    for name, rows in (("test", order[:test]), ("train", order[test:])):
+        np.savetxt(partial / f"{name}_index.txt", np.sort(rows), fmt="%d")
+    try:
+        os.rename(partial, folder)
+    except OSError:
+        # Another run made the same folder meanwhile; the content is the same by construction.
+        shutil.rmtree(partial)
+        if not folder.is_dir():
+            raise
+
+
+def ensure_argos_sim(parent: Path, count: int = 4000, seed: int = 0, offsets: bool = True) -> Path:
+    """The folder of this stand-in under `parent`, made when it is not there yet.
+
+    Raises:
+        ValueError: fewer than ten users.
+    """
+    if count < 10:
+        raise ValueError(f"dataset.count={count}: expected at least 10 users")
+    folder = Path(parent) / f"{STAND_IN}-{count}-{seed}{'' if offsets else '-aligned'}"
+    if not folder.is_dir():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        write_argos_sim(folder, count, seed, Offsets() if offsets else Offsets(0.0, 0.0, 0.0))
+    return folder

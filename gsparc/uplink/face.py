@@ -1,0 +1,44 @@
+"""What all methods that read a fresh uplink share."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.method import Method, Prediction
+from gsparc.ops import Pose
+
+
+class UplinkMethod(Method):
+    """A method that needs the snapshot's own uplink; a position alone is no question to it."""
+
+    site: Site | None = None
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Predict from `batch.uplink` (B, U, L).
+
+        Raises:
+            ValueError: the data hold no uplink, or nothing was fitted.
+        """
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        if batch.uplink is None:
+            raise ValueError(f"{self.name}: reads a fresh uplink, and these data have none; take model=gp")
+        return self.listen(batch.uplink, batch.noise_variance)
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """Always refused: `ValueError`."""
+        raise ValueError(f"{self.name}: answers snapshots with their uplink, not positions")
+
+    @abstractmethod
+    def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""
+
+    def _need_uplink(self, data: Measurements) -> Site:
+        if data.site.kind != "csi" or data.uplink is None or data.site.antennas is None:
+            raise ValueError(
+                f"{self.name}: reads a fresh uplink, and {data.site.name} has none (dataset=argos does)"
+            )
+        return data.site
