@@ -88,7 +88,23 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
         "state": _plain(method.state(), "state"),
         "extra": _plain(dict(extra or {}), "extra"),
     }
+    _write(Path(path), content)
+
+
+def amend(path: str | Path, extra: Mapping[str, Any]) -> None:
+    """Add to (or replace in) the `extra` of a checkpoint; everything else in the file stays as it is.
+
+    Raises:
+        CheckpointError: as `read` and `save` do; the file is then as it was.
+    """
     path = Path(path)
+    read(path)  # refuses what is no good checkpoint
+    content = torch.load(path, map_location="cpu", weights_only=True)
+    content["extra"] = {**content["extra"], **_plain(dict(extra), "extra")}
+    _write(path, content)
+
+
+def _write(path: Path, content: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:

@@ -53,10 +53,10 @@ def interleaved(
         if turn >= settings.least and time.perf_counter() - begin > settings.budget_s:
             break
         for name, call in contenders.items():
-            _synchronise()
+            synchronise()
             start = time.perf_counter()
             call(turn)
-            _synchronise()
+            synchronise()
             times[name].append((time.perf_counter() - start) * 1e3)
     return {name: np.array(values) for name, values in times.items()}
 
@@ -90,7 +90,8 @@ def peak_memory() -> dict[str, float]:
     return facts
 
 
-def _synchronise() -> None:
+def synchronise() -> None:
+    """Wait for the accelerator, if one is used."""
     if torch.cuda.is_available() and torch.cuda.is_initialized():
         torch.cuda.synchronize()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +20,51 @@ from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation import Evaluation, evaluate
+from gsparc.method import Method
 from gsparc.predictor import SAME_PLACE_M
 from gsparc.summary import provenance, results_table, write_samples, write_summary
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Checkpoints of one run with the data they speak of.
+
+    Attributes:
+        methods: one per fold.
+        stored: what their files hold.
+        data: in the models' local coordinates and units.
+        split: the folds the methods were trained on.
+    """
+
+    methods: list[Method]
+    stored: list[checkpoint.Stored]
+    data: Measurements
+    split: Split
+
+
+def open_files(
+    paths: Sequence[str | Path],
+    dataset: Mapping[str, Any] | None = None,
+    split: Mapping[str, Any] | None = None,
+) -> Opened:
+    """Load checkpoints of one run, one per fold, and their data.
+
+    Args:
+        paths: checkpoint files in the order of their folds.
+        dataset, split: settings that replace those stored in the first checkpoint.
+
+    Raises:
+        ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
+    """
+    loaded = [checkpoint.load(path) for path in paths]
+    stored = [one for _, one in loaded]
+    data = aligned(load(_settings("dataset", stored[0], dataset)), stored[0].site)
+    whole = split_for(_settings("split", stored[0], split), data)
+    chosen = _folds(whole, stored)
+    _warn_if_seen(stored[0], data, whole)
+    return Opened([method for method, _ in loaded], stored, data, chosen)
 
 
 def evaluate_files(
@@ -38,26 +79,21 @@ def evaluate_files(
     """Evaluate checkpoints of one run, one per fold.
 
     Args:
-        paths: checkpoint files in the order of their folds.
-        dataset, split: settings that replace those stored in the first checkpoint.
+        paths, dataset, split: see `open_files`.
         eval_on: `train`, `val` or `test`.
         baselines: shown beside it.
         cache: where baselines are kept; None keeps nothing.
 
     Raises:
-        ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
+        ValueError: as `open_files`.
     """
-    loaded = [checkpoint.load(path) for path in paths]
-    stored = [one for _, one in loaded]
-    data = aligned(load(_settings("dataset", stored[0], dataset)), stored[0].site)
-    whole = split_for(_settings("split", stored[0], split), data)
-    chosen = _folds(whole, stored)
-    _warn_if_seen(stored[0], data, whole)
-    seconds = [one.extra.get("train_s") for one in stored]
+    run = open_files(paths, dataset, split)
+    seconds = [one.extra.get("train_s") for one in run.stored]
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
-    methods = [method for method, _ in loaded]
-    found = evaluate(methods, train_s, data, chosen, eval_on=eval_on, baselines=baselines, cache=cache)
-    return found, data, chosen
+    found = evaluate(
+        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache
+    )
+    return found, run.data, run.split
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,6 +13,9 @@ from gsparc import checkpoint
 from gsparc.data.schema import Kind, Site
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
+
+if TYPE_CHECKING:
+    from gsparc.tradeoff.stored import Operating
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 
@@ -27,10 +30,16 @@ class Predictor:
     Args:
         method: fitted or restored.
         site: the dataset's fixed facts.
+        whole: asked for the confidence, where `method` spares it; None asks `method`.
+        point: the operating point `method` answers at, if one was chosen.
     """
 
-    def __init__(self, method: Method, site: Site) -> None:
-        self.method, self.site = method, site
+    def __init__(
+        self, method: Method, site: Site, whole: Method | None = None, point: Operating | None = None
+    ) -> None:
+        self.method, self.site, self.point = method, site, point
+        self._whole = whole or method
+        self._still = self._still_pose()
 
     def __repr__(self) -> str:
         low, high = (self.site.box + self.site.origin).round(2).tolist()
@@ -61,7 +70,7 @@ class Predictor:
         Raises:
             ValueError: the method has no confidence.
         """
-        prediction, single, like = self._predict(tx, rx)
+        prediction, single, like = self._predict(tx, rx, self._whole)
         if prediction.confidence is None:
             raise ValueError(f"{self.method.name} has no confidence")
         return _returned(prediction.confidence, single, like)
@@ -72,10 +81,11 @@ class Predictor:
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
                 f"call .{self.site.kind}(...)"
             )
-        prediction, single, like = self._predict(tx, rx)
-        return _returned(prediction.mean * self.site.target_scale, single, like)
+        prediction, single, like = self._predict(tx, rx, self.method)
+        scale, mean = self.site.target_scale, prediction.mean
+        return _returned(mean if scale == 1 else mean * scale, single, like)
 
-    def _predict(self, tx: Any, rx: Any) -> tuple[Prediction, bool, bool]:
+    def _predict(self, tx: Any, rx: Any, method: Method) -> tuple[Prediction, bool, bool]:
         """The prediction, whether one position was asked for, and whether torch was given."""
         given = rx.position if isinstance(rx, Pose) else rx
         places = {
@@ -87,6 +97,11 @@ class Predictor:
                 f"{moving}= is needed: it is the end that moved when {self.site.name} was measured"
             )
         single = all(place.ndim == 1 for place in places.values())
+        if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
+            asked = _float(np.atleast_2d(places[moving] - self.site.origin))
+            with torch.no_grad():
+                prediction = method.predict(asked, self._still)
+            return prediction, single, isinstance(tx, Tensor)
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
         count = max(len(place) for place in local.values())
         for end, place in local.items():
@@ -100,8 +115,15 @@ class Predictor:
             positions = np.broadcast_to(ends["rx"], (count, 3))
             pose = Pose(_float(positions), _float(np.broadcast_to(rotation, (count, 3, 3))))
         with torch.no_grad():
-            prediction = self.method.predict(_float(np.broadcast_to(ends["tx"], (count, 3))), pose)
+            prediction = method.predict(_float(np.broadcast_to(ends["tx"], (count, 3))), pose)
         return prediction, single, any(isinstance(v, Tensor) for v in (tx, given))
+
+    def _still_pose(self) -> Pose | None:
+        """The pose of a receiver that never moved, made once; None for any other site."""
+        site = self.site
+        if site.static_end != "rx" or site.static_position is None:
+            return None
+        return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
 
     def _static(self, given: np.ndarray | None) -> np.ndarray:
         """Local position (3,) of the static end; a given one must be where it was measured."""
@@ -124,14 +146,26 @@ class Predictor:
         return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
 
 
-def load(path: str | Path) -> Predictor:
+def load(path: str | Path, budget_ms: float | None = None) -> Predictor:
     """The model in a checkpoint, ready to be asked.
+
+    Args:
+        path: the file.
+        budget_ms: what one query may take on this machine, end to end [ms]. The operating points that
+            `python -m gsparc.tradeoff` stored with the model are timed here (a few seconds), the most
+            accurate that fits answers, and torch's number of threads becomes that point's.
 
     Raises:
         gsparc.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
+        ValueError: nothing is as fast as `budget_ms`; the fastest is named.
     """
     method, stored = checkpoint.load(path)
-    return Predictor(method, stored.site)
+    if budget_ms is None:
+        return Predictor(method, stored.site)
+    from gsparc.tradeoff.choose import within
+
+    chosen, point = within(method, stored, budget_ms)
+    return Predictor(chosen, stored.site, whole=method, point=point)
 
 
 def _positions(end: str, value: Any) -> np.ndarray:

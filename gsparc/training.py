@@ -22,7 +22,6 @@ from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation import Evaluation, evaluate
-from gsparc.learned import LearnedField
 from gsparc.method import Method
 from gsparc.pictures import draw_predictions
 from gsparc.registry import build
@@ -80,7 +79,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             method = build(config.model)
             for guess in getattr(method, "guesses", ()) if number == 0 else ():
                 log.info("guess: %s", guess)
-            if isinstance(method, LearnedField):
+            if hasattr(method, "training"):
                 method.training = Training(
                     settings=instantiate(config.trainer),
                     seed=int(config.seed),

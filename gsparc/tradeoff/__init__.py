@@ -1,0 +1,1 @@
+"""What trades accuracy for time when a trained model answers: sweep it, draw it, keep it, choose from it."""

@@ -1,0 +1,104 @@
+"""Points of accuracy against latency, and which of them nobody beats."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.schema import Kind
+
+Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as trained
+
+FIGURES: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
+LOWER_IS_BETTER = ("nmse", "rmse_db")
+WORDS = {
+    "keep": lambda value: f"{value:.0%} kept",
+    "stride": lambda value: f"every {value}th pixel",
+    "cutoff": lambda value: f"cut-off x{value:g}",
+    "projection": lambda value: f"{value} projection",
+    "frozen": lambda value: "frozen plan" if value else "live plan",
+    "confidence": lambda value: "" if value else "no confidence",
+    "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
+    "members": lambda value: "+".join(value),
+}
+
+
+@dataclass(frozen=True)
+class Point:
+    """One way of answering, measured.
+
+    Attributes:
+        label: in words.
+        settings: what is spared.
+        threads: CPU threads.
+        figures: on the evaluated rows, as in `summary.json`.
+        chosen_by: the deciding figure on the rows that choose; no test row among them.
+        ms: (n,) wall times of single queries end to end [ms].
+        size: Gaussians, sources or stored samples that answer.
+        difference: mean paired difference of the figure per sample to the full model, and its standard error.
+    """
+
+    label: str
+    settings: Settings
+    threads: int
+    figures: Mapping[str, float | None]
+    chosen_by: float
+    ms: np.ndarray
+    size: int = 0
+    difference: tuple[float | None, float | None] = field(default=(None, None))
+
+    @property
+    def p50(self) -> float:
+        """Median latency [ms]."""
+        return float(np.median(self.ms))
+
+    @property
+    def p95(self) -> float:
+        """95th percentile of the latency [ms]."""
+        return float(np.quantile(self.ms, 0.95))
+
+
+def worded(settings: Settings) -> str:
+    """`25% kept, every 3th pixel`; `as trained` when nothing is spared."""
+    said = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
+    return ", ".join(word for word in said if word) or "as trained"
+
+
+def score_of(figure: str, value: float) -> float:
+    """A number that is larger when the figure is better, in dB where the figure allows it."""
+    if figure == "nmse":
+        return -10 * math.log10(max(value, 1e-12))
+    return -value if figure in LOWER_IS_BETTER else value
+
+
+def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
+    """Indices of the points that no other beats, fastest first.
+
+    A point is on the front if every point at most as slow is less accurate than it (ties: the first wins).
+
+    Args:
+        latency: (n,) [ms].
+        score: (n,) larger is better.
+    """
+    order = sorted(range(len(latency)), key=lambda i: (latency[i], -score[i]))
+    kept: list[int] = []
+    for i in order:
+        if not kept or score[i] > score[kept[-1]]:
+            kept.append(i)
+    return kept
+
+
+def cost_of_halving(latency: Iterable[float], score: Iterable[float]) -> float | None:
+    """What each halving of the latency costs along a front, its least-squares slope [score per halving].
+
+    Args:
+        latency, score: of the front's points.
+    """
+    x, y = np.log2(np.array(list(latency))), np.array(list(score))
+    if len(x) < 2 or np.ptp(x) == 0:
+        return None
+    return float(np.polyfit(x, y, 1)[0])

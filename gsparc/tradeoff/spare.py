@@ -1,0 +1,87 @@
+"""Which knobs a trained method has, and the method with some of them turned."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from itertools import product
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.method import Method
+from gsparc.tradeoff.points import Settings
+
+FAMILIES = {  # the most special class first
+    "gsparc.committee.Committee": "gsparc.tradeoff.members",
+    "gsparc.array.field.ArrayField": "gsparc.tradeoff.packets",
+    "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.tradeoff.sources",
+    "gsparc.peers.gp.GaussianProcess": "gsparc.tradeoff.components",
+    "gsparc.learned.LearnedField": "gsparc.tradeoff.splatted",
+}
+AS_TRAINED = {"keep": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True}  # else: None
+Measured = dict[str, Tensor]
+
+
+def answering(method: Method) -> Method:
+    """The method that computes the answers: what `model=gsparc` decided on, else itself."""
+    chosen = getattr(method, "_chosen", None)
+    return method if chosen is None else method._models[chosen]  # type: ignore[attr-defined]
+
+
+def family(method: Method) -> ModuleType | None:
+    """The module that knows what a method can spare; None when it can spare nothing."""
+    names = {f"{base.__module__}.{base.__qualname__}" for base in type(answering(method)).__mro__}
+    for name, module in FAMILIES.items():
+        if name in names:
+            return import_module(module)
+    return None
+
+
+def knobs(method: Method) -> tuple[str, ...]:
+    """Names of the settings that mean something to a method."""
+    known = family(method)
+    return () if known is None else known.knobs(answering(method))
+
+
+def measure(method: Method, data: Measurements, rows: np.ndarray) -> Measured:
+    """What must be known of training rows (n,) to turn the knobs; stored with the model."""
+    known = family(method)
+    return {} if known is None else known.measure(answering(method), data, rows)
+
+
+def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
+    """The method with `settings`; itself when there are none."""
+    known = family(method)
+    if not settings or known is None:
+        return method
+    return known.reduced(answering(method), settings, measured)
+
+
+def combinations(
+    method: Method, grid: Mapping[str, Sequence[Any] | None], singles: Mapping[str, Sequence[Any]]
+) -> Iterator[dict[str, Any]]:
+    """Settings: none, each of `singles` alone, and every combination in `grid`, of the knobs the method has.
+
+    A grid without values takes all that the method offers.
+    """
+    known = knobs(method)
+    alone = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
+    offered = getattr(family(method), "offered", lambda method: {})(answering(method))
+    axes = {
+        knob: offered.get(knob, ()) if values is None else values
+        for knob, values in grid.items()
+        if knob in known
+    }
+    together = [
+        {k: v for k, v in zip(axes, chosen, strict=True) if AS_TRAINED.get(k) != v}
+        for chosen in product(*axes.values())
+    ]
+    seen: list[dict[str, Any]] = []
+    for settings in ({}, *alone, *together):
+        if settings not in seen:
+            seen.append(settings)
+            yield settings
