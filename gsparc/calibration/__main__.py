@@ -1,0 +1,142 @@
+"""`python -m gsparc.calibration ckpt=FILE`: compare confidences, promise an error, check the promise."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.table import Table
+
+from gsparc import cli
+from gsparc.calibration.curves import bounded, perfect_area, rank_correlation, risk_coverage
+from gsparc.calibration.evidence import Evidence, gather, joined
+from gsparc.calibration.pictures import draw
+from gsparc.calibration.threshold import Promise
+from gsparc.calibration.trial import Trial, trials
+from gsparc.clock import machine_facts
+from gsparc.evaluate import open_files
+from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.scoring import rows_of
+from gsparc.summary import provenance, write_summary
+
+log = logging.getLogger(__name__)
+
+
+def collect(
+    paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
+) -> tuple[Evidence, dict[str, Any]]:
+    """Evidence of all folds' test rows, and the facts that name them."""
+    run = open_files(paths, dataset, split)
+    pairs = zip(run.methods, run.split.folds, strict=True)
+    parts = [gather(method, run.data, fold, rows_of(fold, "test")) for method, fold in pairs]
+    facts = {**dataset_facts(run.data), **split_facts(run.split), "model/name": run.methods[0].name}
+    return joined(parts), facts
+
+
+def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[str, Any]:
+    """Flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
+    loss = bounded(evidence.error)
+    facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": perfect_area(loss)}
+    for kind, score in evidence.scores.items():
+        curve = risk_coverage(score, loss)
+        facts |= {
+            f"confidence/{kind}/area": curve.area,
+            f"confidence/{kind}/risk_at_70": curve.at(0.7),
+            f"confidence/{kind}/rank_correlation": rank_correlation(score, loss),
+        }
+    bar = facts["confidence/distance/area"]
+    for kind in evidence.scores:
+        facts[f"confidence/{kind}/area_below_distance"] = 1 - facts[f"confidence/{kind}/area"] / bar
+    facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
+    for trial in found:
+        facts |= {
+            f"trial/{trial.how}/kind": trial.kind,
+            f"trial/{trial.how}/broken": trial.broken,
+            f"trial/{trial.how}/realised": trial.mean_realised,
+            f"trial/{trial.how}/coverage": float(trial.coverage.mean()),
+            f"trial/{trial.how}/draws": len(trial.realised),
+        }
+    return facts
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Gather, resample, write; returns the facts of `summary.json`."""
+    if config.threads is not None:
+        torch.set_num_threads(int(config.threads))
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
+    evidence, known = collect(
+        paths,
+        OmegaConf.to_container(config.dataset, resolve=True),  # type: ignore[arg-type]
+        OmegaConf.to_container(config.split, resolve=True),  # type: ignore[arg-type]
+    )
+    if config.confidence != "auto" and config.confidence not in evidence.scores:
+        raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
+    promise = Promise(float(config.limit_db), float(config.alpha), float(config.delta))
+    found = [
+        trials(
+            evidence,
+            promise,
+            how,
+            int(config.draws),
+            config.confidence,
+            float(config.apart_m),
+            int(config.seed),
+        )
+        for how in ("random", "spatial")
+    ]
+    facts = {
+        **known,
+        **figures(evidence, found, promise),
+        **machine_facts(),
+        **provenance(),
+        "seed": config.seed,
+    }
+    write_summary(run_dir / "summary.json", facts)
+    draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
+    console = Console()
+    for table in tables(facts, evidence, found):
+        console.print(table)
+    console.print(f"written to {run_dir}", highlight=False)
+    return facts
+
+
+def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> list[Table]:
+    """Confidences side by side; promises beside what came of them."""
+    first = Table(title=f"{facts['dataset/name']}: {len(evidence)} positions of {facts['model/name']}")
+    for column in ("confidence", "area under risk-coverage", "below distance", "risk at 70 %", "rank"):
+        first.add_column(column, justify="left" if column == "confidence" else "right")
+    for kind in evidence.scores:
+        own = {k.rpartition("/")[2]: v for k, v in facts.items() if k.startswith(f"confidence/{kind}/")}
+        rank = "-" if own["rank_correlation"] is None else f"{own['rank_correlation']:.2f}"
+        first.add_row(
+            kind, f"{own['area']:.4g}", f"{own['area_below_distance']:.0%}", f"{own['risk_at_70']:.4g}", rank
+        )
+    second = Table(title=f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB")
+    for column in ("split", "confidence", "accepted", "bad among them", "broken", "promised"):
+        second.add_column(column, justify="left" if column in ("split", "confidence") else "right")
+    for trial in found:
+        bad = "-" if trial.mean_realised is None else f"{trial.mean_realised:.1%}"
+        second.add_row(
+            trial.how,
+            trial.kind,
+            f"{trial.coverage.mean():.0%}",
+            bad,
+            f"{trial.broken:.1%}",
+            f"{trial.delta:.0%}",
+        )
+    return [first, second]
+
+
+def main() -> None:
+    """Entry point."""
+    cli.run(task, "calibration")
+
+
+if __name__ == "__main__":
+    main()

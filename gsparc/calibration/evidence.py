@@ -1,0 +1,86 @@
+"""How wrong a method was where, and what three confidences said about it beforehand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.method import Method
+from gsparc.peers.gp import GaussianProcess
+
+KINDS = ("learned", "distance", "gp_variance")
+CHUNK = 64
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Positions a method did not learn from.
+
+    Attributes:
+        row: (n,) rows of the dataset.
+        position: (n, 3) [m].
+        error: (n,) |e|^2 / |h|^2; for powers, of the linear power.
+        scores: by kind, (n,) each, larger is surer.
+    """
+
+    row: np.ndarray
+    position: np.ndarray
+    error: np.ndarray
+    scores: dict[str, np.ndarray]
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def at(self, index: np.ndarray) -> Evidence:
+        """Some of the positions."""
+        scores = {kind: score[index] for kind, score in self.scores.items()}
+        return Evidence(self.row[index], self.position[index], self.error[index], scores)
+
+
+def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+    """Ask `method` about `rows`, and the rivals too; a method without a confidence has no `learned`."""
+    errors, learned = [], []
+    for start in range(0, len(rows), CHUNK):
+        batch = data.batch(rows[start : start + CHUNK])
+        found = method.answer(batch)
+        miss = (found.mean - batch.target).abs().square().flatten(1).sum(1)
+        power = batch.target.abs().square().flatten(1).sum(1)
+        errors.append((miss / power.clamp_min(1e-30)).double().numpy())
+        sure = found.confidence
+        learned.append(np.full(len(batch), np.nan) if sure is None else sure.double().numpy())
+    scores = {"learned": np.concatenate(learned), **rivals(data, fold, rows)}
+    if np.isnan(scores["learned"]).any():
+        del scores["learned"]
+    return Evidence(rows, data.moving[rows], np.concatenate(errors), scores)
+
+
+def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
+    """The two cheap confidences: minus the distance to the nearest training point, minus a GP's variance."""
+    known = np.concatenate([fold.train, fold.val])
+    distance = cKDTree(data.moving[known]).query(data.moving[rows])[0]
+    process = GaussianProcess(components=64)
+    process.fit(data, fold, Path())
+    spread = []
+    for start in range(0, len(rows), CHUNK):
+        batch = data.batch(rows[start : start + CHUNK])
+        variance = process.predict(batch.tx, batch.rx).variance
+        assert variance is not None
+        spread.append(variance.double().numpy())
+    return {"distance": -distance, "gp_variance": -np.concatenate(spread)}
+
+
+def joined(parts: Sequence[Evidence]) -> Evidence:
+    """Folds together; scores that not every part has are dropped."""
+    kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
+    return Evidence(
+        np.concatenate([part.row for part in parts]),
+        np.concatenate([part.position for part in parts]),
+        np.concatenate([part.error for part in parts]),
+        {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds},
+    )

@@ -1,0 +1,102 @@
+"""A threshold with a promise: at most a share alpha of accepted positions is bad, with confidence 1 - delta.
+
+Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-sequence testing: thresholds are
+tried from strict to lax, each is a binomial test on the calibration positions it accepts, and the first that
+fails ends the search. Given who is accepted the bad ones are binomial, so the promise is about the error
+*among accepted positions*; plain split conformal promises a share of all positions instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import beta, binom
+
+LEVELS = 50
+
+
+@dataclass(frozen=True)
+class Promise:
+    """What is promised.
+
+    Attributes:
+        limit_db: a prediction is bad when |e|^2 / |h|^2 exceeds this [dB].
+        alpha: largest share of bad ones among the accepted.
+        delta: probability that a calibration set misleads.
+    """
+
+    limit_db: float = -10.0
+    alpha: float = 0.1
+    delta: float = 0.1
+
+    def __post_init__(self) -> None:
+        if not (0 < self.alpha < 1 and 0 < self.delta < 1):
+            raise ValueError(f"promise: alpha={self.alpha} and delta={self.delta} must lie between 0 and 1")
+
+    def bad(self, relative_error: np.ndarray) -> np.ndarray:
+        """Whether predictions (n,) are bad."""
+        return relative_error > 10 ** (self.limit_db / 10)
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A threshold and what it was chosen on.
+
+    Attributes:
+        value: accept scores of at least this; infinite when nothing can be promised.
+        accepted: calibration positions it accepts.
+        bad: how many of them are bad.
+    """
+
+    value: float
+    accepted: int
+    bad: int
+
+    def bound(self, delta: float) -> float:
+        """Upper confidence bound on the share of bad ones among the accepted (Clopper and Pearson 1934)."""
+        if self.accepted == 0 or self.bad == self.accepted:
+            return 1.0
+        return float(beta.ppf(1 - delta, self.bad + 1, self.accepted - self.bad))
+
+
+def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
+    """Thresholds to try, strict to lax: quantiles of scores that are not the calibration's."""
+    return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
+
+
+def choose(score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Promise) -> Threshold:
+    """The laxest threshold that the calibration set (n,) supports.
+
+    A level too strict to be tested (no outcome could reject: fewer than log delta / log(1 - alpha) accepted)
+    is passed over; nothing is tested there, so nothing is spent.
+    """
+    least = int(np.ceil(np.log(promise.delta) / np.log1p(-promise.alpha)))
+    found = Threshold(float("inf"), 0, 0)
+    for level in levels:
+        taken = score >= level
+        accepted, wrong = int(taken.sum()), int(bad[taken].sum())
+        if accepted < least:
+            continue
+        if binom.cdf(wrong, accepted, promise.alpha) > promise.delta:
+            break
+        found = Threshold(float(level), accepted, wrong)
+    return found
+
+
+def spread_out(
+    positions: np.ndarray, rows: np.ndarray, apart_m: float, rng: np.random.Generator
+) -> np.ndarray:
+    """Some of `rows`, no two within `apart_m` [m]: neighbours err together and count as one."""
+    if apart_m <= 0:
+        return rows
+    kept: list[int] = []
+    order = rng.permutation(rows)
+    near = cKDTree(positions[order]).query_ball_point(positions[order], apart_m)
+    gone = np.zeros(len(order), bool)
+    for i, others in enumerate(near):
+        if not gone[i]:
+            kept.append(int(order[i]))
+            gone[others] = True
+    return np.sort(np.array(kept, dtype=np.int64))

@@ -1,0 +1,114 @@
+"""Does the promise hold: thresholds from many calibration sets, each tried on positions it never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from gsparc.calibration.curves import bounded, risk_coverage
+from gsparc.calibration.evidence import Evidence
+from gsparc.calibration.threshold import Promise, choose, levels_of, spread_out
+
+How = Literal["random", "spatial"]
+SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
+CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What many calibration sets led to.
+
+    Attributes:
+        kind: confidence used.
+        how: how positions were divided.
+        realised: (draws,) share of bad ones among accepted test positions; NaN where none was accepted.
+        coverage: (draws,) share of test positions accepted.
+        alpha, delta: as promised.
+    """
+
+    kind: str
+    how: How
+    realised: np.ndarray
+    coverage: np.ndarray
+    alpha: float
+    delta: float
+
+    @property
+    def broken(self) -> float:
+        """Share of draws in which more than alpha were bad; the promise is at most delta."""
+        return float(np.mean(np.nan_to_num(self.realised, nan=0.0) > self.alpha))
+
+    @property
+    def mean_realised(self) -> float | None:
+        """Mean share of bad ones among accepted test positions."""
+        return None if np.isnan(self.realised).all() else float(np.nanmean(self.realised))
+
+
+def divided(
+    evidence: Evidence, how: How, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Disjoint rows of the evidence: to choose on, to calibrate on, to test on.
+
+    `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
+    across a cell's border.
+    """
+    if how == "random":
+        unit = np.arange(len(evidence))
+    else:
+        flat = evidence.position[:, :2]
+        low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
+        cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
+        unit = np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
+    order = rng.permutation(unit.max() + 1)
+    first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
+    parts = order[:first], order[first:second], order[second:]
+    choose_on, calibrate, test = (np.flatnonzero(np.isin(unit, part)) for part in parts)
+    return choose_on, calibrate, test
+
+
+def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
+    """The confidence of the smallest area under risk-coverage on `rows`."""
+    loss = bounded(evidence.error[rows])
+    return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).area)
+
+
+def trials(
+    evidence: Evidence,
+    promise: Promise,
+    how: How,
+    draws: int,
+    kind: str = "auto",
+    apart_m: float = 0.0,
+    seed: int = 0,
+) -> Trial:
+    """Resample `draws` calibration sets.
+
+    Args:
+        evidence: positions the method did not learn from.
+        promise: what every threshold promises.
+        how: `random` or `spatial` division.
+        draws: calibration sets.
+        kind: a confidence, or `auto`: the best on the positions set aside for choosing.
+        apart_m: calibration positions nearer to each other than this are thinned [m].
+        seed: of the draws.
+    """
+    realised, coverage, kinds = [], [], []
+    for rng in _generators(seed, draws):
+        choose_on, calibrate, test = divided(evidence, how, rng)
+        used = best_kind(evidence, choose_on) if kind == "auto" else kind
+        score, bad = evidence.scores[used], promise.bad(evidence.error)
+        calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
+        found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise)
+        taken = test[score[test] >= found.value]
+        kinds.append(used)
+        realised.append(bad[taken].mean() if len(taken) else np.nan)
+        coverage.append(len(taken) / max(len(test), 1))
+    most = max(set(kinds), key=kinds.count)
+    return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha, promise.delta)
+
+
+def _generators(seed: int, draws: int) -> Iterator[np.random.Generator]:
+    return (np.random.default_rng([seed, draw]) for draw in range(draws))
