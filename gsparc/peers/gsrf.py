@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
-from gsparc.model import ChannelResponse
 from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
 from gsparc.peers.gaussians import Screen, gaussians_of
 from gsparc.peers.network import Network, Scene
@@ -76,8 +75,11 @@ class ComplexGaussians(Network):
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(degree, order), 2))
         with torch.no_grad():
             self.coefficients[:, 0, 0] += 0.3
-        channels = scene.site.kind == "csi"
-        self.response = ChannelResponse(count, *scene.shape) if channels else None
+        self.response: nn.Parameter | None = None
+        if scene.site.kind == "csi":  # of each Gaussian at every antenna and tone
+            response = torch.zeros(count, *scene.shape, 2)
+            response[..., 0] = 1
+            self.response = nn.Parameter(response)
         self._frozen: FrozenPlan | None = None
 
     def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
@@ -99,7 +101,8 @@ class ComplexGaussians(Network):
         plan = make_plan(*geometry, rx, self.screen.grid, **self.screen.optics)
         if self.response is not None:
             seen = mean_weights(plan, *geometry).share
-            return self.response(seen * torch.view_as_complex(sent.contiguous()))
+            arriving = seen * torch.view_as_complex(sent.contiguous())
+            return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
         return _magnitude(composite(plan, *geometry, sent).image)
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:

@@ -23,17 +23,14 @@ class Scene:
         shape: of one target: (H, W), (antennas, subcarriers) or (1,).
         receiver: pose of the static receiver; None when it moves.
         transmitter: (3,) [m], the static transmitter; None when it moves.
+        box: (2, 3) float32 [m], lower and upper corner of the moving end's training positions.
     """
 
     site: Site
     shape: tuple[int, ...]
     receiver: Pose | None
     transmitter: Tensor | None
-
-    @property
-    def box(self) -> Tensor:
-        """(2, 3) float32 [m], lower and upper corner of where the moving end was."""
-        return torch.as_tensor(self.site.box).float()
+    box: Tensor
 
     @property
     def reach(self) -> float:

@@ -7,8 +7,8 @@ Kept: training rays along measured directions of arrival, a network of place and
 the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's phase over the marched
 distance; at a query the directions are *searched* (rays of training receivers are intersected, the nearest
 receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
-a query has (the neighbours' mean is taken), and hierarchical resampling, in whose place half of the samples
-lie around the distance that the intersection found.
+a query has (the neighbours' mean is taken); a density per metre (ours is an opacity per sample, since half of
+the samples lie within 10 cm of where the intersection found something, in place of hierarchical resampling).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from gsparc.data.schema import Batch, Kind, Measurements
 from gsparc.encoding import EncodingSettings, PositionEncoding
@@ -30,8 +30,6 @@ from gsparc.peers.trained import TrainedPeer
 
 NEAR = 0.1  # [m] from the receiver, where rays begin
 AROUND = 0.1  # [m], half the interval of the fine samples
-DENSITY = 3.0  # [1/m] per unit of the network's output
-LAST = 1e-3  # [m], the interval behind the last sample
 
 
 class NeWRF(TrainedPeer):
@@ -156,10 +154,10 @@ class DirectedRays(Network):
             -1,
         )
         out = self.network(inputs)
-        density = DENSITY * nn.functional.softplus(out[..., 2])
-        thick = density * nn.functional.pad(depth.diff(dim=-1), (0, 1), value=LAST)
-        opaque = -torch.expm1(-thick)
-        weight = (-(thick.cumsum(-1) - thick)).exp() * opaque
+        # Before training the samples of a ray let 1/e through: what stands at its end can be seen.
+        opaque = torch.sigmoid(out[..., 2] - math.log(self.samples))
+        clear = torch.log1p(-opaque)
+        weight = (clear.cumsum(-1) - clear).exp() * opaque
         gain = torch.view_as_complex(out[..., :2].contiguous())
         wave = torch.polar(weight / depth, -self.wavenumber * depth)
         return ((gain * wave).sum(-1) * likely).sum(-1)

@@ -89,7 +89,7 @@ class TrainedPeer(Method):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         L.seed_everything(self.seed, verbose=False)
-        self.site, self.scene = data.site, _scene(data, int(rows[0]))
+        self.site, self.scene = data.site, _scene(data, rows)
         self.found = self.look(data, rows)
         self.network = self.build(self.scene, self.found)
         self._train(data, rows, watch)
@@ -157,6 +157,7 @@ class TrainedPeer(Method):
             "shape": list(scene.shape),
             "receiver": None if receiver is None else [receiver.position, receiver.rotation],
             "transmitter": scene.transmitter,
+            "box": scene.box,
             "found": self.found,
             "network": network.state_dict(),
             "steps": self.steps,
@@ -166,7 +167,7 @@ class TrainedPeer(Method):
         """See `Method.restore`."""
         receiver = None if state["receiver"] is None else Pose(*state["receiver"])
         self.site = site
-        self.scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"])
+        self.scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"], state["box"])
         self.found, self.steps = dict(state["found"]), int(state["steps"])
         self.network = self.build(self.scene, self.found)
         self.network.load_state_dict(state["network"])
@@ -189,9 +190,9 @@ def rate_factor(progress: float) -> float:
     return rise * (FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
 
 
-def _scene(data: Measurements, row: int) -> Scene:
-    one = data.batch(np.array([row]))
-    shape = tuple(data.target.shape[1:])
-    if data.site.static_end == "rx":
-        return Scene(data.site, shape, one.rx, None)
-    return Scene(data.site, shape, None, one.tx[0])
+def _scene(data: Measurements, rows: np.ndarray) -> Scene:
+    one, moving = data.batch(rows[:1]), data.moving[rows]
+    box = torch.from_numpy(np.stack([moving.min(0), moving.max(0)])).float()
+    static = data.site.static_end == "rx"
+    ends = (one.rx, None) if static else (None, one.tx[0])
+    return Scene(data.site, tuple(data.target.shape[1:]), *ends, box)

@@ -1,0 +1,52 @@
+"""The command: fills what is missing, finds what is there, goes on after a failure."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from campaigns import spectra
+
+ROOT = Path(__file__).parents[2]
+
+
+def compare(tmp_path, *more: str) -> subprocess.CompletedProcess:
+    command = [
+        sys.executable, "-m", "gsparc.compare", f"+datasets.own.file={tmp_path / 'own.npz'}",
+        "splits=[random]", "budgets=[{seconds: 0.3, seeds: [0]}]", f"cells={tmp_path / 'cells'}",
+        f"hydra.run.dir={tmp_path / 'run'}", *more,
+    ]  # fmt: skip
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.slow
+def test_cells_are_filled_once_and_reported_again(tmp_path):
+    spectra(tmp_path / "own.npz")
+    only = "only=[own/random/mean/*,own/random/nearest/*,own/random/swiftwrf/*]"
+    first = compare(tmp_path, only)
+    assert first.returncode == 0, first.stderr
+    assert "3 cells, 0 of them are there" in first.stdout and "min left" in first.stdout
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["own/random/0.3/first"] in ("nearest", "mean", "swiftwrf")
+    assert summary["own/random/0.3/swiftwrf/query_ms_p50"] > 0
+    for file in ("compare.csv", "compare.md", "compare.png"):
+        assert (tmp_path / "run" / file).exists()
+    again = compare(tmp_path, only, "latency=false")
+    assert "3 cells, 3 of them are there" in again.stdout
+    assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+    # A cell whose result is not whole does not count.
+    (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")
+    cell.write_text("{")
+    assert "3 cells, 2 of them are there" in compare(tmp_path, only, "latency=false").stdout
+
+
+@pytest.mark.slow
+def test_mistakes_are_one_line(tmp_path):
+    spectra(tmp_path / "own.npz")
+    done = compare(tmp_path, "only=[own/random/meen/*]")
+    assert done.returncode == 1 and "matches no cell" in done.stderr and "Traceback" not in done.stderr
+    done = compare(tmp_path, "train=false", "only=[own/random/mean/*]")
+    assert done.returncode == 1 and "no cell is filled" in done.stderr

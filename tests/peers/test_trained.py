@@ -1,0 +1,102 @@
+"""What every peer trained by gradient keeps to: its budget, its kinds, its checkpoint, the test rows."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from scenes import lobes, room
+
+from gsparc import checkpoint
+from gsparc.peers.trained import rate_factor
+from gsparc.registry import method_class
+
+SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
+CHANNELS = ("gsrf", "ngrf", "newrf")
+SMALL = {"gsrf": {"count": 40}, "wrfgs": {"count": 40}, "swiftwrf": {"count": 40}, "ngrf": {"count": 20},
+         "newrf": {"width": 16, "samples": 8}, "nerf2": {"width": 16, "samples": 8, "rays": 64}}  # fmt: skip
+
+
+def brief(name: str, **more):
+    return method_class(name)(**{**SMALL[name], "max_steps": 3, **more})
+
+
+def scene(kind: str, tmp_path, moving: str = "tx"):
+    return lobes(tmp_path, moving) if kind == "spectrum" else room(40, directions=True)[:2]
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "moving"),
+    [("spectrum", n, end) for n in SPECTRA for end in ("tx", "rx")] + [("csi", n, "rx") for n in CHANNELS],
+)
+def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
+    torch.set_num_threads(1)
+    data, fold = scene(kind, tmp_path, moving)
+    method = brief(name)
+    assert method.fit(data, fold, tmp_path).seconds > 0
+    batch = data.batch(fold.test)
+    said = method.predict(batch.tx, batch.rx).mean
+    assert said.shape == batch.target.shape and said.dtype == batch.target.dtype
+    assert torch.isfinite(torch.view_as_real(said) if said.is_complex() else said).all()
+    cls = method_class(name)
+    config = {"model": {"_target_": f"{cls.__module__}.{cls.__name__}", **SMALL[name]}}
+    checkpoint.save(tmp_path / "model.ckpt", method, yaml.safe_dump(config))
+    again = checkpoint.load(tmp_path / "model.ckpt")[0]
+    # Another object may choose another of the equally good summation orders.
+    torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, said, rtol=1e-5, atol=1e-6)
+    twin = brief(name)
+    twin.fit(data, fold, tmp_path)
+    assert torch.equal(twin.predict(batch.tx, batch.rx).mean, said), "the same steps give the same model"
+
+
+@pytest.mark.parametrize("name", ["gsrf", "newrf"])
+def test_no_test_row_is_looked_at(tmp_path, name):
+    data, fold, _ = room(40, directions=True)
+    batch = data.batch(fold.test)
+    answers = []
+    for rubbish in (False, True):
+        if rubbish:
+            data.target[fold.test] = np.nan
+            for i in fold.test:
+                data.directions[i] = np.full_like(data.directions[i], np.nan)
+        method = brief(name)
+        method.fit(data, fold, tmp_path)
+        answers.append(method.predict(batch.tx, batch.rx).mean)
+    assert torch.equal(*answers)
+
+
+def test_the_budget_ends_training_and_the_schedule_reaches_its_end(tmp_path, monkeypatch):
+    torch.set_num_threads(1)
+    data, fold = lobes(tmp_path)
+    seen = []
+    monkeypatch.setattr("gsparc.peers.trained.rate_factor", lambda p: seen.append(p) or rate_factor(p))
+    method = brief("swiftwrf", max_steps=None, budget_s=0.5)
+    before = time.process_time()
+    method.fit(data, fold, tmp_path)
+    assert 0.4 < time.process_time() - before < 1.5
+    assert len(set(seen)) == method.steps > 3 and 0.8 < seen[-1] < 1 and sorted(seen) == seen
+    assert rate_factor(0.0) < 0.1 < rate_factor(0.05) and rate_factor(1.0) < 0.05
+
+
+def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):
+    fold = folds(30).folds[0]
+    for name, kind in (("ngrf", "spectrum"), ("swiftwrf", "csi"), ("gsrf", "rssi"), ("kriging", "csi")):
+        method = method_class(name)() if name == "kriging" else brief(name)
+        with pytest.raises(ValueError, match=f"{name}: predicts .*holds {kind}"):
+            method.fit(campaign(kind, 30), fold, tmp_path)
+    with pytest.raises(ValueError, match="newrf: needs directions of arrival"):
+        brief("newrf").fit(campaign("csi", 30, "tx"), fold, tmp_path)
+    with pytest.raises(ValueError, match="gsrf: not fitted"):
+        brief("gsrf").predict(torch.zeros(1, 3), None)
+    with pytest.raises(ValueError, match="budget_s > 0"):
+        brief("gsrf", budget_s=0)
+
+
+def test_a_loss_that_is_not_finite_stops_training(tmp_path):
+    data, fold, _ = room(40)
+    data.target[fold.train] = np.nan
+    with pytest.raises(RuntimeError, match="NaN or infinite at step 0"):
+        brief("ngrf").fit(data, fold, tmp_path)
