@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops.geometry import Pose
+from gsparc.ops.settings import FARTHEST, WIDEST
 
 
 def gaussians(
@@ -35,11 +36,11 @@ def gaussians(
 
 
 def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor) -> None:
-    """Refuse NaN, infinities, negative scales and opacities outside [0, 1], naming the first Gaussian."""
+    """Refuse what no footprint can be made of (ValueError), naming the first Gaussian."""
     sound = {
-        "means": torch.isfinite(means).all(-1),
+        "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
-        "scales": (torch.isfinite(scales) & (scales >= 0)).all(-1),
+        "scales": ((scales >= 0) & (scales <= WIDEST)).all(-1),
         "opacities": (strongest >= 0) & (strongest <= 1),
     }
     for name, ok in sound.items():
@@ -49,7 +50,11 @@ def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor) -> N
 
 def raise_for(name: str, index: int) -> None:
     """The error for Gaussian `index` whose `name` no footprint can be made of (ValueError)."""
-    wanted = {"scales": "finite and >= 0", "opacities": "in [0, 1]"}.get(name, "finite")
+    wanted = {
+        "means": f"finite and within {FARTHEST:.0e} m",
+        "scales": f"finite and from 0 to {WIDEST:.0e} m",
+        "opacities": "in [0, 1]",
+    }.get(name, "finite")
     raise ValueError(f"Gaussian {index} has {name} that are not {wanted}; find where they come from")
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops.geometry import Pose, SphereGrid
-from gsparc.ops.settings import ALPHA_MAX, HORIZON_COSINE, Optics
+from gsparc.ops.settings import ALPHA_MAX, HORIZON_COSINE, SHORTEST_QUATERNION, Optics
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,12 @@ class Projected:
 
 def rotation_matrices(quats: Tensor) -> Tensor:
     """Rotations (N, 3, 3) of quaternions (N, 4) w x y z of any length; the zero quaternion does not turn."""
-    square = (quats * quats).sum(-1, keepdim=True)
-    usable = square > torch.finfo(quats.dtype).tiny
+    longest = quats.detach().abs().amax(-1, keepdim=True)
+    usable = longest > SHORTEST_QUATERNION
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
-    w, x, y, z = torch.where(usable, quats / torch.where(usable, square, 1.0).sqrt(), identity).unbind(-1)
+    # By the longest component first: squares of 1e-20 and 1e20 are no float32 numbers.
+    sized = torch.where(usable, quats / torch.where(usable, longest, 1.0), identity)
+    w, x, y, z = (sized / (sized * sized).sum(-1, keepdim=True).sqrt()).unbind(-1)
     rows = [
         *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
@@ -85,6 +87,9 @@ def project(
 
     if optics.projection == "tangent":
         to_column = torch.full_like(distance, 1 / grid.elevation_step)
+        # The footprint is the same in any frame of the plane: this one is carried along without turning, so
+        # that float32 loses nothing to the turn of east and north, which is infinite at the pole.
+        east, north = (e.detach() - n * (n * e.detach()).sum(-1, keepdim=True) for e in (east, north))
     else:
         to_column = 1 / ((horizontal**2 + grid.elevation_step**2).sqrt() * grid.azimuth_step)
     to_row = 1 / grid.elevation_step
@@ -161,8 +166,10 @@ def footprints(seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor)
     """The Gaussians' shapes G (N, H W), 1 at their centres, 0 where a pixel does not face them."""
     p, q, facing = _offsets(seen, grid, optics, shift)
     _, k12, k22 = (entry[:, None] for entry in seen.covariance.unbind(-1))
-    # The quadratic form completed to squares: no cancellation along a needle.
-    form = k22 / seen.determinant[:, None] * (p - k12 / k22 * q) ** 2 + q**2 / k22
+    # The quadratic form completed to squares: no cancellation along a needle. Roots first: the slope of
+    # k22 / det overflows in float32 long before theirs.
+    root = k22.sqrt()
+    form = (root / seen.determinant[:, None].sqrt() * (p - k12 / k22 * q)) ** 2 + (q / root) ** 2
     return torch.where(facing & seen.present[:, None], torch.exp(-0.5 * form), 0.0)
 
 
@@ -179,8 +186,9 @@ def layers(
 ) -> tuple[Tensor, Tensor]:
     """What each layer emits and hides at each pixel, alpha and gamma (N, H W), before occlusion."""
     emits, hides = (seen.gain * opacities)[:, None] * shapes, (seen.gain * extinctions)[:, None] * shapes
-    strength = shapes if optics.cutoff.relative else torch.maximum(emits, hides)
-    counts = (strength >= optics.cutoff.alpha).detach()
+    strongest = torch.maximum(emits, hides)
+    strength = shapes if optics.cutoff.relative else strongest
+    counts = ((strength >= optics.cutoff.alpha) & (strongest > 0)).detach()
     return (
         torch.where(counts, emits, 0.0).clamp(max=ALPHA_MAX),
         torch.where(counts, hides, 0.0).clamp(max=ALPHA_MAX),

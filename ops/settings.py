@@ -7,6 +7,15 @@ from typing import Literal
 
 Projection = Literal["equirect", "tangent"]
 
+FARTHEST = 1e6
+"""Largest coordinate of a Gaussian [m]; ops see local coordinates, float32 no squares of 1e19."""
+
+WIDEST = 1e5
+"""Largest standard deviation of a Gaussian [m]; at the near cut its determinant in px still is a float32."""
+
+SHORTEST_QUATERNION = 1e-18
+"""A quaternion whose longest component is not longer than this does not turn, in either precision."""
+
 ALPHA_MAX = 0.99
 """Largest opacity of one layer at one pixel; a clamped layer passes no gradient to geometry or opacity."""
 

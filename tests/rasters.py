@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 
 import torch
+from ledger import LEDGER
 from torch import Tensor
 
 from gsparc.ops import Pose, SphereGrid, composite, make_plan
@@ -89,6 +91,14 @@ def origin() -> Pose:
     return Pose.identity(torch.zeros(3, dtype=torch.float64))
 
 
+class Outcome(dict[str, Tensor]):
+    """Outputs and gradients by name, and who made them in which precision."""
+
+    def __init__(self, found: dict[str, Tensor], engine: str, precision: str) -> None:
+        super().__init__(found)
+        self.engine, self.precision = engine, precision
+
+
 def render(
     scene: Scene,
     pose: Pose,
@@ -97,9 +107,11 @@ def render(
     *,
     upstream: Tensor | None = None,
     behind: bool = True,
+    pixels: Tensor | None = None,
     **optics,
-) -> dict[str, Tensor]:
-    """Image, transmittance, and the gradients of a fixed random linear function of both."""
+) -> Outcome:
+    """Image, transmittance, and the gradients of a fixed random linear function of both over `pixels`."""
+    started = time.perf_counter()
     names = ["means", "quats", "scales", "opacities", "features"]
     names += [] if scene.extinctions is None else ["extinctions"]
     leaves = {name: getattr(scene, name).clone().requires_grad_() for name in names}
@@ -110,15 +122,20 @@ def render(
     draw = torch.Generator().manual_seed(5)
     if upstream is None:
         upstream = torch.randn(raster.image.shape, generator=draw, dtype=torch.float64)
+    upstream = upstream if pixels is None else upstream * pixels
     loss = (raster.image * upstream.to(raster.image)).sum()
     if behind:
         weight = torch.randn(raster.transmittance.shape, generator=draw, dtype=torch.float64)
+        weight = weight if pixels is None else weight * pixels
         loss = loss + (raster.transmittance * weight.to(raster.image)).sum()
     loss.backward()
     out = {f"d_{name}": leaf.grad for name, leaf in leaves.items()}
     out |= {"image": raster.image.detach(), "transmittance": raster.transmittance.detach()}
     out |= {"radii": raster.radii, "visible": raster.visible, "d_means2d": raster.means2d.grad}
-    return out
+    engine = backend if backend == "reference" else LEDGER.engine or backend
+    precision = str(scene.means.dtype).removeprefix("torch.")
+    LEDGER.rendered(engine, precision, time.perf_counter() - started)
+    return Outcome(out, engine, precision)
 
 
 def worst(got: dict[str, Tensor], want: dict[str, Tensor]) -> dict[str, float]:
@@ -133,5 +150,33 @@ def worst(got: dict[str, Tensor], want: dict[str, Tensor]) -> dict[str, float]:
 
 
 def assert_close(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: float) -> None:
-    bad = {name: gap for name, gap in worst(got, want).items() if not gap < tolerance}
+    gaps = worst(got, want)
+    if isinstance(got, Outcome):
+        for name, gap in gaps.items():
+            part = "backward" if name.startswith("d_") else "forward"
+            LEDGER.compared(got.engine, got.precision, part, gap, tolerance)
+    bad = {name: gap for name, gap in gaps.items() if not gap < tolerance}
     assert not bad, f"beyond {tolerance}: {bad}"
+
+
+TOLERANCES = {torch.float64: 1e-9, torch.float32: 1e-4}
+
+
+def assert_equals_float64(
+    scene: Scene,
+    pose: Pose,
+    grid: SphereGrid,
+    backend: str,
+    tolerances: dict[torch.dtype, float] = TOLERANCES,
+    **optics,
+) -> Outcome:
+    """The backend in both precisions against the reference in float64, which is returned; all finite."""
+    scene = scene.to(torch.float32).to(torch.float64)
+    want = render(scene, pose, grid, "reference", **optics)
+    for dtype, tolerance in tolerances.items():
+        if backend == "reference" and dtype == torch.float64:
+            continue
+        got = render(scene.to(dtype), pose, grid, backend, **optics)
+        assert all(torch.isfinite(value).all() for value in got.values())
+        assert_close(got, want, tolerance)
+    return want

@@ -8,14 +8,16 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+constexpr double kFarthest = 1e6, kWidest = 1e5;  // FARTHEST and WIDEST in settings.py [m]
+
 template <class S> GSPARC_HD int unsound(const Gaussian<S>& g, S opacity) {
     const S big = sizeof(S) == 4 ? S(3.4e38) : S(1.7e308);
     for (int k = 0; k < 3; ++k)
-        if (!(fabs(g.mean[k]) <= big)) return 0;
+        if (!(fabs(g.mean[k]) <= S(kFarthest))) return 0;
     for (int k = 0; k < 4; ++k)
         if (!(fabs(g.quat[k]) <= big)) return 1;
     for (int k = 0; k < 3; ++k)
-        if (!(g.scale[k] >= 0 && g.scale[k] <= big)) return 2;
+        if (!(g.scale[k] >= 0 && g.scale[k] <= S(kWidest))) return 2;
     return opacity >= 0 && opacity <= 1 ? -1 : 3;
 }
 

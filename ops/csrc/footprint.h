@@ -67,6 +67,8 @@ template <class S> GSPARC_HD S largest_of(S a, S b) { return pick(a > b, a, b); 
 template <class S> GSPARC_HD S dot(const S* a, const S* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 template <class S> GSPARC_HD S clamped(S x, S low, S high) { return pick(x < low, low, pick(x > high, high, x)); }
 
+constexpr double kShortestQuaternion = 1e-18;  // SHORTEST_QUATERNION in settings.py; shorter ones do not turn
+
 // One Gaussian and one pose, both as they come: no derived quantity.
 template <class S> struct Gaussian {
     S mean[3], quat[4], scale[3];
@@ -104,10 +106,13 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     f.e1[0] = -c1, f.e1[1] = c0, f.e1[2] = S(0);
     f.e2[0] = -f.n[2] * c0, f.e2[1] = -f.n[2] * c1, f.e2[2] = f.cosine;
 
-    const S square = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3];
-    const Truth<S> usable = square > smallest(S());
-    f.norm = pick(usable, root(square), S(0));
-    for (int k = 0; k < 4; ++k) f.unit[k] = pick(usable, g.quat[k] / f.norm, S(k == 0));
+    S longest = 0, square = 0;  // by the longest component first: squares of 1e-20 and 1e20 are no float32 numbers
+    for (int k = 0; k < 4; ++k) longest = largest_of(longest, pick(g.quat[k] < 0, -g.quat[k], g.quat[k]));
+    const Truth<S> usable = longest > S(kShortestQuaternion);
+    for (int k = 0; k < 4; ++k) f.unit[k] = g.quat[k] / longest, square += f.unit[k] * f.unit[k];
+    const S length = root(square);
+    f.norm = pick(usable, longest * length, S(0));
+    for (int k = 0; k < 4; ++k) f.unit[k] = pick(usable, f.unit[k] / length, S(k == 0));
     S turn[9];
     rotation_of(f.unit, turn);
     for (int i = 0; i < 3; ++i)
@@ -156,6 +161,8 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
     Gradients<S> out;
     out.opacity = f.gain * m.emits, out.extinction = f.gain * m.hides;
     const S step = lens.elevation_step;
+    // On the axis itself azimuth and elevation have no slope; of what `equirect` needs only the area has one.
+    const Truth<S> smooth = lens.tangent ? f.cosine >= 0 : f.cosine > 0;
 
     // Displacement (d1, d2) of n along (e1, e2) [rad]; for `tangent` p and q move by -(d + q (q . d)).
     const S dp = f.root_a * m.tau1, dq = f.root_b * m.tau2 - f.root_a * f.rho * m.tau1;
@@ -166,7 +173,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
         out.screen[0] = g1 * step, out.screen[1] = g2 * step;
     } else {
         out.screen[0] = dp, out.screen[1] = dq;
-        g1 = pick(f.cosine > 0, dp / (f.cosine * lens.azimuth_step), S(0)), g2 = dq / step;
+        g1 = pick(smooth, dp / (f.cosine * lens.azimuth_step), S(0)), g2 = pick(smooth, dq / step, S(0));
     }
 
     // (A, B, rho) and the gain -> (k11, k12, k22, area), written so that no square of det appears.
@@ -196,13 +203,13 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
         for (int c = 0; c < 3; ++c)
             g_axis[i][c] = f.sigma[i] * (u1 * f.e1[c] + u2 * f.e2[c]) + g_b[i] * f.n[c];
         // Parallel transport: e1 -> e1 - d1 n, e2 -> e2 - d2 n, n -> n + d1 e1 + d2 e2.
-        g1 += g_b[i] * f.along1[i] - u1 * f.sigma[i] * f.b[i];
-        g2 += g_b[i] * f.along2[i] - u2 * f.sigma[i] * f.b[i];
+        g1 += g_b[i] * f.along1[i] - pick(smooth, u1 * f.sigma[i] * f.b[i], S(0));
+        g2 += g_b[i] * f.along2[i] - pick(smooth, u2 * f.sigma[i] * f.b[i], S(0));
         twist += f.sigma[i] * (u1 * f.along2[i] - u2 * f.along1[i]);
     }
     if (!lens.tangent) {
         // East and north turn about n by d1 tan(elevation), and the stretch of the columns depends on it.
-        g1 += pick(f.cosine > 0, twist * f.n[2] / f.cosine, S(0));
+        g1 += pick(smooth, twist * f.n[2] / f.cosine, S(0));
         g_stretch1 += g_area * f.area / f.stretch1;
         g2 += g_stretch1 * f.stretch1 * f.cosine * f.n[2] / f.bound2;
     }

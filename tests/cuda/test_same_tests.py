@@ -1,4 +1,7 @@
-"""The rasterizer's own tests and its hard cases, unchanged, with the CUDA kernels instead of the CPU's."""
+"""The rasterizer's own tests, unchanged, with the CUDA kernels instead of the CPU's.
+
+The hard cases run on every backend by themselves (tests/hard_cases/conftest.py).
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,10 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-NOT_THESE = ("test_operators", "test_threads")  # registration, and threads of the CPU
+NOT_THESE = ("test_operators",)  # registration
 NOT_HERE = {
     "test_absent_backends_say_why": "test_library.py has more of them",
     "test_every_instruction_set": "of the CPU",
-    "test_one_giant_covers_every_strip": "looks into the CPU's plan",
-    "test_too_many_entries_are_refused_before_allocation": "counts entries as the CPU does",
-    "test_a_million_huge_ones": "measures main memory",
 }
 
 
@@ -30,12 +30,11 @@ def again(function):
     return copy
 
 
-for folder in ("ops", "hard_cases"):
-    sys.path.insert(0, str(HERE.parent / folder))
-    for path in sorted((HERE.parent / folder).glob("test_*.py")):
-        if "from rasters import" not in path.read_text() or path.stem in NOT_THESE:
-            continue
-        module = importlib.import_module(path.stem)
-        for name, function in inspect.getmembers(module, inspect.isfunction):
-            if name.startswith("test_") and name not in NOT_HERE and "naive" not in name:
-                globals()[f"{name}__{path.stem}"] = again(function)
+sys.path.insert(0, str(HERE.parent / "ops"))
+for path in sorted((HERE.parent / "ops").glob("test_*.py")):
+    if "from rasters import" not in path.read_text() or path.stem in NOT_THESE:
+        continue
+    module = importlib.import_module(path.stem)
+    for name, function in inspect.getmembers(module, inspect.isfunction):
+        if name.startswith("test_") and name not in NOT_HERE and "naive" not in name:
+            globals()[f"{name}__{path.stem}"] = again(function)

@@ -9,20 +9,18 @@ from itertools import pairwise
 
 import pytest
 import torch
-from rasters import one, origin, render
+from rasters import assert_equals_float64, one, origin, render
 
 from gsparc.ops import SphereGrid
 
 GRID = SphereGrid.full_sphere(20, 40)
 NEAR = 0.05
-BACKENDS = pytest.mark.parametrize("backend", ["cpu", "reference"])
 
 
 def at(distance: float):
     return one([0.3, 0.5, 0.4], distance=distance, sigma=0.2)
 
 
-@BACKENDS
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-6, 0.01, NEAR * 0.999])
 def test_absent_and_without_gradient(backend, dtype, distance):
@@ -32,7 +30,6 @@ def test_absent_and_without_gradient(backend, dtype, distance):
         assert (got[name] == 0).all(), name
 
 
-@BACKENDS
 def test_fades_in_without_a_jump(backend):
     for edge in (NEAR, 2 * NEAR):
         a, b = (render(at(edge + s), origin(), GRID, backend, near=NEAR)["image"] for s in (-1e-6, 1e-6))
@@ -41,6 +38,11 @@ def test_fades_in_without_a_jump(backend):
         render(at(NEAR * k / 10), origin(), GRID, backend, near=NEAR)["image"].max() for k in range(10, 21)
     ]
     assert all(a <= b + 1e-9 for a, b in pairwise(images)) and images[-1] > 0.5
+
+
+@pytest.mark.parametrize("distance", [1.01 * NEAR, 1.5 * NEAR, 2 * NEAR, 0.2])
+def test_equals_float64_while_it_fades_in(backend, distance):
+    assert_equals_float64(at(distance), origin(), GRID, backend, near=NEAR)
 
 
 def test_dividing_by_the_distance_breaks():

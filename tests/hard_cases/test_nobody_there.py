@@ -8,12 +8,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from rasters import origin, poses, random_scene, render
+from rasters import assert_equals_float64, origin, poses, random_scene, render
 
-from gsparc.ops import SphereGrid, freeze, make_plan, mean_weights
+from gsparc.ops import Cutoff, SphereGrid, freeze, make_plan, mean_weights
 
 GRID = SphereGrid.hemisphere(10, 20)
-BACKENDS = pytest.mark.parametrize("backend", ["cpu", "reference"])
 
 
 def check(got):
@@ -21,7 +20,6 @@ def check(got):
     assert all((value == 0).all() for name, value in got.items() if name.startswith("d_"))
 
 
-@BACKENDS
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 @pytest.mark.parametrize("hides", [False, True])
 @pytest.mark.parametrize("count", [0, 3])
@@ -32,20 +30,22 @@ def test_no_gaussians(backend, projection, hides, count):
     check(got)
 
 
-@BACKENDS
+def test_equals_float64(backend):
+    assert_equals_float64(random_scene(n=0), poses(0), GRID, backend)
+
+
 def test_all_below_the_horizon(backend):
     scene = random_scene(n=20, size=0.1)
     under = replace(scene, means=scene.means * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double())
     check(render(under, origin(), GRID, backend))
 
 
-@BACKENDS
-def test_all_transparent(backend):
-    scene = random_scene(n=20)
-    check(render(replace(scene, opacities=0 * scene.opacities), origin(), GRID, backend))
+@pytest.mark.parametrize("relative", [False, True])
+def test_all_transparent(backend, relative):
+    scene, cut = random_scene(n=20), Cutoff(relative=relative)
+    check(render(replace(scene, opacities=0 * scene.opacities), origin(), GRID, backend, cutoff=cut))
 
 
-@BACKENDS
 def test_weights_and_frozen_views_of_nothing(backend):
     scene = random_scene(n=0)
     model = [getattr(scene, k).requires_grad_() for k in ("means", "quats", "scales", "opacities")]
@@ -56,7 +56,6 @@ def test_weights_and_frozen_views_of_nothing(backend):
     assert image.shape == (2, 10, 20) and (image == 0).all()
 
 
-@BACKENDS
 def test_share_of_the_unseen_is_zero_and_harmless(backend):
     """Naive: sum / sum is 0 / 0."""
     scene = random_scene(n=20)

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, compose, spectra
+from rasters import GRIDS, origin, random_scene, render
 
 from gsparc import checkpoint
 from gsparc.learned import LearnedField
 from gsparc.module import NonFiniteLoss
+from gsparc.ops.settings import FARTHEST, WIDEST
 from gsparc.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
@@ -94,6 +96,28 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_
     with pytest.raises(NonFiniteLoss, match=rf"sample {bad}; all parameters are finite"):
         method.fit(dataclasses.replace(data, target=target), fold, tmp_path)
     assert (tmp_path / "nonfinite.pt").exists()
+
+
+@pytest.mark.parametrize("name,value", [("means", 1e7), ("means", 1e38), ("scales", 2e5), ("scales", 1e38)])
+def test_what_overflows_inside_is_refused_at_the_rasterizers_door(backend, name, value):
+    scene = random_scene(n=5).to(torch.float32)
+    getattr(scene, name)[3] = value
+    with pytest.raises(ValueError, match=f"Gaussian 3 has {name} that are not finite and"):
+        render(scene, origin(), GRIDS["patch"], backend)
+
+
+@pytest.mark.parametrize("name,value", [("means", FARTHEST), ("scales", WIDEST), ("quats", 3e38)])
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+def test_what_is_just_let_in_stays_finite(backend, projection, name, value):
+    scene = random_scene(n=5).to(torch.float32)
+    getattr(scene, name)[3] = value
+    got = render(scene, origin(), GRIDS["hemisphere"], backend, projection=projection, compensate=False)
+    assert all(found.isfinite().all() for found in got.values())
+
+
+def test_squares_of_what_is_refused_overflow():
+    """Naive: only NaN and infinities are refused; the length of a vector of 1e20 is infinite in float32."""
+    assert torch.full((3,), 1e20).square().sum().isinf()
 
 
 def test_zeroing_the_gradient_hides_it():

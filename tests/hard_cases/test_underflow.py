@@ -6,7 +6,7 @@ Shown: gradients of everything behind are exactly 0, not small.
 
 import pytest
 import torch
-from rasters import Scene, origin, render
+from rasters import Scene, assert_equals_float64, origin, render
 
 from gsparc.ops import SphereGrid
 
@@ -24,13 +24,17 @@ def tunnel(n: int = 60) -> Scene:
     )
 
 
-@pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_what_lies_behind_gets_exactly_zero(backend, dtype):
     got = render(tunnel().to(dtype), origin(), GRID, backend)
     for name in ("d_means", "d_quats", "d_scales", "d_opacities"):
         assert (got[name][4:] == 0).all() and (got[name][0] != 0).any(), name
     assert (got["d_features"][:, 4:] == 0).all() and (got["transmittance"] > 0).all()
+
+
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+def test_equals_float64(backend, projection):
+    assert_equals_float64(tunnel(), origin(), GRID, backend, projection=projection)
 
 
 def test_without_a_stopping_rule_it_breaks():

@@ -1,0 +1,32 @@
+"""Every hard case on every backend, and the table of what was measured.
+
+`pytest tests/hard_cases --table docs/hard-cases.md` writes the table; see tests/ledger.py.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from ledger import LEDGER
+from shim import serving
+
+from gsparc.ops import cuda_library
+
+ENGINES = ["reference", "cpu", "cuda shim"] + ([] if cuda_library.missing_device() else ["cuda"])
+
+
+@pytest.fixture(params=ENGINES)
+def backend(request):
+    """What to call the backend: under the CUDA kernels, which serve CPU tensors here, that is still `cpu`."""
+    if request.param in ("reference", "cpu"):
+        yield request.param
+        return
+    with serving("shim" if request.param == "cuda shim" else "gpu"):
+        LEDGER.engine = request.param
+        yield "cpu"
+        LEDGER.engine = None
+
+
+def pytest_runtest_setup(item):
+    LEDGER.case = Path(item.path).stem.removeprefix("test_")

@@ -1,0 +1,56 @@
+"""What the tests measured while they ran: worst errors, examples, seconds and counts, case by case.
+
+`tests/hard_cases/conftest.py` says which test is running and writes the table of docs/hard-cases.md from it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Tally:
+    """What one engine in one precision did for one case.
+
+    Attributes:
+        examples: forward and backward passes.
+        seconds: their time in all [s].
+        worst: part ("forward", "backward") -> largest error, relative to one plus the largest value wanted.
+        share: part -> the same error as a share of what was allowed.
+    """
+
+    examples: int = 0
+    seconds: float = 0.0
+    worst: dict[str, float] = field(default_factory=dict)
+    share: dict[str, float] = field(default_factory=dict)
+
+
+class Ledger:
+    """One per test session."""
+
+    def __init__(self) -> None:
+        self.case = "other"
+        self.engine: str | None = None  # who stands in for the CPU's kernels; None: nobody
+        self.tallies: dict[tuple[str, str, str], Tally] = defaultdict(Tally)
+        self.counts: dict[str, Counter[str]] = defaultdict(Counter)
+        self.seconds: Counter[str] = Counter()
+
+    def rendered(self, engine: str, precision: str, seconds: float) -> None:
+        """One forward and backward pass."""
+        tally = self.tallies[self.case, engine, precision]
+        tally.examples += 1
+        tally.seconds += seconds
+
+    def compared(self, engine: str, precision: str, part: str, error: float, allowed: float) -> None:
+        """An error against the float64 reference, and what was allowed."""
+        tally = self.tallies[self.case, engine, precision]
+        tally.worst[part] = max(tally.worst.get(part, 0.0), error)
+        tally.share[part] = max(tally.share.get(part, 0.0), error / allowed)
+
+    def count(self, what: str, number: int = 1) -> None:
+        """Examples of a property, bad inputs, kills, seeds."""
+        self.counts[what][self.case] += number
+
+
+LEDGER = Ledger()
