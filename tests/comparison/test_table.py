@@ -49,10 +49,8 @@ def test_losers_are_not_hidden():
     assert "busy (load up to 3.0 per core)" in said
     far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
     said = " | ".join(remarks(blocks(rows(far, {}))[0], "gsparc"))
-    assert (
-        "2.00 dB behind gp" in said and "spread" not in said
+    assert "2.00 dB behind gp" in said and "spread" not in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
-    )
 
 
 def test_scores_are_decibels_of_which_more_are_better():
