@@ -1,0 +1,60 @@
+"""What each effect gives and costs, sample by sample."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsparc.report.intervals import Interval
+from gsparc.report.runs import PER_SAMPLE, Run
+from gsparc.report.table import Column, Table
+from gsparc.report.tables import HEADS
+
+
+def effects(runs: Sequence[Run]) -> Table | None:
+    """What each effect gives and costs: paired differences between runs of one split; None without pairs."""
+    name = PER_SAMPLE[runs[0].kind]
+    table = Table(
+        "Effects: what they give and cost",
+        [
+            Column("effect"), Column("without"), Column("with"),
+            Column(f"{HEADS.get(name, name)} gained", "+.2f"),
+            Column("train s more", "+.3g"), Column("query ms more", "+.3g"),
+        ],
+        note="Differences per test sample, mean and 95 % interval; same seed, same split.",
+    )  # fmt: skip
+    for off in runs:
+        for on in runs:
+            if not _only_an_effect_apart(off, on):
+                continue
+            gain = _paired(off, on, name)
+            spent = [_minus(on.facts.get("time/train_s"), off.facts.get("time/train_s"))]
+            spent.append(_minus(on.latency[0], off.latency[0]))
+            table.add(on.facts.get("model/effects"), off.setting, on.setting, gain, *spent)
+    return table if table.rows else None
+
+
+def _only_an_effect_apart(off: Run, on: Run) -> bool:
+    same = all(
+        off.facts.get(k) == on.facts.get(k) for k in ("dataset/sha256", "split/sha256", "seed", "model/name")
+    )
+    plain = (off.facts.get("model/effects") or "none") == "none"
+    return same and plain and (on.facts.get("model/effects") or "none") != "none"
+
+
+def _paired(off: Run, on: Run, name: str) -> Interval | None:
+    """Mean difference per sample in dB, larger is better."""
+    if name not in off.samples or name not in on.samples or len(off.samples[name]) != len(on.samples[name]):
+        return None
+    sign = -1 if name == "error_db" else 1
+    values = [np.abs(r.samples[name]) if sign < 0 else r.samples[name] for r in (off, on)]
+    gap = sign * (values[1] - values[0])
+    gap = gap[np.isfinite(gap)]
+    half = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap)) if len(gap) > 1 else math.nan
+    return Interval(float(gap.mean()), float(gap.mean()) - half, float(gap.mean()) + half)
+
+
+def _minus(a: object, b: object) -> float | None:
+    return float(a) - float(b) if isinstance(a, (int, float)) and isinstance(b, (int, float)) else None

@@ -1,0 +1,76 @@
+"""Accuracy against the seconds it took to learn."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsparc.report.runs import Run
+from gsparc.report.table import Column, Table
+from gsparc.report.tables import FORMS, HEADS, number
+from gsparc.tradeoff.points import score_of
+
+MINUTES = (1, 2, 5, 10)
+
+
+def within_minutes(runs: Sequence[Run]) -> Table:
+    """The best validation figure reached within fixed training times, and the time to fixed figures."""
+    figure = validation_figure(runs[0])
+    head = HEADS.get(figure, figure)
+    table = Table(
+        "Accuracy against training time",
+        [
+            Column("method and setting"), Column("seed", "d"),
+            *(Column(f"{head} within {m} min", FORMS.get(figure, ".4f")) for m in MINUTES),
+            *(Column(f"s to {level:.4g}", ".3g") for level in levels(runs)),
+            Column("train s in all", ".3g"),
+        ],
+        note="Validation rows; seconds of learning with preparation, without validation. Methods that train "
+        "in one piece have no curve: their test figure counts from the end of their training.",
+    )  # fmt: skip
+    for run in runs:
+        seconds, values = curve(run)
+        if not len(seconds):
+            continue
+        best = np.array([score_of(figure, v) for v in values])
+        cells = []
+        for minutes in MINUTES:
+            there = seconds <= 60 * minutes
+            cells.append(float(values[there][best[there].argmax()]) if there.any() else None)
+        reached = []
+        for level in levels(runs):
+            there = best >= score_of(figure, level)
+            reached.append(float(seconds[there.argmax()]) if there.any() else None)
+        table.add(run.setting, run.facts.get("seed"), *cells, *reached, run.facts.get("time/train_s"))
+    return table
+
+
+def validation_figure(run: Run) -> str:
+    """The figure of a learning curve: validation of channels and powers logs the mean squared error."""
+    return "psnr_db" if run.kind == "spectrum" else "mse"
+
+
+def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Seconds (n,) and validation figures (n,); one point for a method that trains in one piece."""
+    figure = validation_figure(run)
+    found = run.curve.get(f"val/{figure}")
+    if found is not None and np.isfinite(found).any():
+        known = np.isfinite(found)
+        return run.curve["train_s"][known], found[known]
+    end, value = number(run.facts.get("time/train_s")), run.figure_of(figure)
+    if end is None or value is None:
+        return np.zeros(0), np.zeros(0)
+    return np.array([end]), np.array([value])
+
+
+def levels(runs: Sequence[Run], count: int = 3) -> list[float]:
+    """Round figures between what the worst and the best run reach."""
+    figure = validation_figure(runs[0])
+    ends = [max(curve(run)[1], key=lambda v: score_of(figure, v)) for run in runs if len(curve(run)[0])]
+    if not ends:
+        return []
+    low, high = min(ends), max(ends)
+    if high - low < 1e-9 * max(abs(high), 1e-9):
+        return [float(f"{low:.3g}")]
+    return sorted({float(f"{v:.3g}") for v in np.linspace(low, high, count + 2)[:-1]})[:count]

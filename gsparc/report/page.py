@@ -1,0 +1,135 @@
+"""One self-contained page: tables that sort, plots inside, nothing fetched."""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from jinja2 import Environment
+from PIL import Image
+
+from gsparc.report import effects, learning, plots, tables
+from gsparc.report.runs import Run
+from gsparc.report.table import Table
+from gsparc.summary import remarks
+
+PICTURE_PX = 1000  # width at which pictures are kept
+MOST_PICTURES = 6
+
+
+@dataclass
+class Study:
+    """Runs whose figures can be compared: one dataset, one kind of split.
+
+    Attributes:
+        title: dataset and split.
+        remarks: what a reader must know first.
+        tables: in reading order.
+        plots: SVG texts.
+        pictures: captions and PNG data in base64.
+    """
+
+    title: str
+    remarks: list[str] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    plots: list[str] = field(default_factory=list)
+    pictures: list[tuple[str, str]] = field(default_factory=list)
+
+
+def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = ()) -> list[Study]:
+    """Everything there is to show, study by study.
+
+    Args:
+        runs: of any datasets.
+        fronts: `tradeoff.csv` by column, each with the name of its dataset.
+    """
+    by_study: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        by_study.setdefault(run.study, []).append(run)
+    return [
+        _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
+        for (dataset, split), group in by_study.items()
+    ]
+
+
+def _study(title: str, runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Study:
+    study = Study(title, list(dict.fromkeys(text for run in runs for text in remarks(run.facts))))
+    if len(tables.grouped(runs)) < len(runs):
+        study.tables.append(tables.seeds(runs))
+    found = (
+        tables.results(runs),
+        learning.within_minutes(runs),
+        tables.bill(runs),
+        effects.effects(runs),
+        tables.worst(runs),
+    )
+    study.tables += [table for table in found if table is not None and table.rows]
+    drawn = (
+        plots.pareto(runs, fronts),
+        plots.accuracy_cdf(runs),
+        plots.latency_cdf(runs),
+        plots.learning(runs),
+        plots.bill(runs),
+        plots.measurements(runs),
+        plots.confidence(runs),
+    )
+    study.plots = [_named_apart(plots.svg(figure), i) for i, figure in enumerate(drawn) if figure is not None]
+    firsts = [group[0] for group in tables.grouped(runs).values()]
+    study.pictures = [
+        (run.setting, _png(run.folder / "test.png"))
+        for run in firsts[:MOST_PICTURES]
+        if (run.folder / "test.png").is_file()
+    ]
+    return study
+
+
+def _named_apart(svg: str, number: int) -> str:
+    """Ids of several drawings on one page must differ: matplotlib repeats them."""
+    return re.sub(r'(id="|url\(#|href="#)', rf"\g<1>p{number}-", svg)
+
+
+def _png(path: Path) -> str:
+    with Image.open(path) as image:
+        small = image.convert("RGB")
+        small.thumbnail((PICTURE_PX, 4 * PICTURE_PX))
+        out = io.BytesIO()
+        small.quantize(128).save(out, "PNG", optimize=True)
+    return base64.b64encode(out.getvalue()).decode()
+
+
+def html(title: str, made: str, shown: Sequence[Study]) -> str:
+    """The page.
+
+    Args:
+        title: above everything.
+        made: where it comes from.
+        shown: what is on it.
+    """
+    text = (files("gsparc.report") / "page.html.j2").read_text(encoding="utf-8")
+    return Environment(autoescape=True).from_string(text).render(title=title, made=made, studies=shown)
+
+
+def write(folder: Path, title: str, made: str, shown: Sequence[Study]) -> None:
+    """`report.html`, `report.md` and a CSV file per table."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "report.html").write_text(html(title, made, shown), encoding="utf-8")
+    parts = [f"# {title}\n\n{made}\n"]
+    for study in shown:
+        parts.append(f"## {study.title}\n")
+        parts += [f"{remark}\n" for remark in study.remarks]
+        parts += [table.markdown() for table in study.tables]
+        for table in study.tables:
+            (folder / f"{_slug(study.title)}-{_slug(table.title)}.csv").write_text(
+                table.csv(), encoding="utf-8"
+            )
+    (folder / "report.md").write_text("\n".join(parts), encoding="utf-8")
+
+
+def _slug(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")

@@ -1,0 +1,54 @@
+"""The results table of a document, written by a command and never by hand."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from gsparc.report.runs import Run
+from gsparc.report.table import Table
+from gsparc.report.tables import results, seeds
+
+BEGIN = "<!-- results: written by `make results` -->"
+END = "<!-- end of results -->"
+
+
+def refresh(path: Path, runs: Sequence[Run]) -> None:
+    """Replace what stands between the marks `BEGIN` and `END`; the file is replaced whole.
+
+    Raises:
+        ValueError: the marks are missing or in the wrong order.
+    """
+    text = path.read_text(encoding="utf-8")
+    before, begin, rest = text.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not begin or not end:
+        raise ValueError(f"{path}: the lines {BEGIN} and {END} are needed, in this order")
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(f"{before}{BEGIN}\n\n{tables(runs)}\n{END}{after}", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def tables(runs: Sequence[Run]) -> str:
+    """A short table per study: settings over seeds, then the baselines."""
+    by_study: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        by_study.setdefault(run.study, []).append(run)
+    return "\n".join(_short(f"{name}, split {split}", group) for (name, split), group in by_study.items())
+
+
+def _short(title: str, runs: Sequence[Run]) -> str:
+    table = seeds(runs)
+    wanted = [column.name for column in table.columns]
+    whole = results(runs)
+    heads = [column.name for column in whole.columns]
+    rows = list(table.rows)
+    for row in whole.rows[len(runs) :]:  # the baselines have no seeds
+        cells = dict(zip(heads, row, strict=True))
+        named = {"query ms p50": cells["query ms p50"], "seeds": None, **cells}
+        rows.append([named.get(name) for name in wanted])
+    load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
+    facts = runs[0].facts
+    note = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} threads, load {load:.1f} per core."
+    return Table(title, table.columns, rows, note).markdown()

@@ -1,0 +1,169 @@
+"""Run directories as the report reads them."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from gsparc.data.schema import Kind
+from gsparc.tradeoff.points import FIGURES
+
+SIDE: dict[Kind, tuple[str, ...]] = {
+    "spectrum": ("ssim_gauss", "ssim", "mse"), "csi": ("snr_db",), "rssi": ("mae_db", "nmse")
+}  # fmt: skip
+PER_SAMPLE: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": "error_db"}
+NEVER_SAID = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one training run left behind.
+
+    Attributes:
+        folder: its directory.
+        facts: `summary.json`.
+        samples: `per_sample.csv` by column; empty when absent.
+        curve: `learning_curve.csv` by column, (n,) float64; empty for methods that train in one piece.
+        overrides: what was said on the command line, `model.emission.hidden=8`.
+        render_ms: (n,) times of single queries measured after a sweep, alone; empty when not.
+    """
+
+    folder: Path
+    facts: dict[str, Any]
+    samples: dict[str, np.ndarray] = field(default_factory=dict)
+    curve: dict[str, np.ndarray] = field(default_factory=dict)
+    overrides: tuple[str, ...] = ()
+    render_ms: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @cached_property
+    def kind(self) -> Kind:
+        """`spectrum`, `csi` or `rssi`."""
+        kind = self.facts.get("dataset/kind")
+        return kind if kind in FIGURES else "spectrum"
+
+    @property
+    def figure(self) -> str:
+        """Name of the deciding accuracy."""
+        return FIGURES[self.kind]
+
+    @cached_property
+    def setting(self) -> str:
+        """What distinguishes it from others but the seed: the method and its overrides."""
+        said = [o for o in self.overrides if not o.lstrip("+~").startswith(NEVER_SAID)]
+        named = [o for o in said if not o.startswith(("model=", "dataset=", "split="))]
+        short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
+        return " ".join([str(self.facts.get("model/name", "?")), *short])
+
+    @property
+    def study(self) -> tuple[str, str]:
+        """What makes figures comparable: dataset and split by name."""
+        return str(self.facts.get("dataset/name")), str(self.facts.get("split/name"))
+
+    def figure_of(self, name: str) -> float | None:
+        """A test figure; `render_ms` measured alone wins over the one of the busy sweep."""
+        return _number(self.facts.get(f"test/{name}"))
+
+    @property
+    def latency(self) -> tuple[float | None, float | None]:
+        """Median and 95th percentile of single queries [ms]."""
+        if len(self.render_ms):
+            return float(np.median(self.render_ms)), float(np.quantile(self.render_ms, 0.95))
+        return _number(self.facts.get("time/render_ms_p50")), _number(self.facts.get("time/render_ms_p95"))
+
+    @property
+    def measured(self) -> int:
+        """Measurements the method learned from."""
+        count = sum(int(self.facts.get(f"split/{k}") or 0) for k in ("train", "val"))
+        return count // max(int(self.facts.get("split/folds") or 1), 1)
+
+    @property
+    def checkpoints(self) -> list[Path]:
+        """Its models, one per fold."""
+        found = self.folder / "model.ckpt"
+        return [found] if found.exists() else sorted(self.folder.glob("fold*/model.ckpt"))
+
+
+def find_runs(paths: Iterable[str | Path]) -> list[Run]:
+    """Training runs in and below directories, in the order given.
+
+    Raises:
+        ValueError: a directory that does not exist or holds no run; it is named.
+    """
+    found: dict[Path, Run] = {}
+    for path in map(Path, paths):
+        if not path.is_dir():
+            raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
+        files = (
+            [path / "summary.json"] if _is_run(path / "summary.json") else sorted(path.rglob("summary.json"))
+        )
+        here = {file.parent.resolve(): file for file in files if _is_run(file)}
+        if not here and not any(path.rglob("tradeoff.csv")):
+            raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
+        found |= {folder: read_run(folder) for folder in here if folder not in found}
+    if not found:
+        raise ValueError("a swept front alone is no report: give the directory of its run too")
+    return list(found.values())
+
+
+def _is_run(file: Path) -> bool:
+    if not file.is_file():
+        return False
+    facts = _facts(file)
+    return "split/sha256" in facts and "time/train_s" in facts and "tradeoff/points" not in facts
+
+
+def _facts(file: Path) -> dict[str, Any]:
+    try:
+        facts = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{file}: cannot be read as a summary ({error})") from None
+    if not isinstance(facts, dict):
+        raise ValueError(f"{file}: holds no facts by name")
+    return facts
+
+
+def read_run(folder: Path) -> Run:
+    """The run in a directory."""
+    render = columns(folder / "render_ms.csv").get("render_ms")
+    return Run(
+        folder,
+        _facts(folder / "summary.json"),
+        columns(folder / "per_sample.csv"),
+        {k: v for k, v in columns(folder / "learning_curve.csv").items() if v.dtype.kind == "f"},
+        _overrides(folder / ".hydra" / "overrides.yaml"),
+        np.zeros(0) if render is None else render,
+    )
+
+
+def columns(path: Path) -> dict[str, np.ndarray]:
+    """A CSV file by column: numbers float64 (NaN where empty), else text; {} without a file."""
+    if not path.is_file():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    return {name: _column([row[name] for row in rows]) for name in (rows[0] if rows else ())}
+
+
+def _column(cells: Sequence[str | None]) -> np.ndarray:
+    try:
+        return np.array([float(cell) if cell else np.nan for cell in cells])
+    except ValueError:
+        return np.array([cell or "" for cell in cells])
+
+
+def _overrides(path: Path) -> tuple[str, ...]:
+    if not path.is_file():
+        return ()
+    return tuple(str(line) for line in yaml.safe_load(path.read_text(encoding="utf-8")) or ())
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, (int, float)) else None

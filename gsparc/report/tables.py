@@ -1,0 +1,146 @@
+"""What the runs say, as tables; no accuracy without its time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gsparc.report.intervals import Interval, interval, over_seeds
+from gsparc.report.runs import PER_SAMPLE, SIDE, Run
+from gsparc.report.table import Column, Table
+
+BASELINES = ("zero", "mean", "nearest", "idw", "gp")
+WORST = 3
+FORMS = {"psnr_db": ".2f", "snr_db": ".2f", "rmse_db": ".2f", "mae_db": ".2f", "nmse": ".3g", "mse": ".3g"}
+HEADS = {
+    "psnr_db": "PSNR dB", "ssim_gauss": "SSIM (Gauss 11)", "ssim": "SSIM (uniform 7)", "mse": "MSE",
+    "nmse": "NMSE", "snr_db": "SNR dB", "rmse_db": "RMSE dB", "mae_db": "MAE dB",
+}  # fmt: skip
+
+
+def heading(figure: str, note: str = "") -> Column:
+    """Of an accuracy."""
+    return Column(HEADS.get(figure, figure), FORMS.get(figure, ".4f"), note)
+
+
+def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
+    """Runs that differ by their seed only, by setting, in order of appearance."""
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.setting, []).append(run)
+    return groups
+
+
+def results(runs: Sequence[Run]) -> Table:
+    """Every run and every baseline of one study: accuracy, time, memory, size, effects, data and commit."""
+    figures = (runs[0].figure, *SIDE[runs[0].kind])
+    table = Table(
+        "Results",
+        [
+            Column("method and setting"), Column("seed", "d"),
+            *(heading(f, "95 % interval: bootstrap over test samples") for f in figures),
+            Column("train s", ".3g"), Column("query ms p50", ".3g"), Column("p95", ".3g"),
+            Column("batch of 64, ms each", ".3g"), Column("memory MB", ".0f"), Column("Gaussians", "d"),
+            Column("effects"), Column("load", ".2f", "1-minute load per core while measured"),
+            Column("data"), Column("commit"),
+        ],
+        note="Brackets: 95 % intervals over test samples (independent samples assumed).",
+    )  # fmt: skip
+    for run in runs:
+        p50, p95 = run.latency
+        get = run.facts.get
+        table.add(
+            run.setting, get("seed"), *(interval(run, f) for f in figures), get("time/train_s"), p50, p95,
+            get("time/render_ms_batch64"), get("memory/peak_mb"), get("model/num_gaussians"),
+            get("model/effects") or "none", get("machine/load"), str(get("dataset/sha256"))[:8],
+            str(get("git"))[:8],
+        )  # fmt: skip
+    first = runs[0].facts
+    for name in BASELINES:
+        if f"baseline/{name}/{figures[0]}" not in first:
+            continue
+        base = {key.rsplit("/", 1)[1]: v for key, v in first.items() if key.startswith(f"baseline/{name}/")}
+        table.add(
+            name, None, *(base.get(f) for f in figures), base.get("train_s"), base.get("render_ms_p50"),
+            base.get("render_ms_p95"), base.get("render_ms_batch64"), None, None, "none",
+            first.get("machine/load"), str(first.get("dataset/sha256"))[:8], str(first.get("git"))[:8],
+        )  # fmt: skip
+    return table
+
+
+def seeds(runs: Sequence[Run]) -> Table:
+    """Settings side by side, their spread over seeds, and what they cost."""
+    figures = (runs[0].figure, *SIDE[runs[0].kind])
+    table = Table(
+        "Settings over seeds",
+        [
+            Column("method and setting"), Column("seeds", "d"), *(heading(f) for f in figures),
+            Column("train s", ".3g"), Column("query ms p50", ".3g"), Column("p95", ".3g"),
+            Column("Gaussians", ".0f"),
+        ],
+        note="Brackets: least and largest over seeds.",
+    )  # fmt: skip
+    for setting, group in grouped(runs).items():
+        p50, p95 = zip(*(run.latency for run in group), strict=True)
+        spread = [_over([run.figure_of(f) for run in group]) for f in figures]
+        times = _over([number(run.facts.get("time/train_s")) for run in group])
+        size = _over([number(run.facts.get("model/num_gaussians")) for run in group])
+        table.add(setting, len(group), *spread, times, _over(p50), _over(p95), size)
+    return table
+
+
+def bill(runs: Sequence[Run]) -> Table:
+    """The whole bill: what it took to be able to answer."""
+    figure = runs[0].figure
+    table = Table(
+        "The whole bill",
+        [
+            Column("method and setting"), Column("seed", "d"), Column("points measured", "d"),
+            Column("seconds simulated", ".3g"), Column("seconds trained", ".3g"), Column("ms a query", ".3g"),
+            heading(figure),
+        ],
+        note="Seconds simulated: of the ray tracer that made the data; none where they were measured.",
+    )  # fmt: skip
+    for run in runs:
+        table.add(
+            run.setting, run.facts.get("seed"), run.measured, run.facts.get("dataset/simulate_s"),
+            run.facts.get("time/train_s"), run.latency[0], interval(run, figure),
+        )  # fmt: skip
+    return table
+
+
+def worst(runs: Sequence[Run]) -> Table:
+    """The three test places that each run gets most wrong."""
+    name = PER_SAMPLE[runs[0].kind]
+    table = Table(
+        "The three worst receivers",
+        [
+            Column("method and setting"), Column("seed", "d"), Column("sample"), Column("where [m]"),
+            Column(HEADS.get(name, name), ".2f"), Column("gp there", ".2f"), Column("confidence", ".2f"),
+        ],
+        note="The moving end's position; the Gaussian process there says whether it is hard for all.",
+    )  # fmt: skip
+    for run in runs:
+        own = run.samples
+        if name not in own:
+            continue
+        badness = np.abs(own[name]) if name == "error_db" else -own[name]
+        for i in np.argsort(-np.nan_to_num(badness, nan=-np.inf))[:WORST]:
+            place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
+            rival = own.get(f"baseline/gp/{name}")
+            table.add(
+                run.setting, run.facts.get("seed"), str(own["name"][i]), place, float(own[name][i]),
+                None if rival is None else float(rival[i]), float(own["confidence"][i]),
+            )  # fmt: skip
+    return table
+
+
+def _over(values: Sequence[float | None]) -> Interval | None:
+    known = [v for v in values if v is not None]
+    return over_seeds(known) if known else None
+
+
+def number(value: object) -> float | None:
+    """As a float, None for anything that is no number."""
+    return float(value) if isinstance(value, (int, float)) else None

@@ -1,0 +1,48 @@
+"""Latencies of the models of several runs, taken again: alone, in turns, on the same queries."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsparc.evaluate import open_files
+from gsparc.report.runs import Run
+from gsparc.summary import write_samples
+from gsparc.tradeoff.sweep import asker
+from gsparc.tradeoff.timing import Pace, in_turns
+
+log = logging.getLogger(__name__)
+
+
+def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
+    """The runs with the times of single queries, each also written to its `render_ms.csv`.
+
+    A sweep runs jobs at the same time, which spoils every time column; this is for after it.
+
+    Args:
+        runs: those without a readable checkpoint keep the times they have.
+        rounds: visits to each.
+        budget_s: no new round after this [s].
+    """
+    calls: dict[int, Callable[[int], object]] = {}
+    for number, run in enumerate(runs):
+        try:
+            opened = open_files(run.checkpoints[:1])
+        except (ValueError, IndexError) as error:
+            log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
+            continue
+        calls[number] = asker(opened.methods[0], opened.data, opened.split.folds[0].test)
+    threads = {
+        number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
+    }
+    times = in_turns(calls, threads, Pace(rounds=rounds, budget_s=budget_s)) if calls else {}
+    for number, ms in times.items():
+        write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
+    nothing = np.zeros(0)
+    return [
+        replace(run, render_ms=times.get(i, nothing)) if i in times else run for i, run in enumerate(runs)
+    ]
