@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.effects import (
+    SPLAT,
     Decision,
     EffectSettings,
     decide_array,
@@ -22,6 +24,7 @@ from gsparc.learned import LearnedField
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.gp import GaussianProcess
+from gsparc.response import ResponseSettings
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +48,12 @@ class Gsparc(LearnedField):
         array_model: Method,
         **field: Any,
     ) -> None:
-        super().__init__(**field)
+        response = replace(
+            field.pop("response", ResponseSettings()),
+            array=effects.array == SPLAT,
+            carrier=effects.phase == SPLAT,
+        )
+        super().__init__(response=response, **field)
         self.switches = effects
         self._models = {"phase": phase_model, "array": array_model}
         self._probe = phase_probe
@@ -55,7 +63,9 @@ class Gsparc(LearnedField):
     @property
     def effects(self) -> str:
         """The effects that are computed, for `summary.json`."""
-        return self._chosen or "none"
+        response = self.settings.response
+        splatted = [name for name, on in (("array", response.array), ("phase", response.carrier)) if on]
+        return self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Decide, then train what was decided on; the probe's time is part of the bill."""
@@ -63,7 +73,8 @@ class Gsparc(LearnedField):
         self.decisions = self._decide(data, fold)
         for decision in self.decisions:
             log.info("%s", decision)
-        self._chosen = next((d.effect for d in self.decisions if d.on), None)
+        others = (d.effect for d in self.decisions if d.on and getattr(self.switches, d.effect) != SPLAT)
+        self._chosen = next(others, None)
         if self._chosen is None:
             report = super().fit(data, fold, run_dir)
         else:

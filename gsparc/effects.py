@@ -15,7 +15,8 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.method import Method
 
-Switch = bool | Literal["auto"]
+Switch = bool | Literal["auto", "splat"]
+SPLAT = "splat"
 
 DENSE = 0.25  # neighbours closer than this many wavelengths can be interpolated without a carrier
 PROBE_IMAGES = 12
@@ -24,7 +25,7 @@ ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able 
 
 @dataclass(frozen=True)
 class EffectSettings:
-    """Switches; off means not computed.
+    """Switches: `auto`, true, false, or `splat`: a term of the splatted field itself; off means not computed.
 
     Attributes:
         phase: carrier phase from source positions (channels of a moving receiver).
@@ -103,12 +104,14 @@ def decide_array(switch: Switch, site: Site, splatting: str | None) -> Decision:
 
 
 def _settle(effect: str, switch: Switch, obstacle: str | None) -> Decision:
-    if switch not in ("auto", True, False):
-        raise ValueError(f"model.effects.{effect}={switch!r}: choose auto, true or false")
-    if switch is True and obstacle is not None:
-        raise ValueError(f"model.effects.{effect}=true is not possible: {obstacle}")
+    if switch not in ("auto", SPLAT, True, False):
+        raise ValueError(f"model.effects.{effect}={switch!r}: choose auto, splat, true or false")
+    if switch in (SPLAT, True) and obstacle is not None:
+        raise ValueError(f"model.effects.{effect}={str(switch).lower()} is not possible: {obstacle}")
     if obstacle is not None:
         return Decision(effect, False, obstacle)
+    if switch == SPLAT:
+        return Decision(effect, True, "as configured, a term of the splatted field")
     return Decision(effect, switch is not False, "possible" if switch == "auto" else "as configured")
 
 

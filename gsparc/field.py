@@ -9,6 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+POINT = 0.05  # [m], standard deviation of a Gaussian that stands for a point
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
 
 
@@ -18,9 +19,10 @@ class FieldSettings:
 
     Attributes:
         count: initial number of Gaussians N.
-        init: `uniform` in the scene box enlarged by `margin` (the paper), or `sphere`: evenly spread
-            directions around the static receiver at distances between `near` and `far`. `auto` is
-            settled by `gsparc.resolve` before a field is made.
+        init: `uniform` in the scene box enlarged by `margin` (the paper), `sphere`: evenly spread
+            directions around the static receiver at distances between `near` and `far`, or
+            `backprojection`: one Gaussian at each source that a search of the training channels finds
+            (then `count` is not used). `auto` is settled by `gsparc.resolve` before a field is made.
         margin: enlargement of the box on each side [m].
         near, far: range of distances of `sphere` [m].
         opacity: initial opacity in (0, 1).
@@ -28,7 +30,7 @@ class FieldSettings:
     """
 
     count: int = 500
-    init: Literal["auto", "uniform", "sphere"] = "sphere"
+    init: Literal["auto", "uniform", "sphere", "backprojection"] = "sphere"
     margin: float = 2.0
     near: float = 1.0
     far: float = 6.0
@@ -80,7 +82,11 @@ class GaussianField(nn.Module):
 
 
 def initial_field(
-    settings: FieldSettings, box: Tensor, receiver: Tensor | None, rotation: Tensor | None
+    settings: FieldSettings,
+    box: Tensor,
+    receiver: Tensor | None,
+    rotation: Tensor | None,
+    sources: Tensor | None = None,
 ) -> GaussianField:
     """A field before training.
 
@@ -89,11 +95,17 @@ def initial_field(
         box: (2, 3) [m], scene box, local frame.
         receiver: (3,) [m], the static receiver; None when it moves (then `sphere` is refused).
         rotation: (3, 3), its local-to-world rotation.
+        sources: (N, 3) [m], found by a search, for `backprojection`.
 
     Raises:
-        ValueError: `init=sphere` without a static receiver, or an unknown `init`.
+        ValueError: `init=sphere` without a static receiver, `init=backprojection` without sources, or an
+            unknown `init`.
     """
     count = settings.count
+    if settings.init == "backprojection":
+        if sources is None:
+            raise ValueError("model.field.init=backprojection needs model.effects.phase=splat")
+        return GaussianField(sources, torch.full((len(sources), 3), POINT), settings.opacity)
     if settings.init == "uniform":
         low, high = box[0] - settings.margin, box[1] + settings.margin
         means = low + (high - low) * torch.rand(count, 3)
@@ -102,7 +114,7 @@ def initial_field(
         scales = torch.full((count, 3), float(settings.scale or spacing / 2))
         return GaussianField(means, scales, settings.opacity)
     if settings.init != "sphere":
-        raise ValueError(f"model.field.init={settings.init!r}: choose uniform or sphere")
+        raise ValueError(f"model.field.init={settings.init!r}: choose uniform, sphere or backprojection")
     if receiver is None or rotation is None:
         raise ValueError("model.field.init=sphere needs a static receiver; here it moves: use init=uniform")
     step = torch.arange(count) + 0.5

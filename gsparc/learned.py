@@ -23,12 +23,14 @@ from gsparc.field import FieldSettings
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.module import GaussianModule, LossSettings
-from gsparc.ops import FrozenPlan, Pose
+from gsparc.ops import Pose
 from gsparc.resolve import Choices, resolve, settled
+from gsparc.response import ResponseSettings
 from gsparc.resume import GsparcCheckpointIO
 from gsparc.schedule import OptimizerSettings
+from gsparc.start import prepare
 from gsparc.trainer import Training, run_stage
-from gsparc.warmstart import learn_prior, warm_start
+from gsparc.view import FrozenArray, FrozenView, frozen_view
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +44,7 @@ class LearnedField(Method):
         field, emission, attenuation, raster, confidence: all switches of the model.
         loss: task loss.
         optimizer: learning rates.
+        response: coherent terms: carrier phase, an array's spectra.
         name: as it appears in tables.
         warm_start: solve the emission in closed form before training (spectra of a static receiver);
             `auto` does so where it can.
@@ -58,12 +61,15 @@ class LearnedField(Method):
         confidence: ConfidenceSettings = ConfidenceSettings(),
         loss: LossSettings = LossSettings(),
         optimizer: OptimizerSettings = OptimizerSettings(),
+        response: ResponseSettings | None = None,
         name: str = "gsparc",
         warm_start: bool | Literal["auto"] = False,
         refit: bool = False,
         guesses: Sequence[str] = (),
     ) -> None:
-        self.settings = ModelSettings(field, emission, attenuation, raster, confidence)
+        self.settings = ModelSettings(
+            field, emission, attenuation, raster, response or ResponseSettings(), confidence
+        )
         self.loss = loss
         self.rates = optimizer
         self.name = name
@@ -77,7 +83,7 @@ class LearnedField(Method):
         self._ends: dict[str, Tensor] = {}
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
-        self._frozen: FrozenPlan | None = None
+        self._frozen: FrozenView | FrozenArray | None = None
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -127,23 +133,22 @@ class LearnedField(Method):
         L.seed_everything(training.seed, verbose=False)
         started = time.perf_counter()
         assert self.choices is not None
-        if "kernel" in (self.choices.encoding, self.settings.confidence.encoding.kind):
-            self._prior = learn_prior(
-                data, fold.train, self.settings.emission.encoding.anchors, training.seed
+        if resume is None:
+            ends = self._receiver(), self._ends.get("tx_position")
+            start = prepare(
+                self.settings, self.choices, data, fold.train, ends, self.loss.snapshot, training.seed, folder
             )
-        self.model = self._new_model(data.site)
+            self._prior = start.prior
+            self.model = self._new_model(data.site, start.sources)
+            start.solve(self.model)
+            spent = start.stored_s
+        else:
+            self.restore(data.site, checkpoint.read(resume).state)
+            spent = 0.0
         if confidence is not None:
-            self.model.confidence = confidence.requires_grad_(False)
-        if self.choices.warm_start and resume is None:
-            receiver = self._receiver()
-            if data.site.kind != "spectrum" or receiver is None or self._prior is None:
-                raise ValueError(
-                    "model.warm_start=true needs spectra, a static receiver and "
-                    "model.emission.encoding.kind=kernel"
-                )
-            warm_start(self.model, data, fold.train, receiver, self._prior.noise)
-        prepared = time.perf_counter() - started
-        module = GaussianModule(self.model, self.loss, self.rates, training.settings.max_steps, folder)
+            self.fitted().confidence = confidence.requires_grad_(False)
+        prepared = time.perf_counter() - started + spent
+        module = GaussianModule(self.fitted(), self.loss, self.rates, training.settings.max_steps, folder)
         marks = {"stage": stage, "earlier_s": earlier_s + prepared}
         files = GsparcCheckpointIO(self, training.config_yaml, marks)
         return prepared + run_stage(module, data, fold, training, files, resume)
@@ -152,11 +157,10 @@ class LearnedField(Method):
         ends = self._ends
         return Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
 
-    def _new_model(self, site: Site) -> GaussianModel:
+    def _new_model(self, site: Site, sources: Tensor | None) -> GaussianModel:
         assert self.choices is not None
-        settings = settled(self.settings, self.choices)
-        transmitter = self._ends.get("tx_position")
-        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
+        settings, transmitter = settled(self.settings, self.choices), self._ends.get("tx_position")
+        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape, sources)
 
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
         model = self.fitted()
@@ -187,18 +191,15 @@ class LearnedField(Method):
             ]
             confidence = None if parts[0].confidence is None else torch.cat([p.confidence for p in parts])  # type: ignore[misc]
             return Prediction(torch.cat([p.mean for p in parts]), confidence)
-        frozen = self._frozen_plan(rx)
-        if frozen is None:
-            mean = model(tx, rx).mean
-        else:
-            mean = frozen.render(model.features(tx, rx), int(model.gaussians.version)).squeeze(1)
+        frozen = self._frozen_view(rx)
+        mean = model(tx, rx).mean if frozen is None else frozen.render(model, tx, rx)
         if model.site.kind == "spectrum":
             mean = mean.clamp(0, 1)
         if model.confidence is None:
             return Prediction(mean)
         return Prediction(mean, model.confidence.normalised(model.moving(tx, rx)))
 
-    def _frozen_plan(self, rx: Pose) -> FrozenPlan | None:
+    def _frozen_view(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """The matrix of the static receiver, made anew after an edit; None for any other pose."""
         model, static = self.fitted(), self._receiver()
         if model.site.kind != "spectrum" or static is None or rx.batched:
@@ -206,7 +207,7 @@ class LearnedField(Method):
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
             return None
         if self._frozen is None or self._frozen.version != int(model.gaussians.version):
-            self._frozen = model.freeze(rx)
+            self._frozen = frozen_view(model, rx)
         return self._frozen
 
     # -- storing -----------------------------------------------------------------------------------
@@ -227,7 +228,7 @@ class LearnedField(Method):
         self._ends = dict(state["ends"])
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
-        self.model = self._new_model(site)
+        self.model = self._new_model(site, torch.zeros(1, 3))
         surgery.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
         self._frozen = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -13,6 +14,10 @@ from gsparc.ops.similarity import similarity_op
 
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
+Snapshot = Literal["none", "phase", "phase_timing"]
+"""What every snapshot has of its own: nothing, a phase, or a phase and a delay."""
+
+DELAYS_PER_TONE = 8  # the delay is sought on a comb this fine, then held while the loss is differentiated
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
 
 
@@ -126,17 +131,41 @@ def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) 
     return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
 
 
-def channel_loss(prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
+def channel_loss(
+    prediction: Tensor, target: Tensor, mask: Tensor | None = None, snapshot: Snapshot = "none"
+) -> Tensor:
     """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,).
+
+    Args:
+        prediction, target: alike; (B, A, K) complex where snapshots have offsets.
+        mask: like target, True where measured.
+        snapshot: `phase`: the least error over a phase of each sample's own; `phase_timing`: over a phase
+            and a delay, `exp(j (phi - 2 pi f tau))`, tones evenly spaced. Both leave the amplitude as it is.
 
     Raises:
         ValueError: shapes differ; broadcasting would hide an antenna that is not modelled.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
+    if snapshot != "none":
+        return _up_to_offsets(prediction, target, mask, snapshot == "phase_timing")
     error = (
         (prediction - target).abs().square() if prediction.is_complex() else (prediction - target).square()
     )
     if mask is None:
         return error.flatten(1).mean(1)
     return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
+
+
+def _up_to_offsets(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
+    """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p, h>|."""
+    known = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
+    product = (prediction.conj() * target * known).sum(1)  # (B, K)
+    if timing and product.shape[1] > 1:
+        period = DELAYS_PER_TONE * product.shape[1]
+        best = torch.fft.ifft(product.detach(), period).abs().argmax(1, keepdim=True)
+        turn = 2 * math.pi / period * best * torch.arange(product.shape[1])
+        product = product * torch.polar(torch.ones_like(turn), turn)
+    power = ((prediction.abs().square() + target.abs().square()) * known).flatten(1).sum(1)
+    alike = torch.view_as_real(product.sum(1)).square().sum(1).clamp_min(1e-20).sqrt()
+    return (power - 2 * alike) / known.flatten(1).sum(1).clamp_min(1)

@@ -27,6 +27,7 @@ from gsparc.ops import (
     make_plan,
     mean_weights,
 )
+from gsparc.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 
@@ -80,6 +81,7 @@ class ModelSettings:
     emission: EmissionSettings = dataclasses.field(default_factory=EmissionSettings)
     attenuation: AttenuationSettings = dataclasses.field(default_factory=AttenuationSettings)
     raster: RasterSettings = dataclasses.field(default_factory=RasterSettings)
+    response: ResponseSettings = dataclasses.field(default_factory=ResponseSettings)
     confidence: ConfidenceSettings = dataclasses.field(default_factory=ConfidenceSettings)
 
 
@@ -101,6 +103,7 @@ class GaussianModel(nn.Module):
         transmitter: (3,) [m], the static transmitter, or None when it moves.
         prior: smoothness found on training data, for `encoding.kind=kernel`.
         shape: (antennas A, subcarriers K) of a channel; None for one of each.
+        sources: (N, 3) [m], for `field.init=backprojection`.
     """
 
     def __init__(
@@ -111,12 +114,14 @@ class GaussianModel(nn.Module):
         transmitter: Tensor | None = None,
         prior: Prior | None = None,
         shape: tuple[int, int] | None = None,
+        sources: Tensor | None = None,
     ) -> None:
         super().__init__()
-        if site.kind == "csi" and settings.emission.activation != "linear":
+        signed = site.kind == "csi" or settings.response.array
+        if signed and settings.emission.activation != "linear":
+            what = "channels are signed" if site.kind == "csi" else "fields at an array are signed"
             raise ValueError(
-                f"model.emission.activation={settings.emission.activation}: channels are signed, "
-                "choose linear (or auto)"
+                f"model.emission.activation={settings.emission.activation}: {what}, choose linear (or auto)"
             )
         self.settings = settings
         self.site = site
@@ -126,6 +131,7 @@ class GaussianModel(nn.Module):
             box,
             None if receiver is None else receiver.position,
             None if receiver is None else receiver.rotation,
+            sources,
         )
         encoding = PositionEncoding(settings.emission.encoding, box, prior)
         self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
@@ -140,13 +146,29 @@ class GaussianModel(nn.Module):
         self.log_gain = nn.Parameter(
             torch.tensor(math.log(settings.attenuation.gain)), requires_grad=settings.attenuation.learn_gain
         )
-        if site.kind == "csi":
-            self.response = ChannelResponse(len(self.gaussians), *(shape or (1, 1)))
+        self.response = self._response(*(shape or (1, 1)), transmitter)
+
+    def _response(
+        self, antennas: int, subcarriers: int, transmitter: Tensor | None
+    ) -> ArrayResponse | ChannelResponse | PathResponse | None:
+        site, settings, means = self.site, self.settings.response, self.gaussians.means.detach()
+        if settings.array:
+            return ArrayResponse(site, settings.pattern)
+        if site.kind != "csi":
+            return None
+        if settings.carrier:
+            return PathResponse(site, len(means), antennas)
+        middle = torch.as_tensor(site.box).float().mean(0)
+        lengths = (means - middle).norm(dim=1)
+        if transmitter is not None:
+            lengths = lengths + (means - transmitter.float()).norm(dim=1)
+        known = None if site.subcarriers_hz is None else torch.as_tensor(site.subcarriers_hz)
+        return ChannelResponse(antennas, subcarriers, known, lengths)
 
     @property
     def channels(self) -> int:
         """Real outputs of each emission network: one power, or one complex gain."""
-        return 2 if self.site.kind == "csi" else 1
+        return 2 if self.site.kind == "csi" or self.settings.response.array else 1
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
         """Position of the moving end (B, 3) [m]."""
@@ -171,12 +193,16 @@ class GaussianModel(nn.Module):
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         features = self.features(tx, rx)
+        if isinstance(self.response, PathResponse):
+            gains = torch.view_as_complex(features.contiguous())
+            return Rendered(self.response(gains, self.gaussians.means, rx), None)
         plan = self.plan(rx)
         if self.site.kind == "spectrum":
             raster = composite(plan, *self._geometry(), features)
-            return Rendered(raster.image.squeeze(1), raster)
+            seen = raster.image
+            return Rendered(self.response(seen) if self.response else seen.squeeze(1), raster)
         weights = mean_weights(plan, *self._geometry()).share
-        if self.site.kind == "rssi":
+        if self.response is None:
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
         return Rendered(self.response(weights * gains), None)
@@ -206,29 +232,3 @@ class GaussianModel(nn.Module):
     def _geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         g = self.gaussians
         return g.means, g.quats, g.scales, g.opacities
-
-
-class ChannelResponse(nn.Module):
-    """Factored channels: each Gaussian's gain spreads over antennas and subcarriers by its own response.
-
-    H = w g R with R (N, A K) complex, so that many channels are one small matrix product and never one
-    network output each. R starts at one.
-
-    Args:
-        count: number of Gaussians N.
-        antennas, subcarriers: A and K.
-    """
-
-    per_gaussian = True
-
-    def __init__(self, count: int, antennas: int, subcarriers: int) -> None:
-        super().__init__()
-        self.antennas, self.subcarriers = antennas, subcarriers
-        width = antennas * subcarriers
-        self.real = nn.Parameter(torch.ones(count, width))
-        self.imaginary = nn.Parameter(torch.zeros(count, width))
-
-    def forward(self, weighted: Tensor) -> Tensor:
-        """Visible gains (B, N) complex -> channels (B, A, K) complex."""
-        response = torch.complex(self.real, self.imaginary)
-        return (weighted @ response).view(-1, self.antennas, self.subcarriers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import lightning.pytorch as L
 import torch
@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc import surgery
 from gsparc.confidence import weighted
 from gsparc.data.schema import Batch
-from gsparc.losses import channel_loss, spectrum_loss, ssim
+from gsparc.losses import Snapshot, channel_loss, spectrum_loss, ssim
 from gsparc.model import GaussianModel, Rendered
 from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
 
@@ -24,9 +24,16 @@ class LossSettings:
 
     Attributes:
         ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone.
+        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
+            not look at it.
     """
 
     ssim_weight: float = 0.2
+    snapshot: Snapshot = "none"
+
+    def __post_init__(self) -> None:
+        if self.snapshot not in get_args(Snapshot):
+            raise ValueError(f"model.loss.snapshot={self.snapshot!r}: choose {', '.join(get_args(Snapshot))}")
 
 
 class NonFiniteLoss(RuntimeError):
@@ -67,7 +74,7 @@ class GaussianModule(L.LightningModule):
             if batch.mask is not None:
                 prediction = torch.where(batch.mask, prediction, batch.target)
             return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
-        return channel_loss(prediction, batch.target, batch.mask)
+        return channel_loss(prediction, batch.target, batch.mask, self.loss.snapshot)
 
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Confidence-weighted loss of a batch."""

@@ -51,20 +51,24 @@ def resolve(
 
     still = "spectra of a static receiver"
     why = (still if static else "the receiver moves") if spectra else f"the target is {site.kind}"
-    init = decide("init", settings.field.init, "sphere" if spectra and static else "uniform", why)
+    coherent = settings.response
+    choice = "backprojection" if coherent.carrier else "sphere" if spectra and static else "uniform"
+    init = decide("init", settings.field.init, choice, "carrier phase" if coherent.carrier else why)
     encoding = decide(
         "encoding.kind",
         emission.encoding.kind,
         "fourier" if emission.hidden else "kernel",
         f"hidden={emission.hidden}",
     )
-    possible = spectra and static and not emission.hidden and encoding == "kernel"
+    possible = (coherent.carrier or (spectra and static)) and not emission.hidden and encoding == "kernel"
     started = possible if warm_start == AUTO else bool(warm_start)
     if warm_start == AUTO:
         shape = f"hidden={emission.hidden}, encoding.kind={encoding}"
         notes.append(f"warm_start=auto -> {str(possible).lower()}: {why}, {shape}")
     fitting = {"csi": "linear", "rssi": "softplus", "spectrum": "linear" if started else "sigmoid"}
     reason = "a closed-form start" if started else f"the target is {site.kind}"
+    if coherent.array:
+        fitting["spectrum"], reason = "linear", "fields at an array are signed"
     if emission.log_distance and site.kind != "csi":
         fitting[site.kind], reason = "sigmoid", "log_distance=true"
     activation = decide("activation", emission.activation, fitting[site.kind], reason)

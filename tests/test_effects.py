@@ -39,7 +39,7 @@ def test_phase_needs_channels_of_a_moving_receiver(spectra, channels) -> None:
     assert not decide_phase("auto", spectra.site, None).on
     with pytest.raises(ValueError, match=r"effects\.phase=true is not possible"):
         decide_phase(True, replace(channels, static_end="rx"), None)
-    with pytest.raises(ValueError, match="choose auto, true or false"):
+    with pytest.raises(ValueError, match="choose auto, splat, true or false"):
         decide_phase("on", channels, None)  # type: ignore[arg-type]
 
 

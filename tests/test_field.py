@@ -34,7 +34,7 @@ def test_sphere_needs_a_receiver_that_stays():
 
 
 def test_an_unknown_start_is_refused():
-    with pytest.raises(ValueError, match="choose uniform or sphere"):
+    with pytest.raises(ValueError, match="choose uniform, sphere or backprojection"):
         initial_field(FieldSettings(init="auto"), BOX, RECEIVER, TURN)
 
 

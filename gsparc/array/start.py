@@ -1,0 +1,92 @@
+"""Where a splatted field seen through an array starts: the array's complex vectors, in closed form.
+
+Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen view. Of
+the emissions that make a vector the shortest is taken; over positions, a ridge regression on kernel features.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from gsparc.array.process import learn_process, mirror_elements
+from gsparc.array.response import steering
+from gsparc.array.store import recovered, report
+from gsparc.array.tuning import tune
+from gsparc.baselines import platform_cache
+from gsparc.data.schema import Measurements
+from gsparc.encoding import Prior
+from gsparc.model import GaussianModel
+from gsparc.ops import Pose
+from gsparc.peers.encoding import to_real, training_targets
+from gsparc.view import seen_by_array
+
+RIDGE = 1e-3  # of the strongest direction of G: how short emissions are
+LEAST_NOISE = 1e-3
+
+
+@dataclass(frozen=True)
+class Vectors:
+    """Array vectors of training spectra, phases and twins settled, and how smoothly they vary.
+
+    Attributes:
+        rows: (n,) of the dataset.
+        vectors: (n, M) complex128.
+        prior: features of the emission.
+        waited_s, billed_s: seconds the recovery took now, and when it was made [s].
+    """
+
+    rows: np.ndarray
+    vectors: np.ndarray
+    prior: Prior
+    waited_s: float
+    billed_s: float
+
+
+def settled_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Vectors:
+    """Recover the vectors of the given rows (from disk where known) and agree on phases and twins."""
+    site = data.site
+    assert site.array is not None and site.grid is not None and site.wavelength is not None
+    begin = time.perf_counter()
+    found, billed = recovered(data, rows, platform_cache(), seed)
+    waited = time.perf_counter() - begin
+    report(found, data, rows, run_dir / "array_recovery.csv")
+    matrix = steering(site.array, site.grid, site.wavelength).numpy()
+    images = to_real(training_targets(data, rows), "spectrum")
+    partner, places = mirror_elements(site.array), data.tx[rows]
+    kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed).kernel
+    teacher = learn_process(found.vectors, places, partner, kernel)
+    if len(rows) > anchors:
+        places = places[np.sort(np.random.default_rng(seed).choice(len(rows), anchors, replace=False))]
+    prior = Prior(torch.from_numpy(places.astype(np.float32)), kernel.length, max(kernel.noise, LEAST_NOISE))
+    return Vectors(rows, teacher.vectors, prior, waited, billed)
+
+
+@torch.no_grad()
+def start(model: GaussianModel, data: Measurements, found: Vectors, receiver: Pose) -> None:
+    """Set the emission's read-out so that the model's array vectors are those of the training spectra.
+
+    Raises:
+        ValueError: the emission has hidden units, or follows the transmitter's distance.
+    """
+    if model.settings.emission.hidden or model.settings.attenuation.inverse_distance:
+        raise ValueError(
+            "model.warm_start=true solves a linear read-out: set model.emission.hidden=0 and "
+            "model.attenuation.inverse_distance=false"
+        )
+    view = seen_by_array(model, receiver)  # (N, M)
+    left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
+    damped = size / (size.square() + (RIDGE * size[0]).square())
+    shortest = (right.mH * damped) @ left.mH  # (M, N)
+    places = torch.from_numpy(data.tx[found.rows].astype(np.float32))
+    features = model.emission.encoding(places).to(torch.complex128)
+    gram = features.mT @ features
+    gram.diagonal().add_(found.prior.noise)
+    vectors = torch.from_numpy(found.vectors)
+    readout = torch.linalg.solve(gram, features.mT @ vectors) @ shortest  # (width, N)
+    model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
+    model.emission.bias2.zero_()

@@ -1,0 +1,173 @@
+"""From what Gaussians emit to what a receiver reports: channels, carrier phase, an array's spectra.
+
+Each response is one term of the model, with its own gradients; the model holds the one that its site and
+settings ask for.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from gsparc.array.render import SpectrumRenderer
+from gsparc.array.response import array_output, element_pattern, normalised, site_problem, steering
+from gsparc.coherent.phase import LIGHT, ranges, wave_over_band
+from gsparc.coherent.rows import tones_of
+from gsparc.data.schema import Site
+from gsparc.ops import Pose
+from gsparc.ops.channels import channels
+
+UNEVEN = 1e-6  # tones this far off an even comb, in spacings, are evaluated one by one
+
+
+@dataclass(frozen=True)
+class ResponseSettings:
+    """Coherent terms of the splatted field; off means not computed.
+
+    Attributes:
+        array: spectra arise in the static array: complex emissions are composited per direction to z, the
+            elements measure `h = A z`, and the spectrum is `|A^H h|`, normalised as the dataset says.
+        pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
+        carrier: channels take phase, delay and 1/r from the path between Gaussian and receiver. Gaussians
+            are then sources that hide nobody; who sees which is their emission's business.
+    """
+
+    array: bool = False
+    pattern: float = 0.0
+    carrier: bool = False
+
+
+class ChannelResponse(nn.Module):
+    """Factored channels: each Gaussian has a steering vector over antennas and a delay over subcarriers.
+
+    `H = A diag(w g) F^T`: 2 A + 1 numbers per Gaussian however many channels there are, and one pass for all
+    of them. Steering starts at one, delays where the paths' lengths put them.
+
+    Args:
+        antennas, subcarriers: A and K.
+        tones_hz: (K,) frequencies; None when unknown, then an even comb is assumed.
+        lengths: (N,) [m], of the paths at the start.
+    """
+
+    per_gaussian = True
+    numbers: Tensor
+
+    def __init__(self, antennas: int, subcarriers: int, tones_hz: Tensor | None, lengths: Tensor) -> None:
+        super().__init__()
+        self.subcarriers = subcarriers
+        self.steering = nn.Parameter(torch.tensor([1.0, 0.0]).repeat(len(lengths), antennas, 1))
+        numbers = torch.arange(subcarriers, dtype=torch.float64)
+        band = None
+        if tones_hz is not None and subcarriers > 1:
+            band = float(tones_hz[-1] - tones_hz[0]) * subcarriers / (subcarriers - 1)
+            numbers = (tones_hz - tones_hz[0]).double() / band * subcarriers
+        self.register_buffer("numbers", numbers - numbers.mean(), persistent=False)
+        turns = lengths / LIGHT * band if band else torch.zeros_like(lengths)
+        # In cells of 1 / bandwidth: a step of Adam then means the same on every band.
+        self.delays = nn.Parameter(turns.float(), requires_grad=subcarriers > 1)
+
+    def forward(self, weighted: Tensor) -> Tensor:
+        """Visible gains (B, N) complex -> channels (B, A, K) complex."""
+        gains = torch.view_as_real(weighted)
+        delays = self.delays.double() / self.subcarriers  # in periods of the mean tone spacing
+        numbers = self.numbers
+        if len(numbers) < 3 or float((numbers.diff() - numbers.diff().mean()).abs().max()) < UNEVEN:
+            found = channels(gains, self.steering, delays, float(numbers[0]), 1.0, self.subcarriers)
+            return torch.view_as_complex(found)
+        phase = -2 * math.pi * torch.outer(delays, numbers).float()
+        comb = torch.polar(torch.ones_like(phase), phase)
+        return torch.einsum("bn,na,nk->bak", weighted, torch.view_as_complex(self.steering), comb)
+
+
+class PathResponse(nn.Module):
+    """Channels whose phase, delay and amplitude come from positions: a moving receiver, any band, no grid.
+
+    `h[a, k] = sum_n g_n s_na (f_c / f_k) exp(-j 2 pi f_k r_n / c) / r_n`. With a known array r_n is measured
+    from each element; else s (N, A) is learned.
+
+    Args:
+        site: csi, the receiver moves.
+        count: N.
+        antennas: A.
+    """
+
+    per_gaussian = True
+    array: Tensor
+    tones: Tensor
+
+    def __init__(self, site: Site, count: int, antennas: int) -> None:
+        super().__init__()
+        known = site.array is not None and antennas > 1
+        array = torch.as_tensor(site.array).double() if known else torch.zeros(1, 3, dtype=torch.float64)
+        self.register_buffer("array", array, persistent=False)
+        self.register_buffer("tones", torch.from_numpy(tones_of(site)), persistent=False)
+        own = 1 if known else antennas
+        self.steering = nn.Parameter(torch.tensor([1.0, 0.0]).repeat(count, own, 1), requires_grad=own > 1)
+        self.carrier_hz = float(site.carrier_hz or self.tones.mean())
+
+    def waves(self, means: Tensor, rx: Pose) -> Tensor:
+        """Spherical waves (P, E, N, K) complex64 of Gaussians (N, 3) [m] at the elements of P poses."""
+        place, turn = rx.position.reshape(-1, 3).double(), rx.rotation.reshape(-1, 3, 3).double()
+        elements = place[:, None] + self.array @ turn.mT
+        distance = ranges(elements.flatten(0, 1), means)
+        waves = wave_over_band(distance, self.tones) * (self.carrier_hz / self.tones).float()
+        return waves.unflatten(0, elements.shape[:2])
+
+    def forward(self, gains: Tensor, means: Tensor, rx: Pose) -> Tensor:
+        """Emitted gains (B, N) complex -> channels (B, A, K) complex."""
+        waves = self.waves(means, rx).expand(len(gains), -1, -1, -1)
+        if waves.shape[1] > 1:
+            return torch.einsum("bn,benk->bek", gains, waves)
+        return torch.einsum("bn,na,bnk->bak", gains, torch.view_as_complex(self.steering), waves[:, 0])
+
+    def contributions(self, gains: Tensor, means: Tensor, rx: Pose) -> Tensor:
+        """Share (N,) of each Gaussian in the sum of all their powers at B receivers."""
+        loud = torch.view_as_complex(self.steering).abs().square().mean(1)
+        power = (gains.abs().square() * self.waves(means, rx).abs().square().mean((1, 3))).sum(0) * loud
+        return power / power.sum().clamp_min(1e-30)
+
+
+class ArrayResponse(nn.Module):
+    """Splat, then A: what a static array makes of arriving waves, and the spectrum it reports.
+
+    Args:
+        site: spectra of a static array.
+        pattern: exponent of the element's cosine.
+
+    Raises:
+        ValueError: the site's spectra have no array to go through.
+    """
+
+    def __init__(self, site: Site, pattern: float) -> None:
+        super().__init__()
+        problem = site_problem(site)
+        if problem is not None:
+            raise ValueError(f"model.response.array=true is not possible: {problem}")
+        assert site.grid is not None and site.array is not None and site.wavelength is not None
+        self.grid, self.how = site.grid, site.normalisation
+        matrix = steering(site.array, site.grid, site.wavelength).to(torch.complex64)
+        self.register_buffer("matrix", matrix, persistent=False)
+        elements = element_pattern(site.grid, pattern) if pattern else None
+        self.register_buffer("pattern", elements, persistent=False)
+        silence = torch.zeros(site.grid.height, site.grid.width)
+        self.renderer = SpectrumRenderer(site, silence)
+
+    def measured(self, image: Tensor) -> Tensor:
+        """Array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
+        waves = torch.complex(image[:, 0], image[:, 1])
+        return array_output(waves, self.matrix, self.grid, self.pattern)
+
+    def spectra(self, vectors: Tensor) -> Tensor:
+        """Published spectra (B, H, W) of array vectors (B, M)."""
+        known = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # nothing else is added
+        if self.how != "none":  # the renderer keeps slopes finite below a fixed amplitude: scale first
+            known = known / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
+        image = self.renderer(known).flatten(1)
+        return normalised(image, self.how).unflatten(1, (self.grid.height, self.grid.width))
+
+    def forward(self, image: Tensor) -> Tensor:
+        """Composited fields (B, 2, H, W) -> spectra (B, H, W)."""
+        return self.spectra(self.measured(image))

@@ -1,0 +1,91 @@
+"""The view of a static receiver, frozen: emissions in, spectra out, nothing projected or sorted again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.model import GaussianModel
+from gsparc.ops import FrozenPlan, Pose, StalePlan
+from gsparc.response import ArrayResponse
+
+AT_ONCE = 128  # single Gaussians whose views are in memory on the way to a small matrix
+
+
+@dataclass(frozen=True)
+class FrozenView:
+    """One pose's view of a field, valid for the parameters it was made from.
+
+    Attributes:
+        version: the field's counter at the time.
+        plan: pixels by Gaussians.
+    """
+
+    version: int
+    plan: FrozenPlan
+
+    @torch.no_grad()
+    def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
+        """Spectra (B, H, W) at tx (B, 3) [m]; `rx` is the pose that was frozen.
+
+        Raises:
+            StalePlan: the field has changed since.
+        """
+        return self.plan.render(model.features(tx, rx), int(model.gaussians.version)).squeeze(1)
+
+
+@dataclass(frozen=True)
+class FrozenArray:
+    """The same through an array: A times the view, and times the read-out where emissions are linear.
+
+    Attributes:
+        version: the field's counter at the time.
+        matrix: (N, M) complex64, emissions to array vectors; or (E, M), encoded positions to array vectors.
+        offset: (M,) complex64, added in the second case; None in the first.
+    """
+
+    version: int
+    matrix: Tensor
+    offset: Tensor | None
+
+    @torch.no_grad()
+    def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
+        """See `FrozenView.render`."""
+        if int(model.gaussians.version) != self.version:
+            raise StalePlan(
+                f"this view was frozen at version {self.version}, the field is at "
+                f"{int(model.gaussians.version)}: freeze again"
+            )
+        assert isinstance(model.response, ArrayResponse)
+        if self.offset is None:
+            emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
+            return model.response.spectra(emitted @ self.matrix)
+        encoded = model.emission.encoding(model.moving(tx, rx))
+        return model.response.spectra(torch.addmm(self.offset, encoded.to(self.matrix.dtype), self.matrix))
+
+
+@torch.no_grad()
+def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
+    """Freeze what a static receiver sees of a model of spectra."""
+    version = int(model.gaussians.version)
+    if not isinstance(model.response, ArrayResponse):
+        return FrozenView(version, model.freeze(rx))
+    matrix, emission = seen_by_array(model, rx), model.emission
+    if emission.settings.hidden or model.settings.attenuation.inverse_distance:
+        return FrozenArray(version, matrix, None)
+    weight, bias = (torch.view_as_complex(part.contiguous()) for part in (emission.weight2, emission.bias2))
+    return FrozenArray(version, weight.T @ matrix, bias @ matrix)
+
+
+@torch.no_grad()
+def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
+    """A times the frozen view (N, M) complex64: what each Gaussian's unit emission does to the elements."""
+    plan, version, response = model.freeze(rx), int(model.gaussians.version), model.response
+    assert isinstance(response, ArrayResponse)
+    parts = []
+    for units in torch.eye(len(model.gaussians)).split(AT_ONCE, 1):
+        seen = plan.render(units, version)
+        parts.append(response.measured(torch.stack([seen, torch.zeros_like(seen)], 1)))
+    return torch.cat(parts)
