@@ -94,7 +94,12 @@ def load_argos(
         noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
         release_split=split,
         row_names=[f"snapshot {i}" for i in range(len(csi))],
-        provenance={"layout": "argos", "positions": positions, "aligned": str(align)},
+        provenance={
+            "layout": "argos",
+            "positions": positions,
+            "aligned": str(align),
+            **{name: str(description[name]) for name in ("count", "seed") if name in description},
+        },
     )
     heard = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
     return replace(data, site=replace(data.site, **heard), uplink=np.ascontiguousarray(uplink))

@@ -1,0 +1,155 @@
+"""`python -m gsparc.link ckpt=FILE`: rate adaptation, PUSCH and beams with predicted channels."""
+
+from __future__ import annotations
+
+import logging
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import Progress, TextColumn, TimeElapsedColumn
+
+from gsparc import cli
+from gsparc.calibration.evidence import Evidence, gather
+from gsparc.calibration.threshold import Promise, Threshold, choose, levels_of
+from gsparc.calibration.trial import best_kind, divided
+from gsparc.clock import machine_facts
+from gsparc.evaluate import open_files
+from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.link.channels import channels
+from gsparc.link.grid import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.link.pictures import draw_acceptance, draw_errors, draw_rates
+from gsparc.link.pusch import Pusch, frequency_correlation
+from gsparc.link.study import (
+    acceptance,
+    adapt,
+    beam_facts,
+    curves,
+    pusch_facts,
+    rate_facts,
+    transmit,
+)
+from gsparc.link.tables import tables
+from gsparc.summary import provenance, write_summary
+
+log = logging.getLogger(__name__)
+
+SHARES = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
+
+
+def need_sionna() -> None:
+    """Refuse in words where Sionna is not installed."""
+    if find_spec("sionna") is None:
+        raise ValueError("gsparc.link needs Sionna: pip install 'gsparc[sionna]'")
+
+
+def accept(
+    evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int
+) -> tuple[str, Threshold, np.ndarray]:
+    """Confidence, threshold, and the positions (indices of the evidence) that neither has seen."""
+    rng = np.random.default_rng(seed)
+    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
+    used = best_kind(evidence, choose_on) if kind == "auto" else kind
+    if used not in evidence.scores:
+        raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
+    score, bad = evidence.scores[used], promise.bad(evidence.error)
+    return used, choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise), test
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """All three experiments on one checkpoint; returns the facts of `summary.json`."""
+    need_sionna()
+    torch.set_num_threads(int(config.threads))
+    torch.manual_seed(int(config.seed))
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
+    method, data, fold = run.methods[0], run.data, run.split.folds[0]
+    if data.site.kind != "csi" or data.site.subcarriers_hz is None:
+        raise ValueError(f"gsparc.link needs complex channels with their frequencies, not {data.site.kind}")
+    started = time.perf_counter()
+    evidence = gather(method, data, fold, fold.test)
+    promise = Promise(**settings["promise"])
+    kind, threshold, test = accept(evidence, promise, config.confidence, config.spatial, int(config.seed))
+    rows, score = fold.test[test], evidence.scores[kind][test]
+    accepted = score >= threshold.value
+    bad = promise.bad(evidence.error[test])
+    facts: dict[str, Any] = {
+        **dataset_facts(data), **split_facts(run.split), "model/name": method.name, "seed": int(config.seed),
+        "positions": len(rows), "confidence/kind": kind, "accepted": float(accepted.mean()),
+        "promise/alpha": promise.alpha, "promise/delta": promise.delta, "promise/limit_db": promise.limit_db,
+        "promise/bad_among_accepted": float(bad[accepted].mean()) if accepted.any() else None,
+        "promise/calibrated_on": threshold.accepted,
+        "promise/bound": threshold.bound(promise.delta),
+    }  # fmt: skip
+    own = channels(method, data, rows, data.site.subcarriers_hz)
+    if own.true.shape[1] > 1:
+        facts |= beam_facts(own.true, own.predicted, accepted)
+    antenna = int(config.antenna)
+    if antenna >= own.true.shape[1]:
+        raise ValueError(f"antenna={antenna}: the target has {own.true.shape[1]}")
+    title = f"{data.site.name}, {method.name}"
+    with Progress(
+        *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
+    ) as bar:
+        levels = settings["mcs"]["snr_db"]
+        adapting = bar.add_task("rate adaptation", total=len(levels), now="")
+        true, guess = own.true[:, antenna], own.predicted[:, antenna]
+        rates = adapt(true, guess, levels, settings["mcs"], lambda: bar.advance(adapting))
+        facts |= rate_facts(rates, accepted) | {"time/mcs_s": time.perf_counter() - started}
+        draw_rates(rates, score, title, run_dir / "mcs.png")
+        shape = settings["pusch"]
+        wanted = {name: values for name, values in shape["ebno_db"].items() if values}
+        sending = bar.add_task("PUSCH", total=sum(map(len, wanted.values())), now="")
+        count, spacing = SUBCARRIERS_PER_BLOCK * shape["blocks"], 1e3 * shape["spacing_khz"]
+        tones = data.site.subcarriers_hz
+        grid = channels(method, data, rows, centred(float(tones.mean()), spacing, count))
+        known = frequency_correlation(data.targets(fold.train)[:, antenna], tones, spacing, count)
+        facts["pusch/truth"] = grid.source
+        drawn, trades = {}, {}
+        for modulation, points in wanted.items():
+            begun = time.perf_counter()
+            pusch = Pusch(modulation, shape["blocks"], shape["spacing_khz"], known, shape["iterations"])
+
+            def tick(now: str, modulation: str = modulation) -> None:
+                bar.update(sending, now=f"{modulation} {now}")
+                bar.advance(sending)
+
+            found = transmit(
+                pusch, grid.true[:, antenna], grid.predicted[:, antenna], grid.variance, points,
+                (shape["coarse"], shape["fine"], shape["batch"]), tick,
+            )  # fmt: skip
+            drawn[modulation] = curves(found, accepted)
+            trades[modulation] = acceptance(found, score, SHARES)
+            facts |= pusch_facts(modulation, drawn[modulation])
+            for name in ("perfect", "predicted"):
+                for share, rate in zip(SHARES, trades[modulation][name], strict=True):
+                    facts[f"tradeoff/{modulation}/{name}/{share:.0%}"] = float(rate)
+            facts[f"time/pusch_{modulation}_s"] = time.perf_counter() - begun
+            facts["pilots/share_of_slot"] = pusch.pilot_share
+            facts["pilots/saved"] = pusch.pilot_share * float(accepted.mean())
+    if drawn:
+        draw_errors(drawn, title, run_dir / "bler.png")
+        draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
+    facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
+    write_summary(run_dir / "summary.json", facts)
+    console = Console()
+    for table in tables(facts, title, list(wanted), levels):
+        console.print(table)
+    console.print(f"written to {run_dir}", highlight=False)
+    return facts
+
+
+def main() -> None:
+    """Entry point."""
+    cli.run(task, "link")
+
+
+if __name__ == "__main__":
+    main()

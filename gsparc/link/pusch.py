@@ -1,0 +1,184 @@
+"""5G NR PUSCH with five kinds of channel knowledge, every block the same for all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+RECEIVERS = ("perfect", "ls", "lmmse", "predicted", "predicted_variance")
+MODULATIONS = {"qpsk": 5, "qam16": 14}  # MCS of table 1: rates 0.37 and 0.54
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What became of n blocks at one Eb/N0.
+
+    Attributes:
+        ebno_db: [dB].
+        position: (n,) index of each block's position.
+        failed: by receiver, (n,) bool, the transport block's checksum was wrong.
+        bit_errors: by receiver, (n,) share of wrong bits.
+    """
+
+    ebno_db: float
+    position: np.ndarray
+    failed: dict[str, np.ndarray]
+    bit_errors: dict[str, np.ndarray]
+
+
+class Pusch:
+    """One user, one layer, one receive antenna; two DMRS symbols a slot.
+
+    Args:
+        modulation: `qpsk` or `qam16`.
+        blocks: resource blocks of 12 subcarriers.
+        spacing_khz: subcarrier spacing [kHz].
+        correlation: frequency correlation at multiples of the subcarrier spacing (12 blocks,) complex, from
+            training channels; the LMMSE estimator's knowledge.
+        iterations: of the LDPC decoder.
+    """
+
+    def __init__(
+        self, modulation: str, blocks: int, spacing_khz: int, correlation: np.ndarray, iterations: int = 20
+    ) -> None:
+        from sionna.phy.nr import (
+            PUSCHConfig,
+            PUSCHLSChannelEstimator,
+            PUSCHReceiver,
+            PUSCHTransmitter,
+            TBDecoder,
+        )
+
+        config = PUSCHConfig()
+        config.carrier.n_size_grid = blocks
+        config.carrier.subcarrier_spacing = spacing_khz
+        config.tb.mcs_table = 1
+        config.tb.mcs_index = MODULATIONS[modulation]
+        config.dmrs.additional_position = 1
+        self.transmitter = PUSCHTransmitter(config)
+        self.grid = self.transmitter.resource_grid
+        self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
+        self._known: dict[str, tuple[Tensor, Tensor]] = {}
+        ls = PUSCHLSChannelEstimator(
+            self.grid,
+            config.dmrs.length,
+            config.dmrs.additional_position,
+            config.dmrs.num_cdm_groups_without_data,
+            interpolation_type="lin",
+        )
+        estimators: dict[str, Estimator] = {
+            "ls": ls,
+            "lmmse": _Wiener(self.grid, correlation),
+            **{name: self._told(name) for name in ("perfect", "predicted", "predicted_variance")},
+        }
+        decoder = TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
+        self.receivers = {
+            name: PUSCHReceiver(
+                self.transmitter,
+                channel_estimator=estimators[name],
+                tb_decoder=decoder,
+                return_tb_crc_status=True,
+            )
+            for name in RECEIVERS
+        }
+
+    @property
+    def pilot_share(self) -> float:
+        """Share of a slot's resource elements that pilots occupy."""
+        return float(self.grid.num_pilot_symbols) / float(self.grid.num_resource_elements)
+
+    def _told(self, name: str) -> Estimator:
+        """An estimator that was told the channel beforehand."""
+        return lambda y, no: self._known[name]
+
+    def run(
+        self,
+        true: Tensor,
+        predicted: Tensor,
+        variance: Tensor,
+        ebno_db: float,
+        position: np.ndarray,
+        batch: int,
+    ) -> Blocks:
+        """Send a block over each of `position` (n,): indices into channels (P, K) and variances (P,)."""
+        from sionna.phy.channel import ApplyOFDMChannel
+        from sionna.phy.utils import ebnodb2no
+
+        no = ebnodb2no(ebno_db, self.bits, self.rate, self.grid)
+        apply = ApplyOFDMChannel(add_awgn=True)
+        failed: dict[str, list[np.ndarray]] = {name: [] for name in RECEIVERS}
+        wrong: dict[str, list[np.ndarray]] = {name: [] for name in RECEIVERS}
+        for start in range(0, len(position), batch):
+            at = torch.from_numpy(position[start : start + batch])
+            scale = true[at].abs().square().mean(1).sqrt()[:, None]
+            there, guess = (self._slots(h[at] / scale) for h in (true, predicted))
+            sure = torch.zeros(1)
+            doubt = (variance[at] / scale[:, 0] ** 2).view(-1, *[1] * 6).expand(there.shape).contiguous()
+            self._known = {
+                "perfect": (there, sure), "predicted": (guess, sure), "predicted_variance": (guess, doubt)
+            }  # fmt: skip
+            sent, bits = self.transmitter(len(at))
+            received = apply(sent, there, no)
+            for name, receiver in self.receivers.items():
+                decoded, fine = receiver(received, no)
+                failed[name].append(~fine.bool().flatten().cpu().numpy())
+                wrong[name].append((decoded != bits).double().mean(-1).flatten().cpu().numpy())
+        return Blocks(
+            ebno_db,
+            position,
+            {name: np.concatenate(parts) for name, parts in failed.items()},
+            {name: np.concatenate(parts) for name, parts in wrong.items()},
+        )
+
+    def _slots(self, channel: Tensor) -> Tensor:
+        """(n, K) as [n, rx 1, rx_ant 1, tx 1, tx_ant 1, 14, K]."""
+        count = self.grid.num_ofdm_symbols
+        return channel[:, None, None, None, None, None, :].expand(-1, 1, 1, 1, 1, count, -1).contiguous()
+
+
+class _Wiener:
+    """LMMSE interpolation of one layer's DMRS over frequency; symbols of a slot are averaged."""
+
+    def __init__(self, grid, correlation: np.ndarray) -> None:
+        pattern = grid.pilot_pattern
+        mask = pattern.mask[0, 0].bool().cpu()
+        full = torch.zeros(mask.shape, dtype=torch.complex64)
+        full[mask] = pattern.pilots[0, 0].to(torch.complex64).cpu()
+        self.symbols = mask.any(1).nonzero().flatten()
+        self.comb = (full[self.symbols[0]].abs() > 0).nonzero().flatten()
+        self.pilots = full[self.symbols][:, self.comb]
+        lag = np.arange(mask.shape[1])[:, None] - np.arange(mask.shape[1])
+        whole = np.where(lag >= 0, correlation[np.abs(lag)], correlation[np.abs(lag)].conj())
+        self.whole = torch.from_numpy(whole).to(torch.complex128)
+
+    def __call__(self, y: Tensor, no: Tensor) -> tuple[Tensor, Tensor]:
+        heard = y[:, 0, 0][:, self.symbols][:, :, self.comb]
+        energy = self.pilots.abs().square().sum(0)
+        matched = (heard * self.pilots.conj()).sum(1) / energy
+        noise = float(torch.as_tensor(no).flatten()[0]) / energy.double()
+        known = self.whole[self.comb][:, self.comb] + torch.diag(noise).to(self.whole.dtype)
+        cross = self.whole[:, self.comb]
+        filtering = torch.linalg.solve(known.T, cross.T).T
+        smooth = (matched.to(filtering.dtype) @ filtering.T).to(torch.complex64)
+        left = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(1).real).clamp_min(0).float()
+        shape = (len(y), 1, 1, 1, 1, y.shape[3], y.shape[4])
+        estimate = smooth.view(len(y), 1, 1, 1, 1, 1, -1).expand(shape).contiguous()
+        return estimate, left.view(1, 1, 1, 1, 1, 1, -1).expand(shape).contiguous()
+
+
+def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: float, count: int) -> np.ndarray:
+    """Normalised correlation over frequency at lags 0 to count - 1 of `spacing_hz`, from channels (n, K)."""
+    if len(tones_hz) == 1:
+        return np.ones(count, complex)
+    unit = (channel / channel.abs().square().mean(1, keepdim=True).sqrt().clamp_min(1e-30)).numpy()
+    lags = np.arange(len(tones_hz))
+    values = np.array([(unit[:, lag:] * unit[:, : len(tones_hz) - lag].conj()).mean() for lag in lags])
+    step = float(np.diff(np.sort(tones_hz)).min())
+    wanted = np.arange(count) * spacing_hz
+    real, imaginary = (np.interp(wanted, lags * step, part) for part in (values.real, values.imag))
+    return (real + 1j * imaginary) / values[0].real
