@@ -15,9 +15,9 @@ from jinja2 import Environment
 from PIL import Image
 
 from gsparc.report import effects, learning, plots, tables
-from gsparc.report.runs import Run
+from gsparc.report.runs import Run, told_apart
 from gsparc.report.table import Table
-from gsparc.summary import remarks
+from gsparc.summary import BUSY, remarks
 
 PICTURE_PX = 1000  # width at which pictures are kept
 MOST_PICTURES = 6
@@ -58,8 +58,9 @@ def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarra
     ]
 
 
-def _study(title: str, runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Study:
-    study = Study(title, list(dict.fromkeys(text for run in runs for text in remarks(run.facts))))
+def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Study:
+    runs = told_apart(group)
+    study = Study(title, warnings(runs))
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
     found = (
@@ -87,6 +88,18 @@ def _study(title: str, runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarra
         if (run.folder / "test.png").is_file()
     ]
     return study
+
+
+def warnings(runs: Sequence[Run]) -> list[str]:
+    """What a reader must know first, each once: the loads of a busy machine are one range."""
+    said = [remark for run in runs for remark in remarks({**run.facts, "machine/load": None})]
+    loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
+    if loads and max(loads) > BUSY:
+        said.append(
+            f"the machine was busy (load {min(loads):.1f} to {max(loads):.1f} per core): times are inflated, "
+            "ratios less so"
+        )
+    return list(dict.fromkeys(said))
 
 
 def _named_apart(svg: str, number: int) -> str:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from scipy.stats import spearmanr
 
+from gsparc.data.schema import Kind
 from gsparc.report.intervals import interval, over_seeds
 from gsparc.report.learning import curve, validation_figure
 from gsparc.report.runs import PER_SAMPLE, Run
@@ -20,6 +23,9 @@ from gsparc.tradeoff.points import LOWER_IS_BETTER, front, score_of
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
+CDFS: dict[Kind, tuple[str, ...]] = {
+    "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
+}  # fmt: skip
 
 
 def svg(figure: Figure) -> str:
@@ -69,6 +75,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     axes.step([x[i] for i in best], [y[i] for i in best], where="post", lw=0.6, c="0.7", label="not beaten")
     axes.set_xscale("log")
     _accuracy(axes, name)
+    _leave_out_far(axes, name, y)
     axes.set_xlabel("one query [ms], median; whisker to the 95th percentile")
     axes.set_title("Accuracy against latency (95 % intervals)", fontsize=9)
     _legend(axes)
@@ -93,6 +100,45 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     axes.set_title("How the accuracy is distributed (95 % bands)", fontsize=9)
     _legend(axes)
     return figure
+
+
+def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
+    """The figure that ends a sweep: distributions over test samples and of single queries, as a PNG file.
+
+    The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
+    """
+    kind = runs[0].kind
+    names = [name for name in CDFS[kind] if name in runs[0].samples]
+    timed = any(len(run.render_ms) for run in runs)
+    figure = Figure(figsize=(4.2 * (len(names) + timed), 3.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(names) + timed, squeeze=False)[0]
+    for number, (setting, group) in enumerate(grouped(runs).items()):
+        seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
+        ms = [p50 for p50, _ in (run.latency for run in group) if p50 is not None]
+        label = f"{_short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
+        for axes, name in zip(panels, names, strict=False):
+            values = np.abs(np.concatenate([run.samples[name] for run in group]))
+            _cdf(axes, values[np.isfinite(values)], label, number, samples=len(group[0].samples[name]))
+            axes.set_xlabel(HEADS.get(name, name))
+        if timed:
+            every = [run.render_ms for run in group if len(run.render_ms)]
+            _cdf(panels[-1], np.concatenate(every), label, number)
+            panels[-1].set_xlabel("one query, alone [ms]")
+            panels[-1].set_xscale("log")
+    for axes, name in zip(panels, names, strict=False):
+        if name in ("mse", "error_power"):
+            axes.set_xscale("log")
+    for axes in panels:
+        axes.grid(alpha=0.3)
+    panels[0].set_ylabel("share")
+    figure.suptitle(title, fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(
+        handles, labels, loc="outside lower center", fontsize=7, ncols=2, title="training, one query"
+    )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100)
 
 
 def latency_cdf(runs: Sequence[Run]) -> Figure | None:
@@ -253,6 +299,13 @@ def _accuracy(axes: Axes, name: str) -> None:
     axes.set_ylabel(HEADS.get(name, name))
     if name in LOWER_IS_BETTER or name == "mse":
         axes.set_yscale("log")
+
+
+def _leave_out_far(axes: Axes, name: str, values: Sequence[float]) -> None:
+    """A black image at 6 dB would flatten everything above 25: what is far below the median is not drawn."""
+    if name == "psnr_db" and len(values) > 1:
+        middle, best = float(np.median(values)), max(values)
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best - middle), 5.0)))
 
 
 def _legend(axes: Axes) -> None:

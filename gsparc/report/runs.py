@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,14 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
     if not found:
         raise ValueError("a swept front alone is no report: give the directory of its run too")
     return list(found.values())
+
+
+def told_apart(runs: Sequence[Run]) -> list[Run]:
+    """The runs with only those overrides in which they differ, so that names are short."""
+    if len(runs) < 2:
+        return list(runs)
+    shared = set.intersection(*(set(run.overrides) for run in runs))
+    return [replace(run, overrides=tuple(o for o in run.overrides if o not in shared)) for run in runs]
 
 
 def _is_run(file: Path) -> bool:

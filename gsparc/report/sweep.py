@@ -1,0 +1,115 @@
+"""The end of a multirun: failures said at once, models timed alone, one table and one figure."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table as Shown
+
+from gsparc.cli import one_line
+from gsparc.report.intervals import Interval
+from gsparc.report.table import Column, Table
+from gsparc.summary import provenance, write_summary
+
+log = logging.getLogger(__name__)
+
+FAILURE = "failure.txt"
+WIDE = ("SSIM (uniform 7)", "MSE", "p95")  # left to the files
+
+
+class SweepReport(Callback):
+    """A Hydra callback: does nothing in a single run.
+
+    Args:
+        retime: time the models of the sweep when all jobs are done, in turns, with nothing beside them.
+        rounds: visits to each model by the clock.
+        budget_s: no new round after this [s].
+    """
+
+    def __init__(self, retime: bool = True, rounds: int = 40, budget_s: float = 60.0) -> None:
+        self.retime, self.rounds, self.budget_s = retime, rounds, budget_s
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **unused: Any) -> None:
+        """Say a failure when it happens; the sweep goes on, and ends with exit status 1."""
+        if config.hydra.mode != RunMode.MULTIRUN or job_return.status != JobStatus.FAILED:
+            return
+        error = job_return._return_value
+        said = one_line(error) if isinstance(error, BaseException) else str(error)
+        folder = Path(config.hydra.runtime.output_dir)
+        (folder / FAILURE).write_text(said + "\n", encoding="utf-8")
+        log.error("failed", exc_info=error)  # the job's own log keeps the traceback
+        Console(stderr=True, soft_wrap=True).print(
+            f"job {folder.name} failed, the others go on: {said}", style="red", markup=False, highlight=False
+        )
+        job_return.status = JobStatus.COMPLETED
+        job_return.return_value = None
+
+    def on_multirun_end(self, config: DictConfig, **unused: Any) -> None:
+        """Time, tabulate and draw what the sweep made."""
+        folder = Path(config.hydra.sweep.dir)
+        failed = sorted(folder.rglob(FAILURE))
+        console = Console(soft_wrap=True)
+        if any((path / "summary.json").is_file() for path in folder.iterdir()):
+            report(folder, str(config.get("title") or folder.name), console, self)
+        if failed:
+            names = ", ".join(path.parent.name for path in failed)
+            console.print(f"error: {len(failed)} jobs failed: {names}", style="red", markup=False)
+            sys.exit(1)
+
+
+def report(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
+    """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
+    from gsparc.report import plots
+    from gsparc.report.page import studies, write
+    from gsparc.report.runs import find_runs, told_apart
+    from gsparc.report.tables import seeds
+    from gsparc.report.timing import retime
+
+    runs = find_runs([folder])
+    if settings.retime:
+        runs = retime(runs, rounds=settings.rounds, budget_s=settings.budget_s)
+    origin = provenance()
+    write(folder, title, f"{len(runs)} runs at commit {str(origin['git'])[:8]}", studies(runs))
+    facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
+    by_study: dict[tuple[str, str], list] = {}
+    for run in runs:
+        by_study.setdefault(run.study, []).append(run)
+    for number, (study, together) in enumerate(by_study.items()):
+        group = told_apart(together)
+        stem = "sweep" if number == 0 else f"sweep-{number + 1}"
+        table = seeds(group)
+        (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
+        (folder / f"{stem}.md").write_text(table.markdown(), encoding="utf-8")
+        plots.distributions(group, f"{title}: {', split '.join(study)}", folder / f"{stem}.png")
+        console.print(_on_screen(table))
+        for row in table.rows:
+            for column, value in zip(table.columns[1:], row[1:], strict=True):
+                facts[f"{study[0]}/{study[1]}/{row[0]}/{column.name}"] = getattr(value, "value", value)
+    write_summary(folder / "summary.json", facts)
+    console.print(f"written to {folder}", highlight=False)
+
+
+def _on_screen(table: Table) -> Shown:
+    """What fits a terminal; the files have the rest."""
+    columns = [i for i, column in enumerate(table.columns) if column.name not in WIDE]
+    shown = Shown(title=table.title, caption="least to largest over seeds; sweep.csv has more")
+    for i in columns:
+        shown.add_column(table.columns[i].name, justify="left" if i == 0 else "right")
+    for row in table.rows:
+        shown.add_row(*(_spread(row[i], table.columns[i]) for i in columns))
+    return shown
+
+
+def _spread(value: Any, column: Column) -> str:
+    if isinstance(value, Interval) and value.low is not None and value.high is not None:
+        low, high = format(value.low, column.form), format(value.high, column.form)
+        return low if low == high else f"{low} to {high}"
+    return Table("", ()).shown(value, column)
