@@ -19,6 +19,7 @@ from gsparc.scoring import Scores, rows_of, score
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
+SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
 OWN = "self"  # the evaluated method's name on the clock; baselines may carry the same name as it
 
 
@@ -116,16 +117,20 @@ def paired_differences(scores: Scores, reference: Scores, name: str) -> dict[str
 
 def latencies(
     methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings | None = None
-) -> dict[str, float | int | str]:
-    """`time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others, timed in turns."""
+) -> dict[str, float | int | str | None]:
+    """`time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others, timed in turns.
+
+    A method that marches rays for seconds a query has no batch figure: it would be timed for many minutes.
+    """
     clock = clock or ClockSettings()
     singles = _calls(methods, _queries(data, rows, 1))
     one = interleaved({**singles, COPY: reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
-    many = interleaved(_calls(methods, _queries(data, rows, BATCH)), fewer)
+    quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
+    many = interleaved(_calls(quick, _queries(data, rows, BATCH)), fewer)
     copy_ms = float(np.median(one[COPY]))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
-    facts: dict[str, float | int | str] = {
+    facts: dict[str, float | int | str | None] = {
         "time/copy_ms": copy_ms,
         "time/rounds": len(one[COPY]),
         "time/includes": (
@@ -137,7 +142,8 @@ def latencies(
         room = "time" if name == OWN else f"baseline/{name}"
         facts[f"{room}/render_ms_p50"] = float(np.median(one[name]))
         facts[f"{room}/render_ms_p95"] = float(np.quantile(one[name], 0.95))
-        facts[f"{room}/render_ms_batch{BATCH}"] = float(np.median(many[name])) / BATCH
+        together = float(np.median(many[name])) / BATCH if name in quick else None
+        facts[f"{room}/render_ms_batch{BATCH}"] = together
         facts[f"{room}/ratio_to_copy"] = float(np.median(one[name])) / copy_ms
     return facts
 

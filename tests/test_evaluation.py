@@ -206,3 +206,13 @@ def test_only_the_chosen_rows_are_asked_about(campaign, folds):
     for asked in method.asked:
         assert (torch.cdist(asked, allowed).min(1).values < 1e-6).all()
     assert {len(asked) for asked in method.asked} == {3, 1, 64}
+
+
+def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, monkeypatch):
+    """Ray marching took ten minutes to be timed in batches of 64."""
+    monkeypatch.setattr("gsparc.evaluation.SLOWEST_BATCH_MS", 0.0)
+    data, split = campaign("spectrum", 40), folds(40)
+    method = Remembering((12, 24))
+    facts = evaluate(method, None, data, split, eval_on="val", baselines=(), clock=QUICK).facts
+    assert facts["time/render_ms_batch64"] is None and facts["time/render_ms_p50"] > 0
+    assert 64 not in {len(asked) for asked in method.asked}
