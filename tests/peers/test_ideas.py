@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scenes import error, lobes, room, shadowed, wandering
+from known_arrays import array_site, measure, room_vectors, walk
+from scenes import error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
-from gsparc.ops import Pose
+from gsparc.data.rfid import planar_array
+from gsparc.ops import Pose, SphereGrid
 from gsparc.peers.directions import virtual_transmitters
 from gsparc.peers.kriging import fit_variogram
 from gsparc.peers.radiance import fourier_legendre, terms
@@ -105,6 +107,17 @@ def test_ngrf_finds_the_waves_of_a_room_that_interpolation_cannot(tmp_path):
     plain = error(fitted("gp", data, fold, tmp_path), data, fold.test)
     method = fitted("ngrf", data, fold, tmp_path, count=30, max_steps=400, rate=5e-3)
     assert error(method, data, fold.test) < min(0.5 * plain, 0.3)
+
+
+def test_ngrf_shows_its_waves_through_an_array(tmp_path):
+    """Sixteen elements in a traced room, a tag carried along a path."""
+    grid, array = SphereGrid.hemisphere(18, 36), planar_array(4, 4, 0.16)
+    tx = walk(120)
+    data = measure(array_site(grid, array), tx, room_vectors(tx, 1, array)[0])
+    fold = fold_of(data)
+    known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
+    method = fitted("ngrf", data, fold, tmp_path, count=40, max_steps=400, rate=5e-3)
+    assert error(method, data, fold.test) < 0.75 * known
 
 
 def test_rays_meet_at_the_virtual_transmitters():

@@ -89,7 +89,7 @@ def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds)
             method.fit(campaign(kind, 30), fold, tmp_path)
     with pytest.raises(ValueError, match="newrf: needs directions of arrival"):
         brief("newrf").fit(campaign("csi", 30, "tx"), fold, tmp_path)
-    with pytest.raises(ValueError, match="ngrf: spectra need .* array"):
+    with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
         brief("ngrf").fit(campaign("spectrum", 30), fold, tmp_path)
     with pytest.raises(ValueError, match="gsrf: not fitted"):
         brief("gsrf").predict(torch.zeros(1, 3), None)
