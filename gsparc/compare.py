@@ -109,8 +109,12 @@ def fill_all(
             except (ValueError, RuntimeError) as error:
                 log.warning("%s cannot be filled: %s", one.cell, cli.one_line(error))
                 continue
-            score = table.score_db(found.facts["dataset/kind"], found.facts)
-            log.info("%s: %.2f dB after %.1f s", one.cell, score, found.facts["time/train_s"])
+            score = (
+                f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB"
+                if found.scored()
+                else "-"
+            )
+            log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
         if found is not None:
             filled.append(found)
     return filled
@@ -150,7 +154,7 @@ def report(
     """Write `compare.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
     rows = table.rows(filled, timed)
     blocks = table.blocks(rows)
-    page = table.markdown(blocks, ours)
+    page = table.markdown(blocks, ours, timed)
     table.write_csv(rows, run_dir / "compare.csv")
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
     figure.draw(rows, run_dir / "compare.png", ours)

@@ -29,6 +29,7 @@ class Contender:
         kinds: of data it serves; empty for all.
         reserve_s: part of the budget that its own `budget_s` does not count [s].
         only_longest: too slow for any but the longest budget.
+        timed_only: too slow to be scored at all: fitted for its latency.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Contender:
     kinds: tuple[str, ...] = ()
     reserve_s: float = 0.0
     only_longest: bool = False
+    timed_only: bool = False
 
     def serves(self, kind: str) -> bool:
         """Whether data of this kind can be predicted."""

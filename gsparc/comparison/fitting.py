@@ -77,6 +77,10 @@ class Filled:
     folder: Path
     facts: dict[str, Any]
 
+    def scored(self) -> bool:
+        """Whether it was tested, not only timed."""
+        return any(name.startswith("test/") for name in self.facts)
+
     @property
     def checkpoint(self) -> Path:
         """Of the first fold."""
@@ -90,6 +94,7 @@ class Prepared:
     cell: Cell
     config: DictConfig
     folder: Path
+    scored: bool = True
 
     def found(self) -> Filled | None:
         """The kept result, if there is a whole one."""
@@ -105,7 +110,8 @@ def prepare(cell: Cell, contender: Contender, settings: dict[str, Any], room: Ro
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
     model, trainer = _plain(config.model), _plain(config.trainer)
     name = key(model, trainer, room.data.site.sha256, room.folds.sha256)
-    return Prepared(cell, config, kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}")
+    folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
+    return Prepared(cell, config, folder, not contender.timed_only)
 
 
 def fill(prepared: Prepared, room: Room) -> Filled:
@@ -117,7 +123,7 @@ def fill(prepared: Prepared, room: Room) -> Filled:
     """
     config, folder = prepared.config, prepared.folder
     methods, seconds, processor, notes = [], [], [], []
-    for number, fold in enumerate(room.folds.folds):
+    for number, fold in enumerate(room.folds.folds[: None if prepared.scored else 1]):
         method = build(config.model)
         if isinstance(method, LearnedField):
             method.training = Training(
@@ -136,8 +142,8 @@ def fill(prepared: Prepared, room: Room) -> Filled:
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
         methods.append(method)
     started = time.perf_counter()
-    scores = score(methods, room.data, room.folds)
-    facts = {f"test/{name}": value for name, value in scores.figures().items()}
+    figures = score(methods, room.data, room.folds).figures() if prepared.scored else {}
+    facts: dict[str, Any] = {f"test/{name}": value for name, value in figures.items()}
     facts |= {
         "time/train_s": sum(seconds) / len(seconds),
         "time/train_cpu_s": sum(processor) / len(processor),

@@ -69,7 +69,8 @@ def score_db(kind: str, facts: Mapping[str, Any]) -> float:
 
 
 def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> list[Row]:
-    """Average over seeds; `timed` holds latencies by dataset and method."""
+    """Average the scored cells over seeds; `timed` holds latencies by dataset and method."""
+    filled = [one for one in filled if one.scored()]
 
     def group(one: Filled) -> tuple[str, str, float, str]:
         cell = one.cell
@@ -168,9 +169,19 @@ def remarks(block: Block, ours: str) -> list[str]:
     return said
 
 
-def markdown(found: Sequence[Block], ours: str) -> str:
-    """All blocks as one page."""
-    return "\n\n".join(_page(block, ours) for block in found) + "\n"
+def markdown(
+    found: Sequence[Block], ours: str, timed: Mapping[str, Mapping[str, Latency]] | None = None
+) -> str:
+    """All blocks as one page, and what was timed but is too slow to be scored."""
+    pages = [_page(block, ours) for block in found]
+    scored = {row.method for block in found for row in block.rows}
+    pages += [
+        f"{name} on {dataset}: {latency.p50_ms / 1e3:.3g} s a query, timed only ({latency.rounds} rounds)"
+        for dataset, here in (timed or {}).items()
+        for name, latency in here.items()
+        if name not in scored
+    ]
+    return "\n\n".join(pages) + "\n"
 
 
 def _page(block: Block, ours: str) -> str:

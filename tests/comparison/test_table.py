@@ -21,6 +21,7 @@ def filled(method, psnr, seed=None, budget=None, split="random", load=0.1):
 
 FOUND = [
     filled("gp", 30.0),
+    Filled(Cell("rfid", "random", "unscored", None, None), None, {"dataset/kind": "spectrum"}),
     *(filled("gsparc", 29.0 + s, s, 60.0) for s in (0.0, 1.0)),
     *(filled("gsrf", 20.0 + s, s, 60.0, load=3.0) for s in (0.0, 2.0)),
     filled("gsrf", 25.0, 0, 300.0),
@@ -60,7 +61,10 @@ def test_scores_are_decibels_of_which_more_are_better():
 
 def test_page_sheet_and_picture_show_every_method(tmp_path):
     found = rows(FOUND, TIMED)
-    page = markdown(blocks(found), "gsparc")
+    page = markdown(
+        blocks(found), "gsparc", {"rfid": {**TIMED["rfid"], "nerf2": Latency(60e3, 61e3, 1.0, 1)}}
+    )
+    assert "nerf2 on rfid: 60 s a query, timed only" in page and "gp on rfid" not in page
     assert "### rfid, split random, 60 s of training per model" in page
     assert "**29.50 ± 0.71**" in page and "| gsrf | 21 | 21.00 ± 1.41 |" in page
     write_csv(found, tmp_path / "compare.csv")
