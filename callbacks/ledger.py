@@ -87,7 +87,7 @@ class CostLedger(L.Callback):
         row = {key: figures.get(key, "") for key in COLUMNS}
         row |= {
             "step": trainer.global_step,
-            "train_s": round(self.seconds, 3),
+            "train_s": round(module.prepared_seconds + self.seconds, 3),
             "num_gaussians": int(figures.get("model/num_gaussians", 0)),
         }
         self._append(module.run_dir / self.file, row)

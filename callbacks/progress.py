@@ -31,15 +31,17 @@ class StepProgress(L.Callback):
         )
         self._bar.start()
         stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
-        self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
+        done, total = _progress(trainer, module)
+        self._bar.add_task(stage, total=total, completed=done, figures="")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Advance; figures are read now and then, not at every step."""
         if self._bar is None:
             return
         task = self._bar.task_ids[0]
-        self._bar.update(task, completed=trainer.global_step)
-        if trainer.global_step % 20 == 0 or trainer.global_step == trainer.max_steps:
+        done, total = _progress(trainer, module)
+        self._bar.update(task, completed=done)
+        if trainer.global_step % 20 == 0 or done == total:
             found = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
             figures = [form.format(float(value)) for form, value in found.items() if value is not None]
             self._bar.update(task, figures=", ".join([*figures, f"{len(module.model.gaussians)} Gaussians"]))
@@ -56,3 +58,9 @@ class StepProgress(L.Callback):
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+def _progress(trainer: L.Trainer, module: Any) -> tuple[int, int]:
+    """Steps done and in all; of the stretched schedule when seconds decide."""
+    pace = module.pace
+    return (trainer.global_step, trainer.max_steps) if pace is None else (pace.step, pace.total)

@@ -84,6 +84,9 @@ class Gsparc(LearnedField):
                     "(the splatted field, effects.*=false, resumes)"
                 )
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
+            budget_s = self.training.settings.budget_s
+            if budget_s is not None and hasattr(self._models[self._chosen], "budget_s"):
+                self._models[self._chosen].budget_s = budget_s - sum(d.seconds for d in self.decisions)
             report = self._models[self._chosen].fit(data, fold, run_dir)
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
 

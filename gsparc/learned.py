@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from gsparc import checkpoint, surgery
+from gsparc.budget import Pace
 from gsparc.confidence import Confidence, ConfidenceSettings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -148,7 +149,13 @@ class LearnedField(Method):
         if confidence is not None:
             self.fitted().confidence = confidence.requires_grad_(False)
         prepared = time.perf_counter() - started + spent
-        module = GaussianModule(self.fitted(), self.loss, self.rates, training.settings.max_steps, folder)
+        steps, pace = training.settings.max_steps, None
+        if training.settings.budget_s is not None:
+            first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
+            end = training.settings.budget_s * (0.5 if first else 1.0)
+            pace = Pace(steps, end - earlier_s - prepared)
+        module = GaussianModule(self.fitted(), self.loss, self.rates, steps, folder, pace)
+        module.prepared_seconds = earlier_s + prepared
         marks = {"stage": stage, "earlier_s": earlier_s + prepared}
         files = GsparcCheckpointIO(self, training.config_yaml, marks)
         return prepared + run_stage(module, data, fold, training, files, resume)

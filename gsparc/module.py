@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc import surgery
+from gsparc.budget import Pace
 from gsparc.confidence import weighted
 from gsparc.data.schema import Batch
 from gsparc.losses import Snapshot, channel_loss, spectrum_loss, ssim
@@ -49,6 +50,7 @@ class GaussianModule(L.LightningModule):
         optimizer: learning rates.
         total_steps: length of the schedules.
         run_dir: where a poisoned batch is left.
+        pace: says how far the schedules are when seconds decide, not steps.
     """
 
     def __init__(
@@ -58,6 +60,7 @@ class GaussianModule(L.LightningModule):
         optimizer: OptimizerSettings,
         total_steps: int,
         run_dir: Path,
+        pace: Pace | None = None,
     ) -> None:
         super().__init__()
         self.model = model
@@ -65,6 +68,8 @@ class GaussianModule(L.LightningModule):
         self.rates = optimizer
         self.total_steps = total_steps
         self.run_dir = run_dir
+        self.pace = pace
+        self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
@@ -116,7 +121,7 @@ class GaussianModule(L.LightningModule):
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""
         optimizer = optimizer_for(self.model, self.rates)
-        scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
+        scheduler = scheduler_for(optimizer, self.rates, self.total_steps, self.pace)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:

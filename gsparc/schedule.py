@@ -9,6 +9,8 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
+from gsparc.budget import Pace
+
 
 @dataclass(frozen=True)
 class OptimizerSettings:
@@ -76,10 +78,12 @@ def rate_factor(kind: str, settings: OptimizerSettings, step: int, total: int) -
     return rise * (settings.decay + (1 - settings.decay) * 0.5 * (1 + math.cos(math.pi * progress)))
 
 
-def scheduler_for(optimizer: Adam, settings: OptimizerSettings, total: int) -> LambdaLR:
-    """The schedule of every group over `total` steps."""
+def scheduler_for(
+    optimizer: Adam, settings: OptimizerSettings, total: int, pace: Pace | None = None
+) -> LambdaLR:
+    """The schedule of every group over `total` steps, or as far as `pace` says it is."""
 
     def factor(kind: str):
-        return lambda step: rate_factor(kind, settings, step, total)
+        return lambda step: rate_factor(kind, settings, step if pace is None else pace.step, total)
 
     return LambdaLR(optimizer, [factor(kind_of(group["name"])) for group in optimizer.param_groups])

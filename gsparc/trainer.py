@@ -16,6 +16,7 @@ import lightning.pytorch as L
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.io import CheckpointIO
 
+from gsparc.budget import Budget, Stretched
 from gsparc.data.module import MeasurementsModule
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -28,6 +29,8 @@ class TrainerSettings:
 
     Attributes:
         max_steps: optimiser steps.
+        budget_s: seconds of training instead, over all stages; every schedule is stretched from `max_steps`
+            to end with it. Null: `max_steps` decide.
         batch_size: samples per step.
         val_every: steps between validations.
         checkpoint_every: steps between `last.ckpt`.
@@ -36,6 +39,7 @@ class TrainerSettings:
     """
 
     max_steps: int = 3000
+    budget_s: float | None = None
     batch_size: int = 16
     val_every: int = 500
     checkpoint_every: int = 500
@@ -47,6 +51,10 @@ class TrainerSettings:
             value = getattr(self, name)
             if not isinstance(value, int) or isinstance(value, bool) or value < 1:
                 raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 1 is needed")
+        if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
+            raise ValueError(
+                f"trainer.budget_s={self.budget_s!r}: a positive number of seconds is needed, or null"
+            )
 
 
 @dataclass
@@ -135,12 +143,16 @@ def run_stage(
         enable_version_counter=False,
     )
     stop = StopBetweenSteps(folder / "last.ckpt")
+    callbacks, pace = list(training.callbacks()), module.pace
+    if pace is not None:
+        stretched = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
+        callbacks = [Budget(pace), *stretched]
     trainer = L.Trainer(
         accelerator=settings.accelerator,
         devices=1,
-        max_steps=settings.max_steps,
+        max_steps=settings.max_steps if pace is None else -1,
         max_epochs=-1,
-        callbacks=[*training.callbacks(), stop, last],
+        callbacks=[*callbacks, stop, last],
         logger=list(training.loggers) or False,
         plugins=[checkpoints],
         gradient_clip_val=settings.gradient_clip,

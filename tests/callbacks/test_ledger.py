@@ -27,7 +27,7 @@ def trainer(callbacks=(), **figures) -> SimpleNamespace:
 
 
 def test_validation_and_pictures_are_not_billed(clock, tmp_path):
-    bill, module = CostLedger(), SimpleNamespace(run_dir=tmp_path, train_seconds=0.0)
+    bill, module = CostLedger(), SimpleNamespace(run_dir=tmp_path, train_seconds=0.0, prepared_seconds=0.0)
     run = trainer([bill])
     bill.on_train_start(run, module)
     clock.value += 3
@@ -57,7 +57,10 @@ def test_no_ledger_nothing_to_pause():
 
 
 def test_the_curve_has_accuracy_beside_seconds(clock, tmp_path):
-    bill, module = CostLedger(), SimpleNamespace(run_dir=tmp_path / "new", train_seconds=0.0)
+    bill, module = (
+        CostLedger(),
+        SimpleNamespace(run_dir=tmp_path / "new", train_seconds=0.0, prepared_seconds=0.0),
+    )
     run = trainer([bill], **{"val/psnr_db": 21.5, "model/num_gaussians": 40.0, "other": 1.0})
     bill.on_train_start(run, module)
     for _ in range(2):

@@ -1,0 +1,137 @@
+"""Training for a number of seconds: every schedule written in steps is stretched to end with the budget.
+
+Nothing is known of a step's cost before: after each step the share of the budget that is spent says where in
+its schedule the training is.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import lightning.pytorch as L
+
+
+class Pace:
+    """How far a schedule written for `total` steps has come, when seconds decide.
+
+    Args:
+        total: steps of the schedule.
+        budget_s: seconds in which they are to pass [s].
+    """
+
+    def __init__(self, total: int, budget_s: float) -> None:
+        self.total, self.budget_s = total, budget_s
+        self.step = self._before = 0
+
+    def spend(self, seconds: float) -> None:
+        """Now this much is spent [s]."""
+        self._before = self.step
+        share = seconds / self.budget_s if self.budget_s > 0 else 1.0
+        self.step = min(int(share * self.total), self.total)
+
+    def passed(self, interval: int) -> int | None:
+        """The last multiple of `interval` that the last step passed or reached; None when it passed none."""
+        multiple = self.step // interval * interval
+        return multiple if multiple > self._before else None
+
+    @property
+    def over(self) -> bool:
+        """Whether the budget is spent."""
+        return self.step >= self.total
+
+
+class Budget(L.Callback):
+    """Ends training when its seconds are spent; validation is not billed.
+
+    Args:
+        pace: told after every step.
+    """
+
+    def __init__(self, pace: Pace) -> None:
+        self.pace = pace
+        self.seconds = 0.0
+        self._since: float | None = None
+
+    def _go(self) -> None:
+        self._since = time.perf_counter()
+
+    def _halt(self) -> None:
+        if self._since is not None:
+            self.seconds += time.perf_counter() - self._since
+        self._since = None
+
+    def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
+        """Start the watch."""
+        self.pace.spend(self.seconds)
+        self._go()
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
+        """Say how far it is; end when it is over."""
+        self._halt()
+        self.pace.spend(self.seconds)
+        trainer.should_stop = trainer.should_stop or self.pace.over
+        self._go()
+
+    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
+        """Stop the watch."""
+        self._halt()
+
+    def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Go on."""
+        if trainer.state.fn == "fit":
+            self._go()
+
+    def state_dict(self) -> dict[str, Any]:
+        """Seconds spent, so that a resumed run has only the rest."""
+        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        return {"seconds": self.seconds + running}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from there."""
+        self.seconds = float(state["seconds"])
+
+
+class Stretched(L.Callback):
+    """A callback with an `interval` of steps, shown the steps of the stretched schedule.
+
+    Args:
+        inner: acts at multiples of its `interval`.
+        pace: says which step of the schedule it is.
+    """
+
+    def __init__(self, inner: Any, pace: Pace) -> None:
+        self.inner, self.pace = inner, pace
+
+    @property
+    def state_key(self) -> str:
+        """The inner callback's."""
+        return self.inner.state_key
+
+    def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
+        """As the inner callback, at the schedule's step."""
+        self.inner.on_after_backward(_At(trainer, self.pace.step), module)
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: Any, *rest: Any) -> None:
+        """As the inner callback, when a multiple of its interval was passed."""
+        multiple = self.pace.passed(self.inner.interval)
+        if multiple is not None:
+            self.inner.on_train_batch_end(_At(trainer, multiple), module, *rest)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The inner callback's."""
+        return self.inner.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """The inner callback's."""
+        self.inner.load_state_dict(state)
+
+
+class _At:
+    """A trainer at another step."""
+
+    def __init__(self, trainer: L.Trainer, step: int) -> None:
+        self._trainer, self.global_step = trainer, step
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._trainer, name)
