@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from gsparc import checkpoint, cli
+from gsparc import checkpoint, cli, limits
 from gsparc.baselines import platform_cache
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements, Site
@@ -98,6 +98,7 @@ def evaluate_files(
 
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    limits.check(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
     if config.threads is not None:
         torch.set_num_threads(int(config.threads))
     run_dir = Path(HydraConfig.get().runtime.output_dir)

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
-from gsparc import checkpoint, cli
+from gsparc import checkpoint, cli, limits
 from gsparc.baselines import platform_cache
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
@@ -64,6 +64,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     Raises:
         ValueError: bad data, settings or checkpoint; one line each.
     """
+    limits.check(_plain(config))
     if config.threads is not None:
         torch.set_num_threads(int(config.threads))
     _anchor(config)

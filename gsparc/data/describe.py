@@ -49,6 +49,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
         ("neighbours", _neighbours(moving, site.wavelength)),
     ]
+    lines += [("units?", hint) for hint in _units(np.concatenate([data.tx, data.rx_position]))]
     if site.carrier_hz is not None:
         lines.append(("carrier", f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"))
     else:
@@ -98,6 +99,21 @@ def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
         text += f", {np.median(distance) / wavelength:.2g} wavelengths"
     same = int((distance == 0).sum())
     return text + (f"; {same} rows share their place with another" if same else "")
+
+
+def _units(positions: np.ndarray) -> list[str]:
+    """A doubt that positions (n, 3) are metres: a mountain may be a kilometre high, a room is not."""
+    extent = np.ptp(positions, axis=0)
+    height, width = float(extent[2]), float(extent.max())
+    if height > 100 or width > 1e4:
+        unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
+        size = " x ".join(f"{e * factor:.3g}" for e in extent)
+        return [
+            f"heights differ by {height:.4g} m; if these are {unit}, the box is {size} m: convert to metres"
+        ]
+    if 0 < width < 0.01:
+        return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
+    return []
 
 
 def _grid(grid: SphereGrid) -> str:

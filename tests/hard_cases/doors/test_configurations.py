@@ -1,0 +1,134 @@
+"""Configurations with a slip of the finger at any depth: the nearest right name, before anything is computed.
+
+Remedy: gsparc/limits.py (what each setting may be) and gsparc/cli.py (one line, the nearest name).
+"""
+
+from __future__ import annotations
+
+import pytest
+from campaigns import spectra
+from doors import assert_refused, knock
+
+from gsparc.evaluate import main as evaluate
+from gsparc.training import main as train
+
+SLIPS = {
+    "modle=gsparc": "did you mean 'model'",
+    "model=gsprac": "did you mean 'gsparc'",
+    "dataset=rfdi": "did you mean 'rfid'",
+    "split=randm": "did you mean 'random'",
+    "experiment=paper/rfdi": "experiment=paper/rfdi: no such choice; did you mean 'paper/rfid'",
+    "experiment=papr/rfid": "did you mean 'paper/rfid'",
+    "experiment=paperrfid": "did you mean 'paper/rfid'",
+    "experiment=demoo": "did you mean 'demo'",
+    "paper=gsprc": "did you mean 'gsparc'",
+    "trainer=defalt": "did you mean 'default'",
+    "callbacks=densfy": "did you mean 'densify'",
+    "logger=wandbb": "did you mean 'wandb'",
+    "trainer.max_step=3": "did you mean 'trainer.max_steps'",
+    "trainer.batchsize=3": "did you mean 'trainer.batch_size'",
+    "model.field.cout=4": "did you mean 'model.field.count'",
+    "model.feild.count=4": "did you mean 'model.field'",
+    "model.emission.encoding.octavs=3": "did you mean 'model.emission.encoding.octaves'",
+    "model.emission.activaton=linear": "did you mean 'model.emission.activation'",
+    "model.optimizer.positons=1": "did you mean 'model.optimizer.positions'",
+    "model.effects.phse=true": "did you mean 'model.effects.phase'",
+    "model.raster.lowpass=1": "did you mean 'model.raster.low_pass'",
+    "callbacks.pictures.evry=1": "did you mean 'callbacks.pictures.every'",
+    "callbacks.pictres.every=1": "did you mean 'callbacks.pictures'",
+    "+model.field.cout=3": "model.field.cout: no such setting of FieldSettings; did you mean 'count'",
+    "++model.emission.encoding.octavs=3": "no such setting of EncodingSettings; did you mean 'octaves'",
+    "hydra.run.dri=x": "did you mean 'hydra.run.dir'",
+    "dataset.flie=x": "did you mean 'dataset.file'",
+    "dataset.name=onw": "did you mean 'own'",
+    "split.name=grupped": "did you mean 'grouped'",
+    "split.val_fracton=0.1": "did you mean 'split.val_fraction'",
+    "eval_on=tset": "eval_on='tset': one of train, val, test is needed; did you mean 'test'",
+    "baselines=[gpp]": "'gpp' is none; did you mean 'gp'",
+    "lr=0.1": "lr: no such setting",
+}
+VALUES = {
+    "seed=abc": "seed='abc': a whole number of at least 0",
+    "seed=-1": "seed=-1: a whole number",
+    "seed=1.5": "seed=1.5: a whole number",
+    "threads=0": "threads=0: a whole number of at least 1, or null",
+    "threads=two": "threads='two'",
+    "baselines=gp": "a list of methods is needed",
+    "ckpt_path=missing.ckpt": "ckpt_path=missing.ckpt: no such file",
+    "trainer.max_steps=0": "trainer.max_steps=0: a whole number of at least 1",
+    "trainer.max_steps=abc": "trainer.max_steps='abc'",
+    "trainer.max_steps=1.5": "trainer.max_steps=1.5",
+    "trainer.max_steps=null": "trainer.max_steps=None",
+    "trainer.batch_size=true": "trainer.batch_size=True",
+    "trainer.gradient_clip=-1": "trainer.gradient_clip=-1: a number above 0",
+    "trainer.accelerator=gpuu": "accelerator='gpuu'",
+    "model.field.count=-3": "model.field.count=-3",
+    "model.field.count=many": "model.field.count='many'",
+    "model.field.opacity=1": "model.field.opacity=1: a number above 0 and below 1",
+    "model.field.scale=-0.1": "model.field.scale=-0.1",
+    "model.field.margin=inf": "model.field.margin=inf",
+    "model.field.init=spere": "model.field.init='spere'",
+    "model.emission.activation=sigmoide": "did you mean 'sigmoid'",
+    "model.emission.hidden=-1": "model.emission.hidden=-1",
+    "model.emission.encoding.kind=kernal": "model.emission.encoding.kind='kernal'",
+    "model.emission.encoding.anchors=0": "anchors=0",
+    "model.attenuation.d_min=0": "model.attenuation.d_min=0: a number above 0",
+    "model.attenuation.gain=-2": "model.attenuation.gain=-2",
+    "model.attenuation.d_ref=nan": "model.attenuation.d_ref=nan",
+    "model.raster.projection=tangents": "'equirect' or 'tangent'",
+    "model.raster.backend=gpu": "'reference', 'cpu' or 'cuda'",
+    "model.raster.low_pass=-1": "low_pass >= 0",
+    "model.raster.alpha_cutoff=2": r"cut-offs lie in \(0, 1\)",
+    "model.loss.ssim_weight=nan": "model.loss.ssim_weight=nan",
+    "model.loss.ssim_weight=3": "model.loss.ssim_weight=3",
+    "model.optimizer.positions=-1": "model.optimizer.positions=-1: a number of at least 0",
+    "model.optimizer.emission=inf": "model.optimizer.emission=inf",
+    "model.confidence.alpha=-1": "model.confidence.alpha=-1",
+    "model.confidence.clamp=1e4": "at most 80",
+    "model.effects.phase=ture": "model.effects.phase='ture'",
+    "model.warm_start=maybe": "one of true, false, auto",
+    "model.refit=perhaps": "one of true, false",
+    "model._target_=os.system": "'os.system'",
+    "split.val_fraction=2": "split.val_fraction=2",
+    "split.test_fraction=0": "split.test_fraction=0",
+    "split.thin=-1": "split.thin=-1",
+    "dataset.file=": "dataset.file is not set",
+    "trainer.max_steps": "trainer.max_steps: not understood; say KEY=VALUE",
+    "trainer.max_steps=[1": "not understood",
+    "=": "Could not override",
+}
+CASES = {**SLIPS, **VALUES}
+QUICK = ("modle=gsparc", "experiment=paper/rfdi", "model.emission.encoding.octavs=3", "+model.field.cout=3",
+         "seed=abc", "model.attenuation.d_min=0", "eval_on=tset")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return spectra(tmp_path_factory.mktemp("doors") / "own.npz")
+
+
+@pytest.mark.parametrize(
+    "slip", [s if s in QUICK else pytest.param(s, marks=pytest.mark.slow) for s in CASES]
+)
+def test_train(slip, file, tmp_path):
+    good = [
+        *("dataset=own", f"dataset.file={file}", f"hydra.run.dir={tmp_path}", "logger=none", "threads=1"),
+        *("baselines=[]", "trainer.max_steps=1", "model.field.count=5", "model.effects.phase=false"),
+    ]
+    assert_refused(knock(train, "train.py", [*good, slip]), CASES[slip], tmp_path)
+
+
+@pytest.mark.parametrize(
+    "slip,says",
+    [
+        ("ckpt=none.ckpt", "none.ckpt: no such checkpoint"),
+        ("eval_onn=val", "did you mean 'eval_on'"),
+        ("eval_on=vall", "did you mean 'val'"),
+        ("threads=-2", "threads=-2"),
+        ("baselines=[nearst]", "did you mean 'nearest'"),
+        ("dataset.rot=x", "did you mean 'dataset.root'"),
+    ],
+)
+def test_evaluate(slip, says, tmp_path):
+    given = [f"hydra.run.dir={tmp_path}", "ckpt=absent.ckpt", slip]
+    assert_refused(knock(evaluate, "evaluate", given), says, tmp_path)

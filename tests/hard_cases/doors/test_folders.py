@@ -1,0 +1,117 @@
+"""Folders in the RFID release's layout, spoilt: `python -m gsparc.check` and `train.py dataset=rfid`.
+
+Remedy: gsparc/data/rfid.py. The cases of tests/data/test_bad_input.py come again, at the commands' own doors.
+"""
+# ruff: noqa: E501 (a case is a row of a table)
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from doors import assert_found_bad, assert_refused, knock
+from PIL import Image
+
+from gsparc.check import main as check
+from gsparc.training import main as train
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "data"))
+from test_bad_input import RFID  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> Path:
+    """Eight spectra, in a folder whose name is not ASCII."""
+    root = tmp_path_factory.mktemp("Messung Größe 米") / "release"
+    (root / "spectrum").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for i in range(1, 7):
+        grey = Image.fromarray(rng.integers(0, 256, (90, 360), dtype=np.uint8))
+        grey.save(root / "spectrum" / f"{i:05d}.png", compress_level=1)
+    (root / "gateway_info.yml").write_text(
+        "dataset_name: s23\n"
+        "gateway1:\n  position: [5.0, 0.26, 0]\n"
+        "  orientation: [0.51291602, -0.48674136, -0.48674136, 0.51291602]\n"
+        "gateway2:\n  position: [0, 0, 2]\n  orientation: [0, 0, 0, 1]\n"
+    )
+    rows = "".join(f"{0.1 * i:.4f},0.2000,1.0000\n" for i in range(6))
+    (root / "tx_pos.csv").write_text("x,y,z\n" + rows)
+    (root / "train_index.txt").write_text("00001\n00003\n00004\n00006\n")
+    (root / "test_index.txt").write_text("00002\n00005\n")
+    return root
+
+
+@pytest.fixture
+def release(sound, tmp_path) -> Path:
+    return shutil.copytree(sound, tmp_path / "Freigabe 米")
+
+
+def rewrite(name: str, old: str, new: str):
+    return lambda root: (root / name).write_text((root / name).read_text().replace(old, new, 1))
+
+
+def picture(array: np.ndarray, **how):
+    return lambda root: Image.fromarray(array).save(root / "spectrum" / "00003.png", **how)
+
+
+def rename(old: str, new: str):
+    return lambda root: (root / old).rename(root / new)
+
+
+GREY = np.zeros((90, 360), dtype=np.uint8)
+MORE = {
+    "palette": (lambda r: Image.fromarray(GREY).convert("P").save(r / "spectrum/00003.png"), "found mode P"),
+    "one bit": (lambda r: Image.fromarray(GREY).convert("1").save(r / "spectrum/00003.png"), "found mode 1"),
+    "with alpha": (lambda r: Image.fromarray(GREY).convert("LA").save(r / "spectrum/00003.png"), "mode LA"),
+    "a row less": (picture(GREY[:-1]), "found 360 x 89"),
+    "a column more": (picture(np.zeros((90, 361), np.uint8)), "found 361 x 90"),
+    "a single pixel": (picture(np.zeros((1, 1), np.uint8)), "found 1 x 1"),
+    "named in capitals": (rename("spectrum/00003.png", "spectrum/00003.PNG"), "00003.png: missing"),
+    "named in Unicode": (rename("spectrum/00003.png", "spectrum/٠٠٠٠٣.png"), "00003.png: missing"),
+    "named without zeros": (rename("spectrum/00003.png", "spectrum/3.png"), "00003.png: missing"),
+    "spectrum is a folder": (lambda r: [(r / "spectrum/00003.png").unlink(), (r / "spectrum/00003.png").mkdir()],
+                             "00003.png"),
+    "csv is a folder": (lambda r: [(r / "tx_pos.csv").unlink(), (r / "tx_pos.csv").mkdir()], "tx_pos.csv"),
+    "csv with semicolons": (lambda r: (r / "tx_pos.csv").write_text("x;y;z\n0;0;1\n"), "expected the header"),
+    "csv with a quote left open": (rewrite("tx_pos.csv", "0.3000", '"0.3000'), "line"),
+    "csv with a NUL": (rewrite("tx_pos.csv", "0.3000", "0.3\0"), "line"),
+    "csv with Arabic digits": (rewrite("tx_pos.csv", "0.3000,0.2000,1.0000", "x٣,0,1"), "line 5"),
+    "csv hexadecimal": (rewrite("tx_pos.csv", "0.3000", "0x3"), "line 5"),
+    "csv 1e400": (rewrite("tx_pos.csv", "0.3000", "1e400"), "line 5"),
+    "csv with a fourth column": (rewrite("tx_pos.csv", "0.3000,0.2000,1.0000", "0.3,0.2,1,7"), "line 5"),
+    "index negative": (rewrite("train_index.txt", "00001", "-1"), "line 1"),
+    "index fraction": (rewrite("train_index.txt", "00001", "1.5"), "line 1"),
+    "index enormous": (rewrite("train_index.txt", "00001", "9" * 400), "line 1"),
+    "index is a folder": (lambda r: [(r / "test_index.txt").unlink(), (r / "test_index.txt").mkdir()],
+                          "test_index.txt"),
+    "yaml runs code": (lambda r: (r / "gateway_info.yml").write_text("!!python/object/apply:os.system ['true']"),
+                       "not readable as YAML"),
+    "yaml bomb": (lambda r: (r / "gateway_info.yml").write_text("a: &a [x]\nb: &b [*a,*a]\ngateway1: *b\n"),
+                  "no gateway in it"),
+    "quaternion of length 2": (rewrite("gateway_info.yml", "0.51291602, -0.48674136", "2, -0.48674136"), "length 1"),
+    "true as a coordinate": (rewrite("gateway_info.yml", "0.26", "true"), "three finite numbers"),
+}  # fmt: skip
+CASES = {**RFID, **MORE}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_check(release, case):
+    spoil, says = CASES[case]
+    spoil(release)
+    assert_found_bad(knock(lambda: check([str(release)]), "check", []), says)
+
+
+@pytest.mark.parametrize("case", ["csv nan", "spectrum truncated", "spectrum 16 bit", "index out of range"])
+def test_train(release, case, tmp_path):
+    spoil, says = CASES[case]
+    spoil(release)
+    given = ["dataset=rfid", f"dataset.root='{release}'", f"hydra.run.dir={tmp_path / 'run'}", "logger=none"]
+    assert_refused(knock(train, "train.py", given), says, tmp_path / "run")
+
+
+def test_the_sound_one_is_read(release):
+    answer = knock(lambda: check([str(release)]), "check", [])
+    assert answer.status == 0 and answer.out[-1].endswith("good")
