@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import matplotlib
+from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -48,8 +49,8 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
         for axis in line:
             axis.set_xscale("log")
             axis.grid(alpha=0.3)
-    handles: dict[str, object] = {}
+    handles: dict[str, Artist] = {}
     for axis in grid.flat:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=7, fontsize=9)
+    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=9)
     figure.savefig(path, dpi=110)

@@ -101,8 +101,8 @@ def _row(same: list[Filled], latency: Latency | None) -> Row:
         figure=FIGURE[kind], value=mean(f"test/{FIGURE[kind]}") or 0.0,
         second=SECOND[kind], second_value=mean(f"test/{SECOND[kind]}"),
         train_s=mean("time/train_s") or 0.0, train_cpu_s=mean("time/train_cpu_s") or 0.0,
-        query_ms=latency and latency.p50_ms, query_p95_ms=latency and latency.p95_ms,
-        to_copy=latency and latency.to_copy, load=mean("machine/load"),
+        query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
+        to_copy=latency.to_copy if latency else None, load=mean("machine/load"),
     )  # fmt: skip
 
 
@@ -128,7 +128,7 @@ def blocks(found: Sequence[Row]) -> list[Block]:
     for (dataset, split), group in groupby(found, lambda r: (r.dataset, r.split)):
         here = list(group)
         free = [r for r in here if r.budget_s is None]
-        budgets: list[float | None] = sorted({r.budget_s for r in here if r.budget_s is not None})
+        budgets = sorted({r.budget_s for r in here if r.budget_s is not None})
         for budget in budgets or [None]:
             members = free + [r for r in here if budget is not None and r.budget_s == budget]
             result.append(Block(dataset, split, budget, tuple(sorted(members, key=lambda r: -r.score_db))))

@@ -66,8 +66,14 @@ def render_each(
     Returns:
         (B, C, H, W).
     """
+    means, quats, scales, opacities = geometry
     images = [
-        rasterize(*one, feature, pose[i] if pose.batched else pose, grid, **optics).image[0]
-        for i, (*one, feature) in enumerate(zip(*geometry, features, strict=True))
+        rasterize(
+            *(means[i], quats[i], scales[i], opacities[i], features[i]),
+            pose[i] if pose.batched else pose,
+            grid,
+            **optics,
+        ).image[0]
+        for i in range(len(features))
     ]
     return torch.stack(images)
