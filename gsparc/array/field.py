@@ -112,6 +112,9 @@ class ArrayField(Method):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """Predict at tx (B, 3) [m]; the receiver is the one that was measured with.
 
+        The confidence is the share of the squared error expected far from all data that is not expected here;
+        both come from training spectra predicted without their neighbours.
+
         Raises:
             RuntimeError: before `fit` or `restore`.
         """
@@ -125,7 +128,9 @@ class ArrayField(Method):
                 vectors = self.field(tx[part])
                 torch.square(vectors[:, -1].real, out=left[part])
                 self.renderer.draw(vectors, mean[part])
-        return Prediction(mean, 1 - left, self.error[0] * (left + LEAST_LEFT) ** self.error[1])
+        share = ((left + LEAST_LEFT) / (1 + LEAST_LEFT)) ** self.error[1]
+        far = self.error[0] * (1 + LEAST_LEFT) ** self.error[1]
+        return Prediction(mean, 1 - share, far * share)
 
     def state(self) -> dict[str, Any]:
         """Packets, background, error model."""

@@ -41,13 +41,17 @@ class Tuned:
     def error_model(self) -> tuple[float, float]:
         """(a, p): the expected squared error of a pixel is about `a (left + LEAST_LEFT)^p`.
 
-        A line through the logarithms, then scaled so that the mean error is right.
+        The likeliest for errors that are exponential about it, so that their mean is right at every level: a
+        line through logarithms would follow the many small errors and forget the few large ones.
         """
-        x, y = np.log(self.left + LEAST_LEFT), np.log(self.error + 1e-9)
-        spread = x - x.mean()
-        power = float(np.clip((spread @ y) / max(float(spread @ spread), 1e-12), 0.0, 2.0))
-        shape = np.exp(power * x)
-        return float(self.error.mean() / shape.mean()), power
+        x, y = np.log(self.left + LEAST_LEFT), self.error + 1e-9
+
+        def deviance(parameters: np.ndarray) -> float:
+            level = parameters[0] + np.clip(parameters[1], 0.0, 2.0) * x
+            return float((y * np.exp(-level) + level).mean())
+
+        found = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
+        return float(np.exp(found[0])), float(np.clip(found[1], 0.0, 2.0))
 
 
 def tune(
