@@ -8,27 +8,23 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
 from gsparc import cli
-from gsparc.data.load import load, split_for
+from gsparc.clock import machine_facts
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.learned import LearnedField
+from gsparc.evaluation import dataset_facts
 from gsparc.method import Method
-from gsparc.registry import build, method_class
 from gsparc.scoring import score
-from gsparc.trainer import Training
+from gsparc.summary import provenance, write_summary
+from gsparc.variants import setting
 
 log = logging.getLogger(__name__)
 
@@ -124,27 +120,12 @@ def draw(rows: list[Row], path: Path) -> None:
 
 def task(config: DictConfig) -> list[Row]:
     """Sweep, table, CSV and picture."""
-    if config.threads is not None:
-        torch.set_num_threads(int(config.threads))
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
-    data = load(OmegaConf.to_container(config.dataset, resolve=True))  # type: ignore[arg-type]
-    fold = split_for(OmegaConf.to_container(config.split, resolve=True), data).folds[0]  # type: ignore[arg-type]
-
-    def maker(overrides: Any) -> Callable[[], Method]:
-        def make() -> Method:
-            method = build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
-            if isinstance(method, LearnedField):
-                method.training = Training(instantiate(config.trainer), int(config.seed))
-            return method
-
-        return make
-
-    contenders: dict[str, Callable[[], Method]] = {str(k): maker(v) for k, v in config.variants.items()}
-    contenders |= {name: method_class(name) for name in config.rivals}
+    where = setting(config)
+    run_dir, data = where.run_dir, where.data
     rows: list[Row] = []
     started = time.monotonic()
     found = sweep(
-        contenders, data, fold, [float(e) for e in config.errors_m], run_dir,
+        where.makers, data, where.fold, [float(e) for e in config.errors_m], run_dir,
         train_errors=bool(config.train_errors), seed=int(config.seed),
     )  # fmt: skip
     for row in found:
@@ -155,6 +136,13 @@ def task(config: DictConfig) -> list[Row]:
         writer.writerow([f.name for f in fields(Row)])
         writer.writerows(astuple(row) for row in rows)
     draw(rows, run_dir / "sensitivity.png")
+    figure = rows[0].figure
+    facts: dict[str, object] = {**dataset_facts(data), **machine_facts(), **provenance()}
+    facts["seed"] = int(config.seed)
+    for row in rows:
+        facts[f"sensitivity/{row.method}/{row.where}/{row.error_m:g}/{figure}"] = row.value
+        facts[f"sensitivity/{row.method}/{row.where}/{row.error_m:g}/train_s"] = row.train_s
+    write_summary(run_dir / "summary.json", facts)
     table = Table(title=f"{data.site.name}: {rows[0].figure} against position error")
     for column in ("method", "disturbed", "error m", rows[0].figure, "train s"):
         table.add_column(column, justify="left" if column in ("method", "disturbed") else "right")

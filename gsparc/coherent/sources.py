@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.coherent.phase import NEAR_M, ranges
+from gsparc.coherent.rows import Rows
 
 
 class SourceKind(StrEnum):
@@ -50,13 +51,35 @@ def path_length(
         return ranges(observers, points)
     if axes is None:
         raise ValueError("an edge needs its direction: pass axes (K, 3)")
-    along_rx, across_rx = _about_edge(observers, points, axes)
-    along_tx, across_tx = _about_edge(transmitter[None], points, axes)
+    along_rx, across_rx = about_edge(observers, points, axes)
+    along_tx, across_tx = about_edge(transmitter[None], points, axes)
     return ((along_rx - along_tx).square() + (across_rx + across_tx).square() + NEAR_M**2).sqrt()
 
 
-def _about_edge(places: Tensor, points: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
-    """Cylinder coordinates (n, K) about each edge: along it, and distance from it."""
+def about_edge(places: Tensor, points: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Cylinder coordinates (n, K) [m] of places (n, 3) about each edge: along it, and distance from it."""
     offset = places.double()[:, None, :] - points.double()[None]
     along = (offset * axes).sum(-1)
-    return along, torch.linalg.vector_norm(offset - along[..., None] * axes, dim=-1)
+    return along, (offset - along[..., None] * axes).square().sum(-1).add(NEAR_M**2).sqrt()
+
+
+def kinds(points: Tensor, box: Tensor, margin: float = 0.05) -> list[SourceKind]:
+    """What fixed points (K, 3) [m] stand for, the transmitter first.
+
+    A mirror image lies behind a mirror, outside of everything that the mirrors enclose; what stands inside
+    the box (2, 3) [m] of receivers and transmitter, the transmitter itself apart, is a scatterer.
+
+    Args:
+        points: sources of one scene.
+        box: lower and upper corner of all places measured.
+        margin: by which the box is made smaller: images just behind a wall stay images [m].
+    """
+    inside = ((points > box[0] + margin) & (points < box[1] - margin)).all(1)
+    apart = torch.linalg.vector_norm(points - points[0], dim=1) > 0.1
+    return [SourceKind.SCATTERER if s else SourceKind.IMAGE for s in (inside & apart).tolist()]
+
+
+def box_of(rows: Rows, transmitter: Tensor) -> Tensor:
+    """Lower and upper corner (2, 3) [m] of all places measured and the transmitter (3,)."""
+    places = torch.cat([rows.position, transmitter[None]])
+    return torch.stack([places.amin(0), places.amax(0)])
