@@ -140,6 +140,12 @@ def _argos_folder(folder: Path, config: Mapping[str, Any]) -> Measurements:
     )
 
 
+def _sionna(config: Mapping[str, Any]) -> Measurements:
+    from gsparc.data.sionna import load_sionna
+
+    return load_sionna(_required_file(config), config.get("target"))
+
+
 FOLDERS = ("rfid", "rfid_sim", "argos", "argos_sim")  # datasets that are a folder; the others are one file
 
 LOADERS: dict[str, Callable[[Mapping[str, Any]], Measurements]] = {
@@ -149,4 +155,5 @@ LOADERS: dict[str, Callable[[Mapping[str, Any]], Measurements]] = {
     "argos_sim": _argos_sim,
     "newrf": _newrf,
     "own": _own,
+    "sionna": _sionna,
 }

@@ -23,7 +23,7 @@ from gsparc.data.schema import Kind, Measurements
 
 log = logging.getLogger(__name__)
 
-OWN_ATTRIBUTES = ("name", "normalisation", "stand_in", "convergence_error")
+OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
 @dataclass(frozen=True)

@@ -44,10 +44,13 @@ class Checker:
                 self.problems.add(self.where(name), f"units are {unit!r}; expected {FIELDS[name].unit!r}")
 
     def measurement(self) -> str | None:
-        """Which of spectrum, csi, rssi, rssi_db the file holds; exactly one."""
+        """Which of spectrum, csi, rssi, rssi_db to read: the only one, or the one that an attribute names."""
         present = [name for name in MEASUREMENTS if name in self.raw.arrays]
         if len(present) == 1:
             return present[0]
+        named = self.raw.attributes.get("measurement")
+        if named in present:
+            return str(named)
         found = " and ".join(present) if present else "none of them"
         self.problems.add(self.source, f"expected exactly one of {', '.join(MEASUREMENTS)}; found {found}")
         return None

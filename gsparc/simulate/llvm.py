@@ -1,9 +1,9 @@
-"""The LLVM library that Sionna's CPU back end compiles with: found, fetched without root, tried in a subprocess.
+"""The LLVM library that Sionna's CPU back end needs: found, fetched without root, tried in a subprocess.
 
-Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first solve, which no
-`try` catches. So a library is believed only after a tiny solve in a process of its own.
+Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first solve,
+which no `try` catches. So a library is believed only after a tiny solve in a process of its own.
 
-`python -m gsparc.simulate.llvm` (or `make sionna`) fetches Debian's package where there is no good library yet.
+`python -m gsparc.simulate.llvm` (or `make sionna`) fetches Debian's package where no library is good.
 """
 
 from __future__ import annotations

@@ -1,0 +1,181 @@
+"""From the shards of a simulation to one file in the schema of one's own measurements."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.own import write_own
+from gsparc.data.schema import Measurements
+from gsparc.simulate import priors
+from gsparc.simulate.auto import Choice
+from gsparc.simulate.convergence import Convergence
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.engine import Engine
+from gsparc.simulate.paths import ARRAYS, Paths, join
+from gsparc.simulate.settings import Campaign
+from gsparc.simulate.shards import Shards
+from gsparc.simulate.spectrum import spectra
+
+
+@dataclass(frozen=True)
+class Assembled:
+    """A finished file and what is drawn and told of it.
+
+    Attributes:
+        data: as `load_own` reads the file.
+        power: (S,) sum of path powers.
+        delay_spread: (S,) [s].
+        facts: numbers about the scene (`priors.scene_facts`), and how many paths and silent receivers.
+    """
+
+    data: Measurements
+    power: np.ndarray
+    delay_spread: np.ndarray
+    facts: dict[str, float]
+
+
+def part(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
+    """What a shard keeps of some receivers."""
+    frequency = campaign.scene.frequency_hz
+    images, peak = spectra(paths, campaign.spectrum, frequency, wavelength)
+    strongest = np.zeros(len(paths))
+    np.maximum.at(strongest, paths.owner, paths.power)
+    stored = paths.select(paths.power >= strongest[paths.owner] * 10 ** (-campaign.weakest_db / 10))
+    return {
+        "spectrum": np.round(images * 255).astype(np.uint8),
+        "spectrum_peak": peak,
+        "csi": paths.responses(frequency, campaign.csi.elements(wavelength), wavelength),
+        "received_power": paths.received_power(),
+        "delay_spread": paths.delay_spread(),
+        "power_below": paths.per_receiver(paths.power * (paths.direction[:, 2] < 0)),
+        "offsets": stored.offsets,
+        **{name: getattr(stored, name) for name in ARRAYS},
+    }
+
+
+def assemble(
+    campaign: Campaign,
+    engine: Engine,
+    receivers: np.ndarray,
+    effects: Effects,
+    choice: Choice | None,
+    convergence: Convergence | None,
+    shards: Shards,
+    out: Path,
+) -> Assembled:
+    """Put the shards together, write the file, drop the shards.
+
+    Raises:
+        ValueError: nothing reaches any receiver.
+    """
+    parts = [shards.get(n) for n in range(-(-len(receivers) // campaign.shard))]
+    whole = {k: np.concatenate([p[k] for p in parts]) for k in parts[0] if k not in (*ARRAYS, "offsets")}
+    paths = join([Paths(*(p[name] for name in ("offsets", *ARRAYS))) for p in parts])
+    del parts
+    power = whole["received_power"]
+    heard = power > 0
+    if not heard.any():
+        raise ValueError("nothing reaches any receiver; is the transmitter inside a building?")
+    facts = priors.scene_facts(
+        whole["delay_spread"][heard],
+        float((whole["power_below"][heard] / power[heard]).mean()),
+        campaign.scene.bandwidth_hz,
+        np.linalg.norm(receivers - engine.transmitter, axis=1),
+        campaign.spectrum.near_field(engine.wavelength),
+    )
+    facts |= {
+        "silent_receivers": float((~heard).sum()),
+        "paths_per_receiver": len(paths.order) / len(receivers),
+    }
+    arrays = _arrays(campaign, engine, receivers, effects, whole, paths)
+    about = _provenance(campaign, engine, effects, choice, convergence, facts)
+    data = write_own(out, arrays, about)
+    shards.remove()
+    return Assembled(data, power, whole["delay_spread"], facts)
+
+
+def _arrays(
+    campaign: Campaign,
+    engine: Engine,
+    receivers: np.ndarray,
+    effects: Effects,
+    whole: Mapping[str, np.ndarray],
+    paths: Paths,
+) -> dict[str, np.ndarray]:
+    scene, wavelength = campaign.scene, engine.wavelength
+    spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
+    if campaign.spectrum.normalisation == "none":
+        spectrum = np.round(spectrum * (peak / peak.max())[:, None, None]).astype(np.uint8)
+    order = np.random.default_rng(scene.seed).permutation(len(receivers))
+    tests = max(1, round(scene.test_share * len(receivers)))
+    arrays = {
+        "rx_position": receivers,
+        "tx_position": engine.transmitter,
+        "spectrum": spectrum,
+        "spectrum_peak": peak,
+        "frequency_hz": scene.frequency_hz,
+        "carrier_hz": np.array(scene.carrier_hz),
+        "received_power": whole["received_power"],
+        "delay_spread": whole["delay_spread"],
+        "path_offsets": paths.offsets,
+        "path_direction": paths.direction,
+        "path_gain": paths.gain[:, 0] if paths.gain.shape[1] == 1 else paths.gain,
+        "path_delay": paths.delay,
+        "path_order": paths.order,
+        "path_mechanisms": paths.mechanisms,
+        "line_of_sight": paths.per_receiver((paths.order == 0).astype(float)) > 0,
+        "split_train": np.sort(order[tests:]),
+        "split_test": np.sort(order[:tests]),
+    }
+    if effects.noise_snr_db is not None:
+        variance = float(np.mean(np.abs(csi) ** 2) / 10 ** (effects.noise_snr_db / 10))
+        rng = np.random.default_rng(scene.seed + 1)
+        csi = csi + np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))
+        arrays["csi_noise_variance"] = np.array(variance)
+    arrays["csi"] = csi.astype(np.complex64)
+    if campaign.spectrum.kind == "bartlett":
+        arrays["spectrum_array_position"] = campaign.spectrum.elements(wavelength)
+    if csi.shape[1] > 1:
+        elements = campaign.csi.elements(wavelength)
+        # one row per channel: with two polarisations every place is there twice
+        arrays["csi_array_position"] = np.tile(elements, (csi.shape[1] // len(elements), 1))
+    return arrays
+
+
+def _provenance(
+    campaign: Campaign,
+    engine: Engine,
+    effects: Effects,
+    choice: Choice | None,
+    convergence: Convergence | None,
+    facts: Mapping[str, float],
+) -> dict[str, Any]:
+    """Attributes of the file: what it is, how it was made, how far it can be trusted."""
+    about: dict[str, Any] = {
+        "name": campaign.scene.name,
+        "measurement": campaign.measurement,
+        "normalisation": campaign.spectrum.normalisation,
+        "simulator": engine.name,
+        "simulator_versions": json.dumps(engine.versions()),
+        "scene": json.dumps(asdict(campaign.scene)),
+        "materials": json.dumps(engine.materials()),
+        "effects": str(effects),
+        "effects_json": json.dumps(asdict(effects)),
+        "sampling": json.dumps(asdict(campaign.sampling)),
+        "path_gain_convention": "without carrier phase: multiply by exp(-j 2 pi f path_delay)",
+        "path_mechanisms_bits": "0 sight, 1 specular, 2 diffuse, 4 refraction, 8 diffraction, 16 edge",
+        "frames": "receiver axes are world axes, z up",
+        **campaign.spectrum.attributes(),
+        **facts,
+    }
+    if convergence is not None:
+        about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
+    if choice is not None:
+        about["auto"] = json.dumps(choice.as_dict())
+    return about

@@ -1,0 +1,176 @@
+"""What each effect is worth to each receiver, from the interaction record of one full simulation.
+
+Nothing is traced again: dropping an effect in the solver reshuffles the rays of the others and would measure
+the solver's noise.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.paths import Paths
+from gsparc.simulate.spectrum import SpectrumSettings, spectra
+
+SILENCE_DB = 99.0  # a receiver that loses everything is off by this much
+ASKED = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Deliverable:
+    """What must hold, for how many receivers.
+
+    Attributes:
+        kind: `coverage` (received power), `csi` (channel) or `spectrum`.
+        tolerance: largest error: |dB| of received power; NMSE of the channel in dB; for spectra the error as
+            a share of the error of taking the nearest other receiver's spectrum.
+        quantile: share of the receivers for which it must hold.
+    """
+
+    kind: Literal["coverage", "csi", "spectrum"]
+    tolerance: float
+    quantile: float = 0.95
+
+    @staticmethod
+    def parse(text: str, quantile: float = 0.95) -> Deliverable:
+        """From words: `coverage +-1 dB`, `csi -20 dB`, `spectrum skill` (0.9 unless a number is given).
+
+        Raises:
+            ValueError: none of these.
+        """
+        found = ASKED.fullmatch(text.strip())
+        if not (found and 0 < quantile < 1):
+            raise ValueError(
+                f"effects.deliverable={text!r}: expected 'coverage +-1 dB', 'csi -20 dB' or "
+                "'spectrum skill 0.9'"
+            )
+        kind, number = found[1].lower(), None if found[2] is None else float(found[2])
+        if kind == "coverage":
+            return Deliverable("coverage", abs(1.0 if number is None else number), quantile)
+        if kind == "csi":
+            return Deliverable("csi", -20.0 if number is None else -abs(number), quantile)
+        skill = 0.9 if number is None else number
+        if not 0 < skill < 1:
+            raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
+        return Deliverable("spectrum", round(1 - skill, 6), quantile)
+
+    def __str__(self) -> str:
+        share = f"for {self.quantile:.0%} of the receivers"
+        if self.kind == "coverage":
+            return f"received power within +-{self.tolerance:g} dB {share}"
+        if self.kind == "csi":
+            return f"channel NMSE at most {self.tolerance:g} dB {share}"
+        return f"spectrum skill at least {1 - self.tolerance:g} over the nearest receiver's {share}"
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A full simulation of some receivers, and how channels and spectra are made of it.
+
+    Attributes:
+        paths: everything on, R receivers.
+        effects: what "everything" was.
+        frequency_hz: (K,) subcarriers [Hz].
+        wavelength: at the carrier [m].
+        elements: (M, 3) [m] of the array that channels are measured with.
+        spectrum: definition of spectra.
+        nearest: paths of the nearest other receiver of each, (R receivers); needed for spectra only.
+    """
+
+    paths: Paths
+    effects: Effects
+    frequency_hz: np.ndarray
+    wavelength: float
+    elements: np.ndarray
+    spectrum: SpectrumSettings
+    nearest: Paths | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_channels", self._channel(self.effects))
+        object.__setattr__(self, "_images", {})
+
+    @property
+    def heard(self) -> np.ndarray:
+        """Receivers that anything reaches (R,) bool; the others are judged by nobody."""
+        return self.paths.received_power() > 0
+
+    def shares(self, kept: Effects) -> np.ndarray:
+        """Share of each receiver's power that is lost (R,)."""
+        full = self.paths.received_power()
+        return 1 - self.paths.under(kept).received_power() / np.where(full > 0, full, 1)
+
+    def nmse(self, kept: Effects) -> np.ndarray:
+        """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
+        full: np.ndarray = self._channels  # type: ignore[attr-defined]
+        rest = self._channel(kept)
+        error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
+        error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
+        energy = (np.abs(full) ** 2).sum((1, 2))
+        return error / np.where(energy > 0, energy, 1)
+
+    def errors(self, kept: Effects, deliverable: Deliverable) -> np.ndarray:
+        """The deliverable's error at each receiver (R,), in the unit of its tolerance."""
+        if deliverable.kind == "coverage":
+            remains = np.maximum(1 - self.shares(kept), 10 ** (-SILENCE_DB / 10))
+            return np.abs(10 * np.log10(remains))
+        if deliverable.kind == "csi":
+            return 10 * np.log10(np.maximum(self.nmse(kept), 10 ** (-SILENCE_DB / 10)))
+        full, near = self._image(self.effects), self._image(None)
+        error = ((self._image(kept) - full) ** 2).mean((1, 2))
+        rival = ((near - full) ** 2).mean((1, 2))
+        return error / np.maximum(rival, 1e-12)
+
+    def _channel(self, kept: Effects) -> np.ndarray:
+        return self.paths.under(kept).responses(self.frequency_hz, self.elements, self.wavelength)
+
+    def _image(self, kept: Effects | None) -> np.ndarray:
+        if kept is None and self.nearest is None:
+            raise ValueError("spectra are judged against the nearest receiver's: trace it too")
+        memory: dict[Effects | None, np.ndarray] = self._images  # type: ignore[attr-defined]
+        if kept is not None and kept != self.effects:
+            return self._render(self.paths.under(kept))
+        if kept not in memory:
+            source = self.nearest if kept is None else self.paths
+            assert source is not None
+            memory[kept] = self._render(source)
+        return memory[kept]
+
+    def _render(self, paths: Paths) -> np.ndarray:
+        return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
+
+
+def removals(full: Effects) -> dict[str, Effects]:
+    """What can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation."""
+    dropped = {name: _without(full, name) for name in full.on}
+    found = {name: less for name, less in dropped.items() if less is not None}
+    for depth in range(full.depth - 1, 0, -1):
+        found[f"depth > {depth}"] = replace(full, depth=depth)
+    if full.polarisation:
+        found["polarisation"] = replace(full, polarisation=False)
+    return found
+
+
+def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
+    """Every set of switches that leaves out some of `removable` (names as in `removals`); `full` first."""
+    sets = {full}
+    for name in removable:
+        if name.startswith("depth"):
+            depth = int(name.rpartition(" ")[2])
+            sets |= {replace(s, depth=min(s.depth, depth)) for s in sets}
+        elif name == "polarisation":
+            sets |= {replace(s, polarisation=False) for s in sets}
+        else:
+            sets |= {less for less in (_without(s, name) for s in sets) if less is not None}
+    return sorted(sets, key=lambda s: (len(full.on) - len(s.on), full.depth - s.depth, not s.polarisation))
+
+
+def _without(effects: Effects, name: str) -> Effects | None:
+    """None when nothing would be left."""
+    try:
+        return effects.without(name)
+    except ValueError:
+        return None

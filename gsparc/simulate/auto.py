@@ -1,0 +1,232 @@
+"""`effects=auto`: measure what each effect is worth, keep what the deliverable needs, verify the promise."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.engine import Engine
+
+log = logging.getLogger(__name__)
+
+TIMING_NOISE = 0.1  # a competing process moves a measured time by more than this
+
+
+@dataclass(frozen=True)
+class AutoSettings:
+    """How `auto` decides.
+
+    Attributes:
+        deliverable: what must hold, in words (`attribution.Deliverable.parse`).
+        quantile: share of receivers for which it must hold.
+        probes: receivers the decision is measured on, at least 16; it must hold at all of them, so that the
+            quantile is met with confidence 1 - quantile^probes.
+        held_back: other receivers on which the promise is then verified.
+        full: what "everything on" means.
+    """
+
+    deliverable: str = "coverage +-1 dB"
+    quantile: float = 0.95
+    probes: int = 48
+    held_back: int = 96
+    full: Effects = field(default_factory=lambda: Effects(depth=5))
+
+    def __post_init__(self) -> None:
+        if self.probes < 16 or self.held_back < 16:
+            raise ValueError("effects.probes and effects.held_back: at least 16 receivers each, spread out")
+        Deliverable.parse(self.deliverable, self.quantile)
+
+
+@dataclass(frozen=True)
+class Worth:
+    """One row of the table: what is lost when one effect is left out.
+
+    Attributes:
+        effect: as in `removals`.
+        share: mean share of a receiver's power.
+        share_p95: its 95th percentile over the receivers.
+        nmse, nmse_p95: of the channel, median and 95th percentile.
+        error, error_p95: of the deliverable, likewise.
+        seconds: time of tracing the probes without it [s].
+        reason: what physics says beforehand; empty where it says nothing.
+        kept: whether it is simulated.
+    """
+
+    effect: str
+    share: float
+    share_p95: float
+    nmse: float
+    nmse_p95: float
+    error: float
+    error_p95: float
+    seconds: float
+    reason: str
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether the promise holds on receivers that had no say.
+
+    Attributes:
+        receivers: how many were asked.
+        met: share of them within the tolerance.
+        error, error_p95: of the deliverable, median and 95th percentile.
+        kept: whether the promise is kept.
+    """
+
+    receivers: int
+    met: float
+    error: float
+    error_p95: float
+    kept: bool
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What `auto` decided, and on what grounds.
+
+    Attributes:
+        effects: to simulate.
+        deliverable: what was promised, in words.
+        table: one row per effect.
+        seconds_all, seconds_chosen: tracing the probes with everything and with the choice, both warm [s].
+        seconds: what deciding cost in all [s].
+        verdict: filled by `verify`.
+    """
+
+    effects: Effects
+    deliverable: str
+    table: tuple[Worth, ...]
+    seconds_all: float
+    seconds_chosen: float
+    seconds: float
+    verdict: Verdict | None = None
+
+    @property
+    def saved(self) -> float:
+        """Share of the tracing time that the choice saves against everything."""
+        return 1 - self.seconds_chosen / self.seconds_all if self.seconds_all > 0 else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers and strings, for a file."""
+        return asdict(self)
+
+    @staticmethod
+    def from_dict(stored: Mapping[str, Any]) -> Choice:
+        """Inverse of `as_dict`."""
+        verdict = stored["verdict"]
+        return Choice(
+            Effects(**stored["effects"]),
+            stored["deliverable"],
+            tuple(Worth(**row) for row in stored["table"]),
+            *(float(stored[k]) for k in ("seconds_all", "seconds_chosen", "seconds")),
+            None if verdict is None else Verdict(**verdict),
+        )
+
+
+def decide(
+    engine: Engine,
+    receivers: np.ndarray,
+    settings: AutoSettings,
+    probe: Probe,
+    explain: Callable[[Probe], Mapping[str, str]],
+) -> Choice:
+    """Measure on `receivers` (R, 3) [m] and choose the cheapest set of effects that keeps the promise there.
+
+    Args:
+        engine: traces.
+        receivers: the probes.
+        settings: what must hold.
+        probe: the same receivers traced with everything.
+        explain: prior reasons by effect.
+    """
+    begin = time.perf_counter()
+    full = probe.effects
+    deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
+    heard = probe.heard
+    if not heard.any():
+        raise ValueError(
+            "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
+        )
+    dropped = removals(full)
+    errors = {name: probe.errors(kept, deliverable)[heard] for name, kept in dropped.items()}
+    removable = tuple(name for name, error in errors.items() if error.max() <= deliverable.tolerance)
+    seconds_all = _timed(engine, receivers, full)
+    seconds = {name: _timed(engine, receivers, less) for name, less in dropped.items()}
+    costs = {s: _estimate(s, full, seconds, seconds_all) for s in combinations(full, removable)}
+    chosen = _cheapest(
+        costs, lambda some: bool(probe.errors(some, deliverable)[heard].max() <= deliverable.tolerance), full
+    )
+    why = explain(probe)
+    table = []
+    for name, less in dropped.items():
+        share, nmse = probe.shares(less)[heard], probe.nmse(less)[heard]
+        kept = _keeps(chosen, name)
+        reason = why.get("depth" if name.startswith("depth") else name, "")
+        table.append(Worth(
+            name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
+            float(np.median(errors[name])), _p95(errors[name]), seconds[name], reason, kept,
+        ))  # fmt: skip
+    seconds_chosen = seconds_all if chosen == full else _timed(engine, receivers, chosen)
+    return Choice(
+        chosen, str(deliverable), tuple(table), seconds_all, seconds_chosen, time.perf_counter() - begin
+    )
+
+
+def verify(choice: Choice, settings: AutoSettings, held_back: Probe) -> Choice:
+    """The choice with its verdict on receivers that had no say, by path attribution in a full run."""
+    deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
+    errors = held_back.errors(choice.effects, deliverable)[held_back.heard]
+    met = float((errors <= deliverable.tolerance).mean())
+    verdict = Verdict(len(errors), met, float(np.median(errors)), _p95(errors), met >= deliverable.quantile)
+    return replace(choice, verdict=verdict)
+
+
+def _cheapest(costs: Mapping[Effects, float], holds: Callable[[Effects], bool], full: Effects) -> Effects:
+    """The set of least cost that keeps the promise; where costs are too near to tell, the smallest set."""
+    found: list[Effects] = []
+    for some in sorted(costs, key=lambda s: costs[s]):
+        if found and costs[some] > (1 + TIMING_NOISE) * costs[found[0]]:
+            break
+        if holds(some):
+            found.append(some)
+    return min(found, key=lambda s: (len(s.on), s.polarisation, s.depth, costs[s]), default=full)
+
+
+def _timed(engine: Engine, receivers: np.ndarray, effects: Effects) -> float:
+    """Seconds of a warm trace: the first call of a combination compiles."""
+    engine.trace(receivers[:1], effects)
+    start = time.perf_counter()
+    engine.trace(receivers, effects)
+    return time.perf_counter() - start
+
+
+def _estimate(some: Effects, full: Effects, seconds: Mapping[str, float], everything: float) -> float:
+    """Seconds of a combination, as if what each removal saves multiplied; the choice itself is then timed."""
+    ratio = 1.0
+    if some.depth < full.depth:
+        ratio *= seconds[f"depth > {some.depth}"] / everything
+    for name in full.on:
+        if name in seconds and name not in some.on:
+            ratio *= seconds[name] / everything
+    if full.polarisation and not some.polarisation and "polarisation" in seconds:
+        ratio *= seconds["polarisation"] / everything
+    return everything * ratio
+
+
+def _keeps(effects: Effects, name: str) -> bool:
+    if name.startswith("depth"):
+        return effects.depth > int(name.rpartition(" ")[2])
+    return bool(getattr(effects, name))
+
+
+def _p95(values: np.ndarray) -> float:
+    return float(np.quantile(values, 0.95))

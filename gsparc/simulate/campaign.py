@@ -1,0 +1,182 @@
+"""A simulated dataset from beginning to end: places, effects, shards, convergence error, one file."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.simulate import auto, priors
+from gsparc.simulate.assembly import Assembled, assemble, part
+from gsparc.simulate.attribution import Deliverable, Probe
+from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.convergence import Convergence, compare
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.engine import Engine
+from gsparc.simulate.scenes.build import build
+from gsparc.simulate.scenes.placement import neighbours, spread
+from gsparc.simulate.settings import Campaign
+from gsparc.simulate.shards import Shards
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Changed:
+    """What dropping effects does to receivers that had no say.
+
+    Attributes:
+        rows: (n,) receivers.
+        errors: (n,) of the deliverable, in the unit of its tolerance.
+    """
+
+    rows: np.ndarray
+    errors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A finished dataset and what it cost.
+
+    Attributes:
+        made: the file and what is told of it.
+        receivers: (S, 3) [m], world.
+        transmitter: (3,) [m].
+        effects: that were simulated.
+        choice, changed: of `auto`; else None.
+        convergence: between two seeds; None where there are no rays.
+        seconds: by stage [s].
+    """
+
+    made: Assembled
+    receivers: np.ndarray
+    transmitter: np.ndarray
+    effects: Effects
+    choice: Choice | None
+    changed: Changed | None
+    convergence: Convergence | None
+    seconds: dict[str, float]
+
+
+def simulate(campaign: Campaign, out: Path) -> Outcome:
+    """Make the dataset, or go on where an interrupted run stopped.
+
+    Raises:
+        ValueError: `out` exists, or parts beside it belong to another simulation, or bad settings.
+        SimulatorMissing: the scene needs Sionna and it is not here.
+    """
+    if out.exists():
+        raise ValueError(f"out={out} exists; remove it or say another")
+    clock = _Clock()
+    engine, receivers = build(campaign.scene, campaign.sampling)
+    shards = Shards(out, asdict(campaign))
+    clock.lap("build")
+    choice, changed, effects = None, None, campaign.effects
+    if isinstance(effects, AutoSettings):
+        choice, changed = _choose(campaign, effects, engine, receivers, shards)
+        effects = choice.effects
+    effects = engine.able(effects)
+    clock.lap("decide")
+    _trace_all(campaign, engine, receivers, effects, shards)
+    clock.lap("trace")
+    convergence = _converge(campaign, engine, receivers, effects)
+    clock.lap("converge")
+    made = assemble(campaign, engine, receivers, effects, choice, convergence, shards, out)
+    clock.lap("write")
+    return Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, clock.seconds)
+
+
+class _Clock:
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.seconds[name], self._last = now - self._last, now
+
+
+def _choose(
+    campaign: Campaign, settings: AutoSettings, engine: Engine, receivers: np.ndarray, shards: Shards
+) -> tuple[Choice, Changed]:
+    """The decision of `auto`, taken once and kept with the shards; and what the dropped effects change."""
+    stored = shards.noted("choice")
+    if stored is not None:
+        changed = Changed(np.array(stored["rows"], dtype=int), np.array(stored["errors"]))
+        return Choice.from_dict(stored["choice"]), changed
+    asked = spread(receivers, settings.probes + settings.held_back, campaign.scene.seed)
+    # Farthest-point order: taking every so many leaves both groups spread out.
+    taken = np.zeros(len(asked), dtype=bool)
+    taken[np.linspace(0, len(asked) - 1, settings.probes).round().astype(int)] = True
+    probes, held = asked[taken], asked[~taken]
+    full = engine.able(settings.full)
+    log.info("auto: %d probes with %s", len(probes), full)
+    choice = auto.decide(
+        engine,
+        receivers[probes],
+        settings,
+        _probe(campaign, engine, receivers, probes, full),
+        lambda probe: priors.reasons(probe, engine.transmitter, receivers[probes], engine.materials()),
+    )
+    log.info("auto: keeps %s; verifying on %d held-back receivers", choice.effects, len(held))
+    probe = _probe(campaign, engine, receivers, held, full)
+    choice = auto.verify(choice, settings, probe)
+    deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
+    changed = Changed(held, probe.errors(choice.effects, deliverable))
+    shards.note(
+        "choice",
+        {"choice": choice.as_dict(), "rows": held.tolist(), "errors": changed.errors.tolist()},
+    )
+    return choice, changed
+
+
+def _probe(
+    campaign: Campaign, engine: Engine, receivers: np.ndarray, rows: np.ndarray, effects: Effects
+) -> Probe:
+    """Some receivers traced, with their nearest others where spectra are judged."""
+    asked, beside = campaign.effects, None
+    if isinstance(asked, AutoSettings) and Deliverable.parse(asked.deliverable).kind == "spectrum":
+        beside = engine.trace(receivers[neighbours(receivers, rows)], effects)
+    return Probe(
+        engine.trace(receivers[rows], effects),
+        effects,
+        campaign.scene.frequency_hz,
+        engine.wavelength,
+        campaign.csi.elements(engine.wavelength),
+        campaign.spectrum,
+        beside,
+    )
+
+
+def _converge(
+    campaign: Campaign, engine: Engine, receivers: np.ndarray, effects: Effects
+) -> Convergence | None:
+    """The same receivers under a second seed; None for an engine without rays."""
+    if campaign.check == 0 or not engine.random:
+        return None
+    rows = np.sort(spread(receivers, campaign.check, campaign.scene.seed + 1))
+    first = _probe(campaign, engine, receivers, rows, effects)
+    return compare(first, replace(first, paths=engine.trace(receivers[rows], effects, campaign.check_seed)))
+
+
+def _trace_all(
+    campaign: Campaign, engine: Engine, receivers: np.ndarray, effects: Effects, shards: Shards
+) -> None:
+    """Every shard that is not there yet, telling how far it is."""
+    starts = range(0, len(receivers), campaign.shard)
+    missing = [n for n in range(len(starts)) if not shards.done(n)]
+    if len(missing) < len(starts):
+        log.info("%d of %d shards are there already", len(starts) - len(missing), len(starts))
+    begin, done = time.perf_counter(), 0
+    todo = sum(min(campaign.shard, len(receivers) - starts[n]) for n in missing)
+    for number in missing:
+        places = receivers[starts[number] : starts[number] + campaign.shard]
+        shards.put(number, part(engine.trace(places, effects), campaign, engine.wavelength))
+        done += len(places)
+        rate = done / (time.perf_counter() - begin)
+        standing = len(receivers) - todo + done
+        left = (todo - done) / rate
+        log.info("%d of %d receivers, %.1f per s, %.0f s left", standing, len(receivers), rate, left)

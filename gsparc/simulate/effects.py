@@ -1,0 +1,100 @@
+"""Propagation effects as switches, and which of them a path needs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+# Bits of one interaction; the first four are Sionna's, an edge is a wedge with one face.
+SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION, EDGE = 1, 2, 4, 8, 16
+
+BITS = {
+    "specular": SPECULAR,
+    "refraction": REFRACTION,
+    "diffraction": DIFFRACTION,
+    "edge_diffraction": EDGE,
+    "diffuse": DIFFUSE,
+}
+MECHANISMS = ("line_of_sight", *BITS)
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What is simulated; off means not computed.
+
+    Attributes:
+        line_of_sight: the straight path through air.
+        specular: mirror reflection.
+        refraction: transmission through sheets (the straight path through a pane is one).
+        diffraction: at wedges between two faces.
+        edge_diffraction: at free edges of a sheet; needs `diffraction`.
+        diffuse: scattering off rough surfaces; needs `specular`.
+        depth: most interactions of a path.
+        polarisation: receive the horizontal component beside the vertical one; off: the vertical one only.
+        noise_snr_db: white noise on channels this far below their mean power [dB]; None for none.
+    """
+
+    line_of_sight: bool = True
+    specular: bool = True
+    refraction: bool = True
+    diffraction: bool = True
+    edge_diffraction: bool = True
+    diffuse: bool = True
+    depth: int = 3
+    polarisation: bool = True
+    noise_snr_db: float | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.depth <= 8:
+            raise ValueError(f"effects.depth={self.depth}: expected 0 to 8 interactions")
+        if self.diffuse and not self.specular:
+            raise ValueError(
+                "effects.diffuse needs effects.specular (the solver loses diffuse power without)"
+            )
+        if self.edge_diffraction and not self.diffraction:
+            raise ValueError("effects.edge_diffraction needs effects.diffraction")
+        if not any(getattr(self, name) for name in MECHANISMS):
+            raise ValueError("effects: every mechanism is off; nothing would arrive")
+
+    @property
+    def on(self) -> tuple[str, ...]:
+        """Names of the mechanisms that are computed."""
+        return tuple(name for name in MECHANISMS if getattr(self, name))
+
+    def without(self, *names: str) -> Effects:
+        """The same with some switched off, and with what needs them."""
+        off = set(names)
+        if "specular" in off:
+            off.add("diffuse")
+        if "diffraction" in off:
+            off.add("edge_diffraction")
+        return replace(self, **dict.fromkeys(off, False))
+
+    def allows(self, mechanisms: np.ndarray, order: np.ndarray) -> np.ndarray:
+        """Which paths exist under these switches: (P,) bool.
+
+        Args:
+            mechanisms: (P,) OR of the bits of all interactions of a path.
+            order: (P,) number of interactions.
+        """
+        bits = sum(bit for name, bit in BITS.items() if getattr(self, name))
+        kept = (mechanisms & ~np.array(bits, dtype=mechanisms.dtype)) == 0
+        return kept & (order <= self.depth) & (self.line_of_sight | (order > 0))
+
+    def __str__(self) -> str:
+        extra = [f"depth {self.depth}"] + (["both polarisations"] if self.polarisation else [])
+        return ", ".join([name.replace("_", " ") for name in self.on] + extra)
+
+
+def from_config(config: dict[str, object]) -> Effects:
+    """Switches from the config group `effects`.
+
+    Raises:
+        ValueError: a switch that does not exist, or a contradiction.
+    """
+    known = {f.name for f in fields(Effects)}
+    unknown = [key for key in config if key not in known]
+    if unknown:
+        raise ValueError(f"effects.{unknown[0]}: no such effect; there are {', '.join(sorted(known))}")
+    return Effects(**config)  # type: ignore[arg-type]

@@ -1,0 +1,45 @@
+"""The one face of every simulator: positions and switches in, paths out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.paths import Paths
+
+
+class Engine(Protocol):
+    """A scene with one transmitter, ready to trace.
+
+    Attributes:
+        name: for provenance.
+        transmitter: (3,) [m].
+        wavelength: at the carrier [m].
+        random: whether another seed gives another answer.
+    """
+
+    name: str
+    transmitter: np.ndarray
+    wavelength: float
+    random: bool
+
+    def able(self, effects: Effects) -> Effects:
+        """These switches without what the engine cannot compute."""
+
+    def trace(
+        self,
+        receivers: np.ndarray,
+        effects: Effects,
+        seed: int | None = None,
+        progress: Callable[[int], None] = ...,
+    ) -> Paths:
+        """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
+
+    def versions(self) -> dict[str, str]:
+        """What computes."""
+
+    def materials(self) -> dict[str, dict[str, Any]]:
+        """What the scene is made of, for provenance and for physical reasons."""

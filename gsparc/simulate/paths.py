@@ -1,0 +1,107 @@
+"""Propagation paths of many receivers as flat arrays, and what follows from them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.simulate.effects import Effects
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths of R receivers, sorted by receiver and then by delay; those of r are `offsets[r]:offsets[r+1]`.
+
+    Attributes:
+        offsets: (R + 1,) int64.
+        gain: (P, ports) complex64 without the carrier's phase, one column per received polarisation.
+        delay: (P,) float64 [s].
+        direction: (P, 3) float32 unit vectors from the receiver to where the path comes from, world axes.
+        mechanisms: (P,) uint8, OR of the bits of `effects.BITS` over its interactions; 0: line of sight.
+        order: (P,) uint8 number of interactions.
+    """
+
+    offsets: np.ndarray
+    gain: np.ndarray
+    delay: np.ndarray
+    direction: np.ndarray
+    mechanisms: np.ndarray
+    order: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    @property
+    def owner(self) -> np.ndarray:
+        """Receiver of each path (P,)."""
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
+
+    @property
+    def power(self) -> np.ndarray:
+        """|gain|^2 summed over the ports (P,)."""
+        return (np.abs(self.gain.astype(np.complex128)) ** 2).sum(1)
+
+    def select(self, kept: np.ndarray) -> Paths:
+        """Only the paths where `kept` (P,) bool is true; receivers stay."""
+        counts = np.bincount(self.owner[kept], minlength=len(self))
+        parts = (getattr(self, name)[kept] for name in ARRAYS)
+        return Paths(np.concatenate([[0], np.cumsum(counts)]), *parts)
+
+    def under(self, effects: Effects) -> Paths:
+        """What remains of a full simulation under these switches."""
+        kept = self.select(effects.allows(self.mechanisms, self.order))
+        if effects.polarisation or kept.gain.shape[1] == 1:
+            return kept
+        return Paths(kept.offsets, kept.gain[:, :1], *(getattr(kept, n) for n in ARRAYS[1:]))
+
+    def per_receiver(self, values: np.ndarray) -> np.ndarray:
+        """Sums of `values` (P,) over the paths of each receiver (R,)."""
+        return np.bincount(self.owner, weights=values, minlength=len(self))
+
+    def received_power(self) -> np.ndarray:
+        """Mean power over a small area: the sum of path powers (R,)."""
+        return self.per_receiver(self.power)
+
+    def delay_spread(self) -> np.ndarray:
+        """Root-mean-square delay spread (R,) [s]; 0 where nothing arrives."""
+        total = np.maximum(self.received_power(), np.finfo(float).tiny)
+        mean = self.per_receiver(self.power * self.delay) / total
+        return np.sqrt(self.per_receiver(self.power * (self.delay - mean[self.owner]) ** 2) / total)
+
+    def below_horizon(self) -> float:
+        """Share of all receivers' power that arrives from below the horizon, each receiver counting alike."""
+        below = self.per_receiver(self.power * (self.direction[:, 2] < 0))
+        heard = self.received_power()
+        return float((below / np.where(heard > 0, heard, 1))[heard > 0].mean()) if heard.any() else 0.0
+
+    def responses(self, frequency_hz: np.ndarray, elements: np.ndarray, wavelength: float) -> np.ndarray:
+        """Channels (R, ports x M, K) complex128: `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.
+
+        Args:
+            frequency_hz: (K,) absolute frequencies [Hz].
+            elements: (M, 3) [m] array elements about the receiver, world axes.
+            wavelength: [m], at the carrier.
+        """
+        ports = self.gain.shape[1]
+        channels = np.zeros((len(self), ports * len(elements), len(frequency_hz)), dtype=np.complex128)
+        for r, (start, stop) in enumerate(zip(self.offsets[:-1], self.offsets[1:], strict=True)):
+            some = slice(start, stop)
+            # cycles, not radians, and reduced in float64 before the exponential
+            tones = np.exp(-2j * np.pi * np.mod(np.outer(self.delay[some], frequency_hz), 1.0))
+            steered = np.exp(2j * np.pi / wavelength * (elements @ self.direction[some].T.astype(np.float64)))
+            for port in range(ports):
+                block = (steered * self.gain[some, port]) @ tones
+                channels[r, port * len(elements) : (port + 1) * len(elements)] = block
+        return channels
+
+
+ARRAYS = ("gain", "delay", "direction", "mechanisms", "order")
+
+
+def join(parts: Sequence[Paths]) -> Paths:
+    """Receivers of all parts, one after the other."""
+    counts = np.concatenate([np.diff(part.offsets) for part in parts])
+    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
+    return Paths(np.concatenate([[0], np.cumsum(counts)]), *columns)

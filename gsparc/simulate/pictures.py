@@ -1,0 +1,81 @@
+"""Pictures of a simulation: the floor plan, and what `auto` measured."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from gsparc.simulate.auto import Choice
+from gsparc.simulate.campaign import Outcome
+
+
+def floor_plan(outcome: Outcome, path: Path) -> None:
+    """From above: received power, delay spread and, after `auto`, where a dropped effect mattered."""
+    changed = outcome.changed
+    count = 2 if changed is None else 3
+    places = outcome.receivers
+    extent = np.ptp(places[:, :2], axis=0)
+    high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 0.9
+    figure = Figure(figsize=(5.4 * count, high), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, count)
+    heard = outcome.made.power > 0
+    size = float(np.clip(6000 / len(places), 2, 40))
+    power = 10 * np.log10(outcome.made.power[heard])
+    _map(panels[0], places[heard], power, "received power [dB]", size, robust=True)
+    _map(
+        panels[1],
+        places[heard],
+        outcome.made.delay_spread[heard] * 1e9,
+        "delay spread [ns]",
+        size,
+        robust=True,
+    )
+    if changed is not None:
+        known = heard[changed.rows]
+        label = "error by what was dropped, held-back receivers"
+        _map(panels[2], places[changed.rows][known], changed.errors[known], label, 40.0, robust=False)
+    for panel in panels:
+        if (~heard).any():
+            panel.scatter(*places[~heard, :2].T, s=size, c="lightgrey", label="nothing arrives")
+        panel.plot(*outcome.transmitter[:2], "r^", markersize=9, label="transmitter")
+        panel.set_aspect("equal")
+        panel.set_xlabel("x [m]")
+    panels[0].set_ylabel("y [m]")
+    panels[0].legend(loc="upper right", fontsize="small")
+    figure.suptitle(
+        f"{outcome.made.data.site.name}: {len(places)} receivers, {outcome.effects}", fontsize="medium"
+    )
+    figure.savefig(path, dpi=110)
+
+
+def _map(axes: Axes, places: np.ndarray, values: np.ndarray, label: str, size: float, robust: bool) -> None:
+    low, high = np.quantile(values, [0.01, 0.99]) if robust else (values.min(), values.max())
+    drawn = axes.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    assert axes.figure is not None
+    axes.figure.colorbar(drawn, ax=axes, location="bottom", label=label, shrink=0.8)
+
+
+def worth(choice: Choice, path: Path) -> None:
+    """Share of power and channel NMSE of each effect, kept or dropped."""
+    rows = [row for row in choice.table if row.share > 0 or row.nmse_p95 > 0][::-1]
+    names = [row.effect.replace("_", " ") for row in rows]
+    figure = Figure(figsize=(9, 0.36 * len(rows) + 1.6), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subplots(1, 2, sharey=True)
+    colours = ["tab:blue" if row.kept else "lightgrey" for row in rows]
+    for axes, middle, far, label in (
+        (left, [r.share * 100 for r in rows], [r.share_p95 * 100 for r in rows], "share of power [%]"),
+        (right, [r.nmse for r in rows], [r.nmse_p95 for r in rows], "channel NMSE if left out"),
+    ):
+        axes.barh(names, far, color=colours, alpha=0.5, height=0.75)
+        axes.barh(names, middle, color=colours, height=0.45)
+        axes.set_xlabel(f"{label}: typical (thick), 95 % (thin)")
+        axes.grid(axis="x", alpha=0.3)
+    right.set_xscale("log")
+    figure.suptitle(f"blue: simulated; grey: left out. {choice.deliverable}", fontsize="medium")
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,87 @@
+"""Reasons that physics gives beforehand; printed beside the measurement, never instead of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from gsparc.simulate.attribution import Probe
+
+
+def reasons(
+    probe: Probe, transmitter: np.ndarray, receivers: np.ndarray, materials: Mapping[str, Mapping[str, Any]]
+) -> dict[str, str]:
+    """Why an effect should or should not matter, by its name; absent where physics gives no short reason.
+
+    Args:
+        probe: everything on.
+        transmitter: (3,) [m].
+        receivers: (R, 3) [m], those of the probe.
+        materials: of the scene; `permittivity`, `thickness_m` and `scattering` are read where given.
+    """
+    wavelength, paths = probe.wavelength, probe.paths
+    distance = float(np.median(np.linalg.norm(receivers - transmitter, axis=1)))
+    sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
+    fresnel = np.sqrt(wavelength * distance) / 2
+    rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]
+    found = {
+        "line_of_sight": f"{sight.mean():.0%} of the receivers see the transmitter",
+        "diffraction": (
+            f"first Fresnel zone {fresnel:.2g} m wide at {distance:.3g} m; {1 - sight.mean():.0%} shadowed"
+        ),
+        "diffuse": f"smooth below {wavelength / 8 * 1e3:.2g} mm of relief (Rayleigh)"
+        + (f"; S^2 is {min(rough):.1%} to {max(rough):.1%} of a reflection" if rough else ""),
+    }
+    losses = {name: _normal_incidence(m, wavelength) for name, m in materials.items() if _slab(m)}
+    if losses:
+        through = {name: loss for name, (_, loss) in losses.items()}
+        clearest, densest = min(through, key=lambda n: through[n]), max(through, key=lambda n: through[n])
+        found["refraction"] = (
+            f"a sheet costs {through[clearest]:.1f} dB ({clearest}) to {through[densest]:.1f} dB ({densest})"
+        )
+        mirror = -10 * np.log10(np.median([10 ** (-loss / 10) for loss, _ in losses.values()]))
+        found["depth"] = f"a reflection costs about {mirror:.0f} dB"
+    return found
+
+
+def scene_facts(
+    delay_spread_s: np.ndarray,
+    below_horizon: float,
+    bandwidth_hz: float,
+    distance: np.ndarray,
+    near_field_m: float,
+) -> dict[str, float]:
+    """Numbers about the scene that decide what a dataset can be used for.
+
+    Args:
+        delay_spread_s: (R,) of the receivers that hear anything [s].
+        below_horizon: share of their power that an upper hemisphere cannot show.
+        bandwidth_hz: times the delay spread far below 1, the band is flat and one tone says it all [Hz].
+        distance: (R,) from the transmitter [m].
+        near_field_m: Fraunhofer distance of the spectrum's array; nearer, waves over it are not plane.
+    """
+    spread = float(np.median(delay_spread_s))
+    return {
+        "below_horizon": below_horizon,
+        "delay_spread_ns": spread * 1e9,
+        "bandwidth_times_delay_spread": spread * bandwidth_hz,
+        "near_field_m": near_field_m,
+        "share_in_near_field": float((distance < near_field_m).mean()),
+    }
+
+
+def _slab(material: Mapping[str, Any]) -> bool:
+    # A conductor's permittivity is 1: its loss is not in this number.
+    return float(material.get("permittivity", 0.0)) > 1.01 and float(material.get("thickness_m", 0.0)) > 0
+
+
+def _normal_incidence(material: Mapping[str, Any], wavelength: float) -> tuple[float, float]:
+    """Loss [dB] of a reflection off, and of a passage through, a lossless slab at normal incidence."""
+    index = np.sqrt(float(material["permittivity"]))
+    face = (1 - index) / (1 + index)
+    turn = np.exp(-4j * np.pi * index * float(material["thickness_m"]) / wavelength)
+    through = (1 - face**2) * np.sqrt(turn) / (1 - face**2 * turn)
+    back = 1 - abs(through) ** 2
+    return -10 * np.log10(max(back, 1e-9)), -20 * np.log10(max(abs(through), 1e-9))

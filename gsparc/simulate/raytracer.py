@@ -1,0 +1,314 @@
+"""Sionna's ray tracer behind our interface, with a guard for each of its traps; imported only when it traces.
+
+What is guarded: candidates cut off at the shared limit (detected, and the batch is halved and traced again),
+duplicated lines of sight (refused), materials without scattering (completed), receivers inside objects.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.simulate import llvm
+from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
+from gsparc.simulate.paths import ARRAYS, Paths, join
+from gsparc.simulate.scenes.solid import Solid
+
+log = logging.getLogger(__name__)
+
+CANDIDATES_PER_RECEIVER = 20_000  # fewer lose specular chains to hash collisions before the limit is reached
+LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
+MATERIALS = {  # thickness [m] and scattering coefficient, where a scene says nothing
+    "concrete": (0.20, 0.20), "brick": (0.12, 0.25), "plasterboard": (0.025, 0.10), "wood": (0.03, 0.15),
+    "glass": (0.008, 0.05), "ceiling_board": (0.015, 0.20), "chipboard": (0.018, 0.15),
+    "plywood": (0.012, 0.15),
+    "floorboard": (0.02, 0.15), "metal": (0.002, 0.05), "marble": (0.10, 0.15),
+}  # fmt: skip
+OTHERS = (0.10, 0.20)
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How hard the solver works.
+
+    Attributes:
+        samples: rays per call; the convergence error falls with it.
+        batch: receivers of one call.
+        seed: of the rays; one for all batches, because receivers share candidate paths.
+    """
+
+    samples: int = 300_000
+    batch: int = 200
+    seed: int = 1
+
+
+class RayTracer:
+    """One scene with one transmitter, ready to trace.
+
+    Args:
+        source: objects built in code, the name of one of Sionna's scenes, or the path of an XML file.
+        transmitter: (3,) [m].
+        carrier_hz: [Hz].
+        sampling: how hard to work.
+        scattering: scattering coefficient of all materials instead of `MATERIALS`; None for those.
+
+    Raises:
+        SimulatorMissing: no Sionna, or no LLVM that works.
+        ValueError: no such scene, or a file that Sionna cannot read.
+    """
+
+    name = "sionna-rt"
+    random = True
+
+    def __init__(
+        self,
+        source: Sequence[Solid] | str | Path,
+        transmitter: np.ndarray,
+        carrier_hz: float,
+        sampling: Sampling = Sampling(),
+        scattering: float | None = None,
+    ) -> None:
+        self.library = llvm.prepare()
+        self.sampling = sampling
+        self.wavelength = 299_792_458.0 / carrier_hz
+        self._scene = _load(source, carrier_hz, scattering)
+        self.transmitter = np.asarray(transmitter, dtype=np.float64)
+        self._ports = 0
+        self.retried = 0  # batches that were halved because candidates were cut off
+
+    def able(self, effects: Effects) -> Effects:
+        """Everything."""
+        return effects
+
+    def versions(self) -> dict[str, str]:
+        """What computes."""
+        from importlib.metadata import version
+
+        return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+
+    def materials(self) -> dict[str, dict[str, Any]]:
+        """ITU name, thickness [m] and scattering coefficient of every material in use."""
+        return {
+            name: {
+                "itu": getattr(m, "itu_type", None),
+                "thickness_m": round(float(m.thickness[0]), 6),
+                "scattering": round(float(m.scattering_coefficient[0]), 6),
+                "permittivity": round(float(m.relative_permittivity[0]), 6),
+            }
+            for name, m in self._scene.radio_materials.items()
+        }
+
+    def trace(
+        self,
+        receivers: np.ndarray,
+        effects: Effects,
+        seed: int | None = None,
+        progress: Callable[[int], None] = lambda done: None,
+    ) -> Paths:
+        """Paths from the transmitter to receivers (R, 3) [m].
+
+        Args:
+            receivers: world coordinates.
+            effects: what is computed.
+            seed: of the rays instead of `sampling.seed`.
+            progress: called with the number of receivers finished.
+
+        Raises:
+            RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
+        """
+        parts, start = [], 0
+        while start < len(receivers):
+            some = receivers[start : start + self.sampling.batch]
+            parts.append(self._batch(some, effects, self.sampling.seed if seed is None else seed))
+            start += len(some)
+            progress(start)
+        return join(parts)
+
+    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int, boost: int = 1) -> Paths:
+        """One call; halved, or with a larger buffer, when candidates were cut off."""
+        limit = min(CANDIDATES_PER_RECEIVER * boost * len(receivers), LARGEST_BUFFER)
+        if effects.depth == 0:
+            limit = max(limit, len(receivers))
+        paths = self._solve(receivers, effects, seed, limit)
+        if paths is not None:
+            return paths
+        self.retried += 1
+        if limit < LARGEST_BUFFER:
+            log.info("candidate paths were cut off at %d; tracing %d receivers again", limit, len(receivers))
+            return self._batch(receivers, effects, seed, boost * 4)
+        if len(receivers) == 1:
+            raise RuntimeError(
+                f"one receiver has over {LARGEST_BUFFER} candidate paths; lower sampling.samples"
+            )
+        half = len(receivers) // 2
+        log.info("candidate paths were cut off at %d; tracing halves of %d receivers", limit, len(receivers))
+        return join(
+            [self._batch(part, effects, seed, boost) for part in (receivers[:half], receivers[half:])]
+        )
+
+    def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Paths | None:
+        """Paths, or None when the solver ran into `limit` and left some out."""
+        import sionna.rt as rt
+
+        self._stand(receivers, 2 if effects.polarisation else 1)
+        solver = rt.PathSolver()
+        watched = _Watched(solver._candidate_generator)
+        solver._candidate_generator = watched
+        found = solver(
+            self._scene,
+            max_depth=effects.depth,
+            samples_per_src=self.sampling.samples,
+            max_num_paths_per_src=limit,
+            los=effects.line_of_sight,
+            specular_reflection=effects.specular,
+            diffuse_reflection=effects.diffuse,
+            refraction=effects.refraction,
+            diffraction=effects.diffraction,
+            edge_diffraction=effects.edge_diffraction,
+            seed=seed,
+        )
+        return None if watched.stored() >= limit else _collect(found, len(receivers))
+
+    def _stand(self, receivers: np.ndarray, ports: int) -> None:
+        """Put the ends into the scene."""
+        import mitsuba as mi
+        import sionna.rt as rt
+
+        scene = self._scene
+        if ports != self._ports:
+
+            def one(polarisation: str) -> Any:
+                return rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
+
+            scene.tx_array, scene.rx_array, self._ports = one("V"), one("V" if ports == 1 else "VH"), ports
+        for name in list(scene.receivers):
+            scene.remove(name)
+        if not scene.transmitters:
+            scene.add(rt.Transmitter("tx", position=mi.Point3f(*map(float, self.transmitter))))
+        for i, place in enumerate(receivers):
+            scene.add(rt.Receiver(f"rx{i}", position=mi.Point3f(*map(float, place))))
+
+    def under_open_sky(self, points: np.ndarray) -> np.ndarray:
+        """Whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""
+        return ~np.isfinite(self._distance(points, np.array([0.0, 0.0, 1.0])))
+
+    def clear_of_surfaces(self, points: np.ndarray, gap: float) -> np.ndarray:
+        """Whether no surface is within `gap` [m] of points (N, 3) along the six axes."""
+        axes = np.concatenate([np.eye(3), -np.eye(3)])
+        return np.all([self._distance(points, axis) > gap for axis in axes], axis=0)
+
+    def _distance(self, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        import mitsuba as mi
+
+        origin = mi.Point3f(
+            *(mi.Float(np.ascontiguousarray(points[:, i], dtype=np.float32)) for i in range(3))
+        )
+        ray = mi.Ray3f(origin, mi.Vector3f(*map(float, direction)))
+        return self._scene.mi_scene.ray_intersect(ray).t.numpy()
+
+
+class _Watched:
+    """A candidate generator that remembers how many candidates it stored; the solver does not tell."""
+
+    def __init__(self, generator: Any) -> None:
+        self._generator = generator
+        self._counter: Any = None
+
+    def __call__(self, **arguments: Any) -> Any:
+        buffer = self._generator(**arguments)
+        self._counter = buffer.paths_counter
+        return buffer
+
+    def stored(self) -> int:
+        return int(self._counter.numpy().max())
+
+
+def _collect(found: Any, receivers: int) -> Paths:
+    """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest list."""
+    buffer = found._paths_buffer
+    owner = buffer.target_indices.numpy().astype(np.int64)
+    gain = np.stack([one[0].numpy() for one in buffer.a], axis=1).astype(np.complex64)
+    delay = buffer.tau.numpy().astype(np.float64)
+    kinds = buffer.interaction_types.numpy().astype(np.uint8).reshape(len(owner), -1)
+    edge = np.zeros(len(owner), dtype=bool)
+    if buffer.diffracting_wedges is not None and len(owner):
+        wedges = buffer.diffracting_wedges
+        edge = wedges.prim0.numpy() == wedges.primn.numpy()
+    kinds = np.where(edge[:, None] & (kinds == DIFFRACTION), EDGE, kinds).astype(np.uint8)
+    mechanisms = np.bitwise_or.reduce(kinds, axis=1) if kinds.shape[1] else np.zeros(len(owner), np.uint8)
+    order = (kinds > 0).sum(1).astype(np.uint8)
+    direction = buffer.k_rx.numpy().T.astype(np.float32).reshape(len(owner), 3)
+    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
+    sight = np.bincount(owner[order == 0], minlength=receivers)
+    if len(sight) and sight.max() > 1:
+        row = int(sight.argmax())
+        raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
+    rank = np.lexsort((delay, owner))
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=receivers))])
+    arrays: Mapping[str, np.ndarray] = {
+        "gain": gain, "delay": delay, "direction": direction, "mechanisms": mechanisms, "order": order
+    }  # fmt: skip
+    return Paths(offsets, *(arrays[name][rank] for name in ARRAYS))
+
+
+def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:
+    import sionna.rt as rt
+
+    if isinstance(source, (str, Path)):
+        scene = _load_file(source)
+        for material in scene.radio_materials.values():
+            # Built-in scenes come with 0: diffuse reflection would contribute nothing without a word.
+            if float(material.scattering_coefficient[0]) == 0.0:
+                usual = MATERIALS.get(getattr(material, "itu_type", None) or "", OTHERS)[1]
+                material.scattering_coefficient = usual if scattering is None else scattering
+    else:
+        scene = rt.load_scene()
+        _add(scene, source, scattering)
+    scene.frequency = float(carrier_hz)
+    return scene
+
+
+def _load_file(source: str | Path) -> Any:
+    import sionna.rt as rt
+
+    path = Path(source)
+    if isinstance(source, Path) or path.suffix == ".xml":
+        if not path.is_file():
+            raise ValueError(f"scene.xml={source}: no such file")
+        try:
+            return rt.load_scene(str(path))
+        except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
+            first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
+            raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
+    known = sorted(n for n in dir(rt.scene) if str(getattr(rt.scene, n)).endswith(".xml"))
+    if source not in known:
+        raise ValueError(f"scene.builtin={source}: Sionna has no such scene; there are {', '.join(known)}")
+    return rt.load_scene(getattr(rt.scene, str(source)))
+
+
+def _add(scene: Any, solids: Sequence[Solid], scattering: float | None) -> None:
+    import mitsuba as mi
+    import sionna.rt as rt
+
+    materials = {}
+    for name in sorted({solid.material for solid in solids}):
+        thickness, usual = MATERIALS.get(name, OTHERS)
+        materials[name] = rt.ITURadioMaterial(
+            f"itu-{name}", name, thickness, scattering_coefficient=usual if scattering is None else scattering
+        )
+    objects = []
+    for solid in solids:
+        mesh = mi.Mesh(solid.name, vertex_count=len(solid.vertices), face_count=len(solid.faces))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = np.ascontiguousarray(solid.vertices, dtype=np.float32).ravel()
+        parameters["faces"] = np.ascontiguousarray(solid.faces, dtype=np.uint32).ravel()
+        parameters.update()
+        objects.append(
+            rt.SceneObject(mi_mesh=mesh, name=solid.name, radio_material=materials[solid.material])
+        )
+    scene.add(objects)

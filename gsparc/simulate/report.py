@@ -1,0 +1,88 @@
+"""A simulation in numbers: the table of `auto`, and flat facts for `summary.json`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rich.table import Table
+
+from gsparc.simulate.auto import Choice
+from gsparc.simulate.campaign import Outcome
+
+
+def choice_table(choice: Choice) -> Table:
+    """Every effect a row: what it is worth, what it costs, why, kept or dropped."""
+    table = Table(title=f"promise: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
+    table.add_column("left out")
+    for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "seconds"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for row in choice.table:
+        table.add_row(
+            row.effect.replace("_", " "),
+            f"{row.share:.1%}", f"{row.share_p95:.1%}", f"{row.nmse:.2g}", f"{row.nmse_p95:.2g}",
+            f"{row.error:.2g}", f"{row.error_p95:.2g}", f"{row.seconds:.1f}",
+            "kept" if row.kept else "dropped",
+            style="bold" if row.kept else None,
+        )  # fmt: skip
+    return table
+
+
+def reasons(choice: Choice) -> list[str]:
+    """What physics says beforehand, one line an effect."""
+    found = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
+    return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in found.items()]
+
+
+def verdict(choice: Choice) -> str:
+    """What was chosen, what it saves, and whether the promise holds."""
+    said = (
+        f"simulated: {choice.effects}; tracing takes {choice.seconds_chosen:.1f} s instead of "
+        f"{choice.seconds_all:.1f} s on the probes ({choice.saved:.0%} saved)"
+    )
+    found = choice.verdict
+    if found is None:
+        return said
+    judged = "kept" if found.kept else "NOT KEPT"
+    return (
+        f"{said}; promise {judged}: {found.met:.1%} of {found.receivers} held-back receivers are within it "
+        f"(error {found.error:.2g} median, {found.error_p95:.2g} at 95 %)"
+    )
+
+
+def figures(outcome: Outcome) -> dict[str, Any]:
+    """Flat facts."""
+    facts: dict[str, Any] = {
+        "dataset/name": outcome.made.data.site.name,
+        "dataset/sha256": outcome.made.data.site.sha256,
+        "dataset/receivers": len(outcome.receivers),
+        "effects": str(outcome.effects),
+        **{f"scene/{name}": value for name, value in outcome.made.facts.items()},
+        **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
+        "time/receivers_per_s": len(outcome.receivers) / max(outcome.seconds["trace"], 1e-9),
+    }
+    if outcome.convergence is not None:
+        facts["dataset/convergence_error"] = outcome.convergence.nmse
+        facts |= {f"dataset/{k}": v for k, v in outcome.convergence.attributes().items()}
+    choice = outcome.choice
+    if choice is not None:
+        facts |= {
+            "auto/deliverable": choice.deliverable,
+            "auto/seconds_all": choice.seconds_all,
+            "auto/seconds_chosen": choice.seconds_chosen,
+            "auto/saved": choice.saved,
+            "auto/decide_s": choice.seconds,
+        }
+        for row in choice.table:
+            name = row.effect.replace(" > ", "_over_")
+            facts |= {
+                f"auto/{name}/share": row.share,
+                f"auto/{name}/nmse": row.nmse,
+                f"auto/{name}/nmse_p95": row.nmse_p95,
+                f"auto/{name}/error_p95": row.error_p95,
+                f"auto/{name}/seconds": row.seconds,
+                f"auto/{name}/kept": row.kept,
+            }
+        if choice.verdict is not None:
+            facts |= {f"auto/verdict/{k}": v for k, v in vars(choice.verdict).items()}
+    return facts

@@ -1,0 +1,1 @@
+"""Places to simulate: what stands where, of what, and where the two ends may be."""

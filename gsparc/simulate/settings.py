@@ -1,0 +1,74 @@
+"""Everything a simulated dataset is made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from gsparc.simulate.auto import AutoSettings
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.raytracer import Sampling
+from gsparc.simulate.scenes.build import SceneSettings
+from gsparc.simulate.spectrum import SpectrumSettings
+
+
+@dataclass(frozen=True)
+class CsiSettings:
+    """The array that channels are stored for, in the receiver's xy plane.
+
+    Attributes:
+        rows, columns: elements; 1 x 1 is one antenna at the receiver's place.
+        spacing: in carrier wavelengths.
+    """
+
+    rows: int = 1
+    columns: int = 1
+    spacing: float = 0.5
+
+    def elements(self, wavelength: float) -> np.ndarray:
+        """Positions (M, 3) [m]."""
+        lattice = SpectrumSettings(rows=self.rows, columns=self.columns, spacing=self.spacing)
+        return lattice.elements(wavelength)
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """One dataset.
+
+    Attributes:
+        scene: where.
+        effects: what is simulated, or how `auto` decides.
+        sampling: how hard the ray tracer works.
+        spectrum, csi: what is stored.
+        shard: receivers per shard.
+        check: receivers of the convergence error; 0 for none.
+        check_seed: the second seed.
+        weakest_db: stored paths reach this far below the strongest of their receiver [dB].
+        measurement: which of `spectrum` and `csi` the file is mainly read as.
+    """
+
+    scene: SceneSettings
+    effects: Effects | AutoSettings
+    sampling: Sampling = field(default_factory=Sampling)
+    spectrum: SpectrumSettings = field(default_factory=SpectrumSettings)
+    csi: CsiSettings = field(default_factory=CsiSettings)
+    shard: int = 400
+    check: int = 128
+    check_seed: int = 2
+    weakest_db: float = 60.0
+    measurement: str = "spectrum"
+
+    def __post_init__(self) -> None:
+        if self.measurement not in ("spectrum", "csi"):
+            raise ValueError(f"measurement={self.measurement}: expected spectrum or csi")
+        if self.shard < 1 or self.check < 0:
+            raise ValueError("shard is at least 1, check at least 0")
+        if self.check_seed == self.sampling.seed:
+            raise ValueError("check_seed must differ from sampling.seed")
+        asked = self.effects
+        if isinstance(asked, AutoSettings) and self.scene.num_receivers < asked.probes + asked.held_back:
+            raise ValueError(
+                f"effects=auto asks {asked.probes} + {asked.held_back} receivers, the scene has "
+                f"{self.scene.num_receivers}; lower effects.probes and effects.held_back (16 at least)"
+            )

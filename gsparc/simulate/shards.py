@@ -1,0 +1,82 @@
+"""A simulation on its way to disk: shards written once, atomically, and only counted when whole.
+
+HDF5 does not survive a kill, so nothing is appended to: each shard is a file of its own that appears by
+renaming, and the dataset is written from all of them at the end.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+
+class Shards:
+    """The folder `FILE.parts` beside a dataset that is being made.
+
+    Args:
+        out: the dataset's file.
+        plan: everything that decides what the shards hold; a folder made by another plan is refused.
+
+    Raises:
+        ValueError: the folder belongs to another simulation.
+    """
+
+    def __init__(self, out: Path, plan: Mapping[str, Any]) -> None:
+        self.folder = out.with_name(out.name + ".parts")
+        self.resumed = self.folder.exists()
+        text = json.dumps(plan, sort_keys=True, indent=1, default=str)
+        stored = self.folder / "plan.json"
+        if stored.exists() and stored.read_text(encoding="utf-8") != text:
+            raise ValueError(
+                f"{self.folder} holds parts of a different simulation; remove it, or say another out="
+            )
+        if not stored.exists():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            _write(stored, text.encode())
+
+    def note(self, name: str, content: Mapping[str, Any]) -> None:
+        """Keep a decision, so that a resumed run does not decide again."""
+        _write(self.folder / f"{name}.json", json.dumps(content, indent=1).encode())
+
+    def noted(self, name: str) -> dict[str, Any] | None:
+        """What was noted, or None."""
+        path = self.folder / f"{name}.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+    def path(self, number: int) -> Path:
+        """File of a shard."""
+        return self.folder / f"shard_{number:04d}.npz"
+
+    def done(self, number: int) -> bool:
+        """Whether a shard is finished."""
+        return self.path(number).exists()
+
+    def put(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a shard, whole or not at all."""
+        partial = self.path(number).with_suffix(".partial")
+        with partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, self.path(number))
+
+    def get(self, number: int) -> dict[str, np.ndarray]:
+        """The arrays of a finished shard."""
+        with np.load(self.path(number), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+
+    def remove(self) -> None:
+        """After the dataset is written."""
+        shutil.rmtree(self.folder)
+
+
+def _write(path: Path, content: bytes) -> None:
+    partial = path.with_suffix(".partial")
+    partial.write_bytes(content)
+    os.replace(partial, path)

@@ -1,0 +1,172 @@
+"""What a simulated spectrum is: fixed and stored before anything is trained.
+
+Bartlett (default): the elements of a stated planar array hear the paths from above their ground plane on
+every subcarrier, `P(u) = mean_k |a(u)^H h_k|^2 / M^2`, the subcarriers being the snapshots; interference
+within the band is real. Beam: every path is a von Mises-Fisher spot of a stated width carrying its power.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+
+from gsparc.ops import SphereGrid
+from gsparc.simulate.paths import Paths
+
+BLOCK = 64  # receivers at once
+
+
+@dataclass(frozen=True)
+class SpectrumSettings:
+    """One definition of a spectrum.
+
+    Attributes:
+        kind: `bartlett` or `beam`.
+        rows, columns: of the array in the receiver's xy plane.
+        spacing: of the elements, in carrier wavelengths.
+        beam_deg: full width at half power of the beam kernel [deg].
+        scale: what a pixel is: `power`, or `amplitude`, its square root.
+        normalisation: each image divided by its largest value (`max`), or all by the largest of all (`none`).
+        height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width of azimuth.
+    """
+
+    kind: Literal["bartlett", "beam"] = "bartlett"
+    rows: int = 8
+    columns: int = 8
+    spacing: float = 0.5
+    beam_deg: float = 10.0
+    scale: Literal["amplitude", "power"] = "amplitude"
+    normalisation: Literal["max", "none"] = "max"
+    height: int = 90
+    width: int = 360
+
+    def __post_init__(self) -> None:
+        for name, allowed in (
+            ("kind", ("bartlett", "beam")),
+            ("scale", ("amplitude", "power")),
+            ("normalisation", ("max", "none")),
+        ):
+            if getattr(self, name) not in allowed:
+                raise ValueError(
+                    f"spectrum.{name}={getattr(self, name)}: expected one of {', '.join(allowed)}"
+                )
+        if min(self.rows, self.columns, self.height, self.width) < 1:
+            raise ValueError("spectrum: rows, columns, height and width are at least 1")
+        if not (self.spacing > 0 and self.beam_deg > 0):
+            raise ValueError("spectrum: spacing and beam_deg are positive")
+
+    @property
+    def grid(self) -> SphereGrid:
+        """Directions of the pixels: the upper hemisphere."""
+        return SphereGrid.hemisphere(self.height, self.width)
+
+    def elements(self, wavelength: float) -> np.ndarray:
+        """Positions (M, 3) [m] of the array's elements about its middle."""
+        x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing * wavelength for n in (self.rows, self.columns))
+        return np.stack(
+            [*(v.ravel() for v in np.meshgrid(x, y, indexing="ij")), np.zeros(len(x) * len(y))], 1
+        )
+
+    def near_field(self, wavelength: float) -> float:
+        """Fraunhofer distance of the array, 2 D^2 / wavelength [m]; nearer, waves over it are not plane."""
+        size = float(np.linalg.norm(np.ptp(self.elements(wavelength), axis=0)))
+        return 2 * size**2 / wavelength
+
+    def attributes(self) -> dict[str, str | float | int]:
+        """The definition as attributes of a file."""
+        given = {f"spectrum_{key}": value for key, value in asdict(self).items()}
+        drop = ("beam_deg",) if self.kind == "bartlett" else ("rows", "columns", "spacing")
+        return {key: value for key, value in given.items() if key.removeprefix("spectrum_") not in drop}
+
+
+def spectra(
+    paths: Paths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
+
+    Only paths from above the horizon are heard. A receiver that hears nothing is black, divided by 1.
+
+    Args:
+        paths: of R receivers, world axes as the receivers' axes.
+        settings: the definition.
+        frequency_hz: (K,) subcarriers, the snapshots of the Bartlett spectrum [Hz].
+        wavelength: at the carrier [m].
+    """
+    above = paths.select(paths.direction[:, 2] >= 0)
+    images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)
+    if settings.kind == "bartlett":
+        elements = settings.elements(wavelength)
+        render = _Bartlett(settings)
+    for start in range(0, len(paths), BLOCK):
+        rows = slice(start, min(start + BLOCK, len(paths)))
+        some = _rows(above, rows)
+        if settings.kind == "bartlett":
+            channels = some.responses(frequency_hz, elements, wavelength)
+            images[rows] = render(channels.reshape(len(some), -1, len(elements), len(frequency_hz)))
+        else:
+            images[rows] = _beams(some, settings)
+    if settings.scale == "amplitude":
+        np.sqrt(images, out=images)
+    peak = images.max(axis=(1, 2)) if settings.normalisation == "max" else np.full(len(images), images.max())
+    peak = np.where(peak > 0, peak, 1.0).astype(np.float64)
+    images /= peak[:, None, None].astype(np.float32)
+    return images, peak
+
+
+def _rows(paths: Paths, rows: slice) -> Paths:
+    first, last = paths.offsets[rows.start], paths.offsets[rows.stop]
+    some = slice(first, last)
+    return Paths(
+        paths.offsets[rows.start : rows.stop + 1] - first,
+        paths.gain[some], paths.delay[some], paths.direction[some], paths.mechanisms[some], paths.order[some],
+    )  # fmt: skip
+
+
+class _Bartlett:
+    """The spectrum of a planar lattice from its lags: (2 rows - 1)(2 columns - 1) real numbers per image.
+
+    `a^H R a` depends on R only through sums over equal element differences, which are the autocorrelation
+    of the channel over the lattice: one small product instead of M^2 terms per pixel.
+    """
+
+    def __init__(self, settings: SpectrumSettings) -> None:
+        self.shape = (settings.rows, settings.columns)
+        self.padded = tuple(2 * n for n in self.shape)
+        lag = [np.fft.fftfreq(2 * n, 1 / (2 * n)) for n in self.shape]
+        directions = settings.grid.directions().numpy().reshape(-1, 3)
+        # +lag and -lag are conjugates: half of them is enough, counted twice
+        x, y = (v.ravel() for v in np.meshgrid(*lag, indexing="ij"))
+        self.half = np.flatnonzero((x > 0) | ((x == 0) & (y >= 0)))
+        x, y = x[self.half], y[self.half]
+        twice = np.where((x == 0) & (y == 0), 1.0, 2.0)
+        cycles = settings.spacing * (np.outer(x, directions[:, 0]) + np.outer(y, directions[:, 1]))
+        angle = 2 * np.pi * cycles
+        basis = np.concatenate([twice[:, None] * np.cos(angle), twice[:, None] * np.sin(angle)])
+        self.basis = torch.from_numpy(basis.astype(np.float32))
+        self.image = (settings.height, settings.width)
+
+    def __call__(self, channels: np.ndarray) -> np.ndarray:
+        """Power (R, H, W) of channels (R, ports, M, K)."""
+        lattice = np.moveaxis(channels, 2, -1).reshape(*channels.shape[:2], channels.shape[3], *self.shape)
+        power = np.abs(np.fft.fft2(lattice, s=self.padded)) ** 2
+        lags = np.fft.ifft2(power.mean(axis=2).sum(axis=1)).reshape(len(channels), -1)[:, self.half]
+        lags = lags / np.prod(self.shape) ** 2
+        # a^H h h^H a with a = exp(+j k u.e): element differences enter with the opposite sign
+        parts = np.concatenate([lags.real, lags.imag], axis=1)
+        image = torch.from_numpy(parts.astype(np.float32)) @ self.basis
+        return image.clamp_(min=0).numpy().reshape(-1, *self.image)
+
+
+def _beams(paths: Paths, settings: SpectrumSettings) -> np.ndarray:
+    """Power (R, H, W): von Mises-Fisher spots of half power at half the stated width."""
+    directions = settings.grid.directions(torch.float32).reshape(-1, 3)
+    sharpness = np.log(2) / (1 - np.cos(np.radians(settings.beam_deg) / 2))
+    images = np.zeros((len(paths), settings.height * settings.width), dtype=np.float32)
+    for r, (start, stop) in enumerate(zip(paths.offsets[:-1], paths.offsets[1:], strict=True)):
+        cosine = torch.from_numpy(paths.direction[start:stop]) @ directions.T
+        power = torch.from_numpy(paths.power[start:stop].astype(np.float32))
+        images[r] = power @ torch.exp(sharpness * (cosine - 1))
+    return images.reshape(-1, settings.height, settings.width)

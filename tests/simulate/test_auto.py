@@ -1,0 +1,146 @@
+import dataclasses
+
+import numpy as np
+import pytest
+
+from gsparc.simulate import auto
+from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
+from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
+from gsparc.simulate.paths import Paths
+from gsparc.simulate.spectrum import SpectrumSettings
+
+FULL = Effects(depth=2, polarisation=False)
+
+
+class Invented:
+    """An engine whose receivers all hear the same record of paths; power by mechanism is known."""
+
+    name, random, wavelength = "invented", False, 0.125
+    transmitter = np.zeros(3)
+
+    def __init__(self, record):
+        self.record = record  # list of (mechanisms, order, power)
+
+    def able(self, effects):
+        return effects
+
+    def materials(self):
+        return {}
+
+    def versions(self):
+        return {}
+
+    def trace(self, receivers, effects, seed=None, progress=None):
+        rng = np.random.default_rng(0)
+        count, each = len(receivers), len(self.record)
+        power = np.tile([p for _, _, p in self.record], count)
+        direction = np.abs(rng.normal(size=(count * each, 3)))
+        whole = Paths(
+            np.arange(count + 1) * each, np.sqrt(power)[:, None].astype(np.complex64),
+            rng.uniform(0, 1e-7, count * each),
+            (direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32),
+            np.tile([m for m, _, _ in self.record], count).astype(np.uint8),
+            np.tile([o for _, o, _ in self.record], count).astype(np.uint8),
+        )  # fmt: skip
+        return whole.under(effects)
+
+
+@pytest.fixture(autouse=True)
+def steady_clock(monkeypatch):
+    monkeypatch.setattr(
+        auto, "_timed", lambda engine, receivers, effects: 1.0 + len(effects.on) + effects.depth
+    )
+
+
+RECORD = [(0, 0, 1.0), (SPECULAR, 1, 0.5), (REFRACTION, 1, 0.6), (DIFFRACTION, 1, 0.01),
+          (SPECULAR | DIFFUSE, 2, 0.02), (SPECULAR, 2, 0.05)]  # fmt: skip
+
+
+def decided(deliverable, record=RECORD):
+    engine, receivers = Invented(record), np.random.default_rng(0).uniform(size=(20, 3))
+    elements, small = np.zeros((1, 3)), SpectrumSettings(height=18, width=36)
+    probe = Probe(engine.trace(receivers, FULL), FULL, np.linspace(2.4e9, 2.48e9, 26), 0.125, elements,
+                  small, engine.trace(receivers + 1, FULL))  # fmt: skip
+    settings = AutoSettings(deliverable=deliverable, probes=20, held_back=20, full=FULL)
+    choice = auto.decide(engine, receivers, settings, probe, lambda p: {"diffuse": "smooth"})
+    return auto.verify(choice, settings, probe)
+
+
+def test_words_become_a_deliverable():
+    assert Deliverable.parse("coverage +-1 dB") == Deliverable("coverage", 1.0)
+    assert Deliverable.parse("coverage ±2.5 dB").tolerance == 2.5
+    assert Deliverable.parse("csi -20 dB") == Deliverable("csi", -20.0)
+    assert Deliverable.parse("csi 30 dB").tolerance == -30.0
+    assert Deliverable.parse("spectrum skill") == Deliverable("spectrum", 0.1)
+    assert Deliverable.parse("spectrum skill 0.8").tolerance == pytest.approx(0.2)
+    for wrong in ("coverge 1 dB", "spectrum skill 1.5", "csi -20 dB please"):
+        with pytest.raises(ValueError, match=r"effects\.deliverable"):
+            Deliverable.parse(wrong)
+
+
+def test_coverage_drops_what_is_below_a_decibel_and_says_so():
+    choice = decided("coverage +-1 dB")
+    assert set(choice.effects.on) == {"line_of_sight", "specular", "refraction"}
+    assert choice.effects.depth == 1
+    rows = {row.effect: row for row in choice.table}
+    assert rows["refraction"].share == pytest.approx(0.6 / 2.18, rel=1e-4)
+    assert rows["refraction"].error == pytest.approx(-10 * np.log10(1 - 0.6 / 2.18), rel=1e-4)
+    assert rows["refraction"].kept and not rows["diffuse"].kept and not rows["depth > 1"].kept
+    assert rows["diffuse"].reason == "smooth"
+    assert choice.verdict is not None and choice.verdict.kept and choice.verdict.met == 1.0
+
+
+def test_a_stricter_deliverable_keeps_more():
+    loose, strict = decided("csi -10 dB").effects, decided("csi -60 dB").effects
+    assert set(loose.on) < set(strict.on)
+    assert strict == dataclasses.replace(FULL, edge_diffraction=False)  # there is none in the record
+
+
+def test_what_is_dropped_together_is_judged_together():
+    """Each of two effects alone is within the promise, both together are not."""
+    record = [(0, 0, 1.0), (REFRACTION, 1, 0.15), (DIFFRACTION, 1, 0.15)]
+    effects = decided("coverage +-1 dB", record).effects
+    assert effects.refraction != effects.diffraction
+
+
+def test_a_broken_promise_is_said():
+    choice = decided("coverage +-1 dB")
+    other = Invented([(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]).trace(np.zeros((30, 3)), FULL)
+    probe = Probe(other, FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)), SpectrumSettings())
+    verdict = auto.verify(choice, AutoSettings(), probe).verdict
+    assert verdict is not None and not verdict.kept and verdict.met == 0.0
+
+
+def test_spectra_are_judged_against_the_nearest_receiver():
+    choice = decided("spectrum skill 0.9")
+    assert choice.effects.line_of_sight and choice.effects.specular
+    probe = Probe(Invented(RECORD).trace(np.zeros((2, 3)), FULL), FULL, np.array([2.4e9]), 0.125,
+                  np.zeros((1, 3)), SpectrumSettings())  # fmt: skip
+    with pytest.raises(ValueError, match="nearest"):
+        probe.errors(FULL, Deliverable("spectrum", 0.1))
+
+
+def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
+    paths = Paths(np.array([0, 2]), np.array([[1.0], [0.1]], np.complex64), np.array([0.0, 1e-8]),
+                  np.array([[0, 0, 1], [0, 0, 1]], np.float32), np.array([0, SPECULAR], np.uint8),
+                  np.array([0, 1], np.uint8))  # fmt: skip
+    probe = Probe(paths, FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)), SpectrumSettings())
+    h = 1 + 0.1 * np.exp(-2j * np.pi * 24)
+    assert probe.nmse(FULL.without("specular"))[0] == pytest.approx(0.01 / abs(h) ** 2, rel=1e-4)
+    assert probe.shares(FULL.without("specular"))[0] == pytest.approx(0.01 / 1.01, rel=1e-4)
+    assert probe.nmse(FULL)[0] == 0.0
+
+
+def test_removals_and_combinations_are_complete():
+    found = removals(Effects(depth=3))
+    assert set(found) == {"line_of_sight", "specular", "refraction", "diffraction", "edge_diffraction",
+                          "diffuse", "depth > 2", "depth > 1", "polarisation"}  # fmt: skip
+    assert found["depth > 1"].depth == 1
+    sets = combinations(Effects(depth=3), ("diffuse", "depth > 2", "polarisation"))
+    assert len(sets) == 8 and sets[0] == Effects(depth=3)
+
+
+def test_a_choice_survives_its_file():
+    choice = decided("coverage +-1 dB")
+    assert Choice.from_dict(choice.as_dict()) == choice

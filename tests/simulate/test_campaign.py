@@ -1,0 +1,173 @@
+"""Whole campaigns on our own engine: no ray tracer needed."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from gsparc.check import main as check
+from gsparc.data.errors import DataError
+from gsparc.data.load import load
+from gsparc.data.own import load_own
+from gsparc.simulate import campaign as campaigns
+from gsparc.simulate.auto import AutoSettings
+from gsparc.simulate.campaign import simulate
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.mirrors import Mirrors
+from gsparc.simulate.pictures import floor_plan, worth
+from gsparc.simulate.report import choice_table, figures, verdict
+from gsparc.simulate.scenes.build import SceneSettings
+from gsparc.simulate.settings import Campaign, CsiSettings
+from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.spectrum import SpectrumSettings
+
+SCENE = SceneSettings(
+    name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
+    num_receivers=60, carrier_hz=2.4e9, bandwidth_hz=40e6, subcarriers=4,
+    room={"size_m": [6, 5, 3], "reflection": -0.6, "boxes_m": [[[2.6, 2.2, 0], [3.0, 2.6, 3]]]},
+)  # fmt: skip
+MIRROR = Effects(
+    refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
+)
+SMALL = SpectrumSettings(height=18, width=36, rows=4, columns=4)
+
+
+def plan(**changes):
+    return Campaign(**{"scene": SCENE, "effects": MIRROR, "spectrum": SMALL, "shard": 16, **changes})
+
+
+def arrays(path):
+    with h5py.File(path) as file:
+        return {name: file[name][()] for name in file}, dict(file.attrs)
+
+
+def test_the_file_is_the_schema_and_equals_the_exact_room(tmp_path):
+    outcome = simulate(plan(), tmp_path / "box.h5")
+    stored, about = arrays(tmp_path / "box.h5")
+    room = Room(np.zeros(3), np.array([6.0, 5, 3]), np.full(6, -0.6), np.array(SCENE.room["boxes_m"]))
+    exact = trace(room, SCENE.transmitter_m, stored["rx_position"], SCENE.frequency_hz, max_order=3).csi
+    # the amplitude of a path is the carrier's on all tones: 20 of 2,400 MHz
+    np.testing.assert_allclose(stored["csi"], exact, rtol=0.02, atol=1e-4 * np.abs(exact).max())
+    assert room.contains(stored["rx_position"]).all()
+    assert not (tmp_path / "box.h5.parts").exists()
+    assert about["simulator"] == b"gsparc-shoebox" and about["spectrum_rows"] == 4
+    assert json.loads(about["effects_json"])["depth"] == 3
+    assert load_own(tmp_path / "box.h5").site.kind == "spectrum"
+    assert check([str(tmp_path / "box.h5")]) == 0
+    assert outcome.convergence is None and outcome.made.facts["paths_per_receiver"] > 5
+    paths = stored["path_offsets"]
+    assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
+
+
+def test_paths_make_the_channel(tmp_path):
+    """What the attributes promise about gain and delay holds."""
+    simulate(plan(weakest_db=200.0), tmp_path / "box.h5")
+    stored, _ = arrays(tmp_path / "box.h5")
+    some = slice(*stored["path_offsets"][7:9])
+    tones = np.exp(-2j * np.pi * np.outer(stored["path_delay"][some], stored["frequency_hz"]))
+    np.testing.assert_allclose(stored["path_gain"][some] @ tones, stored["csi"][7, 0], rtol=1e-4)
+
+
+def test_it_is_read_as_spectra_and_as_channels(tmp_path):
+    simulate(plan(csi=CsiSettings(rows=2, columns=2)), tmp_path / "box.h5")
+    spectra, csi = (
+        load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": target})
+        for target in ("spectrum", "csi")
+    )
+    assert spectra.site.kind == "spectrum" and spectra.target.shape == (60, 18, 36)
+    assert spectra.site.static_end == csi.site.static_end == "tx"
+    assert spectra.site.array.shape == (16, 3) and csi.site.array.shape == (4, 3)
+    assert csi.site.kind == "csi" and csi.target.shape == (60, 4, 4)
+    assert spectra.site.sha256 != csi.site.sha256
+    assert len(spectra.release_split[1]) == 18
+    assert load({"name": "sionna", "file": str(tmp_path / "box.h5")}).site.kind == "spectrum"
+    with pytest.raises(DataError, match=r"dataset\.target=rssi"):
+        load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": "rssi"})
+
+
+def test_noise_is_as_loud_as_said(tmp_path):
+    simulate(plan(), tmp_path / "clean.h5")
+    simulate(plan(effects=Effects(**{**vars(MIRROR), "noise_snr_db": 20.0})), tmp_path / "noisy.h5")
+    clean, noisy = (arrays(tmp_path / f"{name}.h5")[0]["csi"] for name in ("clean", "noisy"))
+    ratio = 10 * np.log10(np.mean(np.abs(clean) ** 2) / np.mean(np.abs(noisy - clean) ** 2))
+    assert ratio == pytest.approx(20, abs=1.5)
+    read = load({"name": "sionna", "file": str(tmp_path / "noisy.h5"), "target": "csi"})
+    measured = np.mean(np.abs(noisy - clean) ** 2) / read.site.target_scale**2
+    assert read.noise_variance[0] == pytest.approx(measured, rel=0.3)
+
+
+def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
+    """Finished shards are not touched, every receiver is there once, the file is the uninterrupted one's."""
+    simulate(plan(), tmp_path / "whole.h5")
+    real, calls = Mirrors.trace, []
+
+    def dies(self, receivers, *rest, **named):
+        calls.append(len(receivers))
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return real(self, receivers, *rest, **named)
+
+    monkeypatch.setattr(Mirrors, "trace", dies)
+    with pytest.raises(KeyboardInterrupt):
+        simulate(plan(), tmp_path / "cut.h5")
+    assert not (tmp_path / "cut.h5").exists()
+    shards = sorted((tmp_path / "cut.h5.parts").glob("shard_*.npz"))
+    before = [(s.name, s.stat().st_mtime_ns, s.read_bytes()) for s in shards]
+    assert len(shards) == 2
+    seen = []
+
+    def watches(self, receivers, *rest, **named):
+        seen.append([(s.name, s.stat().st_mtime_ns, s.read_bytes()) for s in shards])
+        return real(self, receivers, *rest, **named)
+
+    monkeypatch.setattr(Mirrors, "trace", watches)
+    simulate(plan(), tmp_path / "cut.h5")
+    assert len(seen) == 2 and all(state == before for state in seen)
+    (one, about), (two, other) = (arrays(tmp_path / f"{n}.h5") for n in ("whole", "cut"))
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+    assert about == other and len(np.unique(two["rx_position"], axis=0)) == 60
+
+
+def test_parts_of_another_simulation_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaigns, "_trace_all", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        simulate(plan(), tmp_path / "box.h5")
+    with pytest.raises(ValueError, match="different simulation"):
+        simulate(plan(shard=20), tmp_path / "box.h5")
+
+
+def test_an_existing_file_is_not_overwritten(tmp_path):
+    (tmp_path / "box.h5").write_text("mine")
+    with pytest.raises(ValueError, match="exists"):
+        simulate(plan(), tmp_path / "box.h5")
+    assert (tmp_path / "box.h5").read_text() == "mine"
+
+
+def test_auto_decides_once_verifies_and_is_drawn(tmp_path):
+    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
+    choice = outcome.choice
+    assert choice is not None and choice.verdict is not None and choice.verdict.kept
+    assert set(outcome.effects.on) == {"line_of_sight", "specular"} and 1 <= outcome.effects.depth < 4
+    stored = json.loads(arrays(tmp_path / "box.h5")[1]["auto"])
+    assert [row["effect"] for row in stored["table"]] == [row.effect for row in choice.table]
+    facts = figures(outcome)
+    assert facts["auto/verdict/met"] >= 0.95 and facts["auto/specular/kept"] is True
+    assert "promise kept" in verdict(choice) and choice_table(choice).row_count == len(choice.table)
+    for draw, what in ((floor_plan, outcome), (worth, choice)):
+        draw(what, tmp_path / "picture.png")
+        assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("changes, words", [
+    ({"builder": "x"}, "exactly one of"),
+    ({"num_receivers": 3}, "at least 20"),
+    ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
+    ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
+])  # fmt: skip
+def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
+    with pytest.raises(ValueError, match=words):
+        simulate(plan(scene=SceneSettings(**{**vars(SCENE), **changes})), tmp_path / "box.h5")
+    assert not list(tmp_path.iterdir())

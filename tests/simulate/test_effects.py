@@ -1,0 +1,75 @@
+import numpy as np
+import pytest
+
+from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, Effects, from_config
+from gsparc.simulate.paths import Paths, join
+
+EVERYTHING = Effects(depth=3)
+
+
+def paths_of(mechanisms, order, owner=None, ports=1):
+    """Paths of unit gain with given records; all of receiver 0 unless said."""
+    count = len(mechanisms)
+    owner = np.zeros(count, int) if owner is None else np.array(owner)
+    direction = np.tile(np.array([[1.0, 0, 0]], np.float32), (count, 1))
+    return Paths(
+        np.concatenate([[0], np.cumsum(np.bincount(owner))]), np.ones((count, ports), np.complex64),
+        np.arange(count) * 1e-9, direction, np.array(mechanisms, np.uint8), np.array(order, np.uint8),
+    )  # fmt: skip
+
+
+def test_a_path_exists_only_when_all_its_mechanisms_and_its_depth_do():
+    found = paths_of([0, SPECULAR, SPECULAR | DIFFUSE, REFRACTION, EDGE], [0, 1, 2, 1, 1])
+
+    def left(effects):
+        return effects.allows(found.mechanisms, found.order).tolist()
+
+    assert left(EVERYTHING) == [True] * 5
+    assert left(EVERYTHING.without("line_of_sight")) == [False, True, True, True, True]
+    assert left(EVERYTHING.without("specular")) == [True, False, False, True, True]
+    assert left(EVERYTHING.without("diffuse")) == [True, True, False, True, True]
+    assert left(EVERYTHING.without("diffraction")) == [True, True, True, True, False]
+    assert left(Effects(depth=1)) == [True, True, False, True, True]
+    assert left(Effects(depth=0)) == [True, False, False, False, False]
+
+
+@pytest.mark.parametrize("config, words", [
+    ({"specular": False}, "diffuse needs"),
+    ({"diffraction": False}, "edge_diffraction needs"),
+    ({"depth": 9}, "0 to 8"),
+    ({"speculr": True}, "speculr: no such effect"),
+    (dict.fromkeys(("line_of_sight", "specular", "refraction", "diffraction", "edge_diffraction", "diffuse"),
+                   False), "every mechanism is off"),
+])  # fmt: skip
+def test_contradictions_are_refused(config, words):
+    with pytest.raises(ValueError, match=words):
+        from_config(config)
+
+
+def test_selecting_keeps_receivers_that_lose_everything():
+    found = paths_of([0, SPECULAR, SPECULAR], [0, 1, 1], owner=[0, 0, 1])
+    less = found.under(Effects(depth=3).without("specular"))
+    assert less.offsets.tolist() == [0, 1, 1] and less.received_power().tolist() == [1.0, 0.0]
+    both = join([found, less])
+    assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]
+
+
+def test_one_polarisation_is_the_first_port():
+    found = paths_of([0], [0], ports=2)
+    assert found.received_power()[0] == 2.0
+    assert found.under(Effects(polarisation=False)).received_power()[0] == 1.0
+
+
+def test_delay_spread_of_two_equal_paths_is_half_their_distance():
+    found = paths_of([0, SPECULAR], [0, 1])
+    assert found.delay_spread()[0] == pytest.approx(0.5e-9)
+    assert found.select(np.array([True, False])).delay_spread()[0] == 0.0
+
+
+def test_response_of_one_path_is_its_phase_over_tones_and_elements():
+    found = paths_of([0, SPECULAR], [0, 1]).select(np.array([False, True]))  # 1 ns, from +x
+    tones, wavelength = np.array([2.4e9, 2.5e9]), 0.125
+    elements = np.array([[0.0, 0, 0], [wavelength / 4, 0, 0]])
+    channel = found.responses(tones, elements, wavelength)[0]
+    expected = np.exp(-2j * np.pi * tones * 1e-9) * np.array([[1], [1j]])
+    np.testing.assert_allclose(channel, expected, atol=1e-6)

@@ -1,0 +1,85 @@
+import numpy as np
+import pytest
+
+from gsparc.ops import SphereGrid
+from gsparc.simulate.paths import Paths
+from gsparc.simulate.spectrum import SpectrumSettings, spectra
+
+WAVELENGTH = 0.125
+TONES = 2.4e9 + np.linspace(-40e6, 40e6, 7)
+
+
+def arriving(directions, powers, delays=None):
+    """One receiver hearing plane waves."""
+    count = len(directions)
+    unit = np.array(directions, float)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    delays = np.arange(count) * 1e-8 if delays is None else np.array(delays)
+    return Paths(np.array([0, count]), np.sqrt(np.array(powers))[:, None].astype(np.complex64), delays,
+                 unit.astype(np.float32), np.zeros(count, np.uint8), np.zeros(count, np.uint8))  # fmt: skip
+
+
+def random_waves(count=9, seed=0):
+    rng = np.random.default_rng(seed)
+    directions = rng.normal(size=(count, 3))
+    directions[:, 2] = np.abs(directions[:, 2])
+    return arriving(directions, rng.uniform(0.1, 1, count), rng.uniform(0, 1e-7, count))
+
+
+def test_bartlett_by_lags_equals_the_definition():
+    """|a^H h|^2 averaged over the tones, element by element."""
+    settings, waves = SpectrumSettings(rows=4, columns=3, scale="power"), random_waves()
+    images, peak = spectra(waves, settings, TONES, WAVELENGTH)
+    elements = settings.elements(WAVELENGTH)
+    h = waves.responses(TONES, elements, WAVELENGTH)[0]
+    directions = settings.grid.directions().numpy().reshape(-1, 3)
+    steering = np.exp(2j * np.pi / WAVELENGTH * directions @ elements.T)
+    power = (np.abs(steering.conj() @ h) ** 2).mean(1) / len(elements) ** 2
+    np.testing.assert_allclose(images[0].ravel() * peak[0], power, atol=1e-5 * power.max())
+    assert images.max() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("kind", ["bartlett", "beam"])
+def test_a_wave_is_brightest_in_its_own_pixel(kind):
+    grid = SphereGrid.hemisphere()
+    for row, column in ((40, 37), (60, 200), (30, 359)):
+        wave = arriving([grid.directions()[row, column].numpy()], [1.0])
+        image = spectra(wave, SpectrumSettings(kind=kind), TONES, WAVELENGTH)[0][0]
+        found = np.unravel_index(image.argmax(), image.shape)
+        assert found == (row, column)
+
+
+def test_waves_from_below_are_not_heard():
+    up = arriving([[1, 1, 1]], [1.0])
+    both = arriving([[1, 1, 1], [0, 1, -1]], [1.0, 5.0])
+    one, other = (spectra(w, SpectrumSettings(), TONES, WAVELENGTH)[0] for w in (up, both))
+    np.testing.assert_array_equal(one, other)
+    assert both.below_horizon() == pytest.approx(5 / 6)
+
+
+def test_amplitude_is_the_root_of_power_and_silence_is_black():
+    waves = random_waves(seed=1)
+    power, peak = spectra(waves, SpectrumSettings(scale="power"), TONES, WAVELENGTH)
+    amplitude, root = spectra(waves, SpectrumSettings(), TONES, WAVELENGTH)
+    np.testing.assert_allclose(amplitude**2, power, atol=1e-6)
+    assert root[0] == pytest.approx(np.sqrt(peak[0]))
+    silent = waves.select(np.zeros(9, bool))
+    image, divided = spectra(silent, SpectrumSettings(), TONES, WAVELENGTH)
+    assert not image.any() and divided[0] == 1.0
+
+
+def test_both_polarisations_add_their_powers():
+    waves = random_waves(seed=2)
+    doubled = Paths(waves.offsets, np.repeat(waves.gain, 2, axis=1), waves.delay, waves.direction,
+                    waves.mechanisms, waves.order)  # fmt: skip
+    settings = SpectrumSettings(scale="power")
+    (one, low), (two, high) = (spectra(w, settings, TONES, WAVELENGTH) for w in (waves, doubled))
+    np.testing.assert_allclose(one, two, atol=1e-6)
+    assert high[0] == pytest.approx(2 * low[0], rel=1e-5)
+
+
+def test_settings_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="kind"):
+        SpectrumSettings(kind="music")
+    with pytest.raises(ValueError, match="positive"):
+        SpectrumSettings(spacing=0)
