@@ -48,6 +48,10 @@ class PhasedScene:
 
     def waves(self, rows: Rows) -> Tensor:
         """w_k at the rows, (n, K) complex64."""
+        return self.scene.waves(rows) * torch.polar(torch.ones(()), self.phase)
+
+    def unshaded(self, rows: Rows) -> Tensor:
+        """The same as if the clutter were not there."""
         return steering(rows, self.scene.sources) * torch.polar(torch.ones(()), self.phase)
 
 
@@ -152,13 +156,14 @@ class PhasedPosterior:
         return share * self.pulled.sum(1) * torch.polar(torch.ones(()), self.phased.phase)[:, None]
 
     def gains(self, places: Tensor) -> Tensor:
-        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m]."""
+        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], as far as seen."""
         pulled, per_source = self.pulled, []
         for k, source in enumerate(self.scene.sources):
             here, there = View.of(places, source), View.of(self.rows.position, source)
             correlation = self.scene.visibility.correlation(here, there)
             per_source.append(torch.complex(correlation @ pulled[k].real, correlation @ pulled[k].imag))
-        return torch.stack(per_source, 1) * torch.polar(torch.ones(()), self.phased.phase)[:, None]
+        turn = torch.polar(self.scene.shade(places), self.phased.phase.expand(1, -1))
+        return torch.stack(per_source, 1) * turn[:, :, None]
 
     def left_out(self) -> Tensor:
         """Each row predicted from the rows of all other receivers (n, R) complex64.

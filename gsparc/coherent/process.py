@@ -8,12 +8,14 @@ and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), chapter
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
 from torch import Tensor
 
+from gsparc.coherent.furniture.clutter import Clutter, shade
+from gsparc.coherent.furniture.paths import Unfolding
 from gsparc.coherent.phase import ranges, wave
 from gsparc.coherent.planes import Word, images
 from gsparc.coherent.rows import Rows
@@ -32,7 +34,8 @@ class Scene:
         words: K of them, the transmitter first.
         log_amplitude: (K,) float32, log s_k.
         log_noise: log of the noise variance, in units of the rows' power.
-        visibility: one law for all.
+        visibility: one law for all, of what the clutter leaves open.
+        clutter: what blocks paths and where mirrors end.
     """
 
     transmitter: Tensor
@@ -41,11 +44,27 @@ class Scene:
     log_amplitude: Tensor
     log_noise: float
     visibility: Visibility = KernelVisibility()  # noqa: RUF009 frozen
+    clutter: Clutter = field(default_factory=Clutter.none)
 
     @cached_property
     def sources(self) -> Tensor:
         """Positions (K, 3) float64 [m]."""
         return images(self.transmitter, self.planes, self.words)
+
+    @cached_property
+    def unfolding(self) -> Unfolding:
+        """The legs of every word's path."""
+        return Unfolding.of(self.transmitter, self.planes, self.words)
+
+    def shade(self, places: Tensor) -> Tensor:
+        """How much of each source the clutter lets through to places (n, 3) [m]: (n, K), or (1, 1)."""
+        if not len(self.clutter):
+            return torch.ones(1, 1)
+        return shade(self.unfolding.paths(places), self.clutter, self.planes).T
+
+    def waves(self, rows: Rows) -> Tensor:
+        """Waves (n, K) complex64 of the sources at every row, as far as they are seen."""
+        return steering(rows, self.sources) * self.shade(rows.position)
 
     def with_words(self, words: list[Word], amplitude: Tensor) -> Scene:
         """More sources, with amplitudes (k,)."""
@@ -58,7 +77,13 @@ class Scene:
         used = sorted({letter for word in words for letter in word})
         new = {old: i for i, old in enumerate(used)}
         renamed = tuple(tuple(new[letter] for letter in word) for word in words)
-        return replace(self, planes=self.planes[used], words=renamed, log_amplitude=self.log_amplitude[kept])
+        return replace(
+            self,
+            planes=self.planes[used],
+            words=renamed,
+            log_amplitude=self.log_amplitude[kept],
+            clutter=self.clutter.renamed(new),
+        )
 
 
 def steering(rows: Rows, sources: Tensor) -> Tensor:
@@ -128,7 +153,7 @@ class Posterior:
     @cached_property
     def waves(self) -> Tensor:
         """(n, K) complex64."""
-        return steering(self.rows, self.scene.sources)
+        return self.scene.waves(self.rows)
 
     @cached_property
     def covariance(self) -> Tensor:
@@ -164,7 +189,7 @@ class Posterior:
         return Factor.of(self.covariance - torch.complex(real, imag), self.rows.target).nll
 
     def gains(self, places: Tensor) -> Tensor:
-        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m]."""
+        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], as far as seen."""
         weights = self.waves.conj() * self.scene.log_amplitude.mul(2).exp()
         per_source = []
         for k, source in enumerate(self.scene.sources):
@@ -172,11 +197,11 @@ class Posterior:
             correlation = self.scene.visibility.correlation(here, there)
             pulled = weights[:, k, None] * self.factor.alpha
             per_source.append(torch.complex(correlation @ pulled.real, correlation @ pulled.imag))
-        return torch.stack(per_source, 1)
+        return torch.stack(per_source, 1) * self.scene.shade(places)[:, :, None]
 
     def variance(self, queries: Rows) -> Tensor:
         """Expected squared error (m,) float32 of each query row, noise included."""
-        waves = steering(queries, self.scene.sources)
+        waves = self.scene.waves(queries)
         power = self.scene.log_amplitude.mul(2).exp()
         cross = torch.zeros(len(queries), len(self.rows), dtype=torch.complex64)
         for k, source in enumerate(self.scene.sources):

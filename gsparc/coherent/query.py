@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.coherent.furniture.clutter import Screens
+from gsparc.coherent.furniture.paths import Unfolding
 from gsparc.coherent.inphase import PhasedPosterior, shares, stacked
 from gsparc.coherent.phase import ranges, wave_over_band
 from gsparc.coherent.process import Scene
@@ -26,18 +28,35 @@ class Pack:
         law: (K, 3) float32: constant, 1 / angle^2, 1 / length^2 of each source's visibility.
         places: (n, 3) float64 [m].
         directions: (K, n, 3) float32, unit vectors from source to place.
+        unfolding, screens: paths of the K sources and what they must pass; None when nothing is in the way.
     """
 
     sources: Tensor
     law: Tensor
     places: Tensor
     directions: Tensor
+    unfolding: Unfolding | None
+    screens: Screens | None
 
     @staticmethod
     def of(scenes: list[Scene], places: Tensor) -> Pack:
         """All sources of the scenes, in order."""
         sources = torch.cat([scene.sources for scene in scenes])
-        return Pack(sources, torch.cat([_numbers(s) for s in scenes]), places, _directions(sources, places))
+        laws, directions = torch.cat([_numbers(s) for s in scenes]), _directions(sources, places)
+        if not any(len(scene.clutter) for scene in scenes):
+            return Pack(sources, laws, places, directions, None, None)
+        first = torch.tensor([0] + [len(scene.planes) for scene in scenes]).cumsum(0).tolist()
+        unfolding = Unfolding.beside(
+            [scene.unfolding.numbered_from(start) for scene, start in zip(scenes, first, strict=False)]
+        )
+        screens = Screens.beside([Screens.of(s.clutter, s.planes, len(s.words)) for s in scenes])
+        return Pack(sources, laws, places, directions, unfolding, screens)
+
+    def shade(self, queries: Tensor) -> Tensor:
+        """How much of each source is seen from queries (m, 3) [m]: (K, m), or (1, 1) for all."""
+        if self.unfolding is None or self.screens is None:
+            return torch.ones(1, 1)
+        return self.screens.shade(self.unfolding.paths(queries))
 
     def correlation(self, queries: Tensor) -> Tensor:
         """Visibility correlations (K, m, n) between queries (m, 3) float64 [m] and the places."""
@@ -84,19 +103,24 @@ class Query:
         for part in queries.split(CHUNK):
             correlation = self.pack.correlation(part)
             gains = torch.complex(correlation @ self.real, correlation @ self.imag) * self.turn  # (K, m, R)
+            seen = self.pack.shade(part)
+            gains = gains * seen[:, :, None]
             waves = wave_over_band(ranges(part, self.pack.sources), tones)  # (m, K, F)
             split = zip(gains.split(self.counts), waves.split(self.counts, 1), strict=True)
             means.append(torch.stack([torch.einsum("kmr,mkf->mrf", g, w) for g, w in split]))
-            variance, prior = self._variance(part, middle, correlation[: self.counts[0]])
+            first = slice(self.counts[0])
+            variance, prior = self._variance(part, middle, correlation[first], seen[first].T)
             variances.append(variance)
             priors.append(prior)
         return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
 
-    def _variance(self, part: Tensor, tone: Tensor, correlation: Tensor) -> tuple[Tensor, Tensor]:
+    def _variance(
+        self, part: Tensor, tone: Tensor, correlation: Tensor, shade: Tensor
+    ) -> tuple[Tensor, Tensor]:
         phased, count = self.first.phased, len(part)
         power = phased.scene.log_amplitude.mul(2).exp()
         rows = Rows(part, tone.expand(count), torch.empty(count, 0), torch.arange(count))
-        waves = phased.waves(rows)
+        waves = phased.unshaded(rows) * shade
         seen = correlation[:, :, self.place_of[self.few]]
         # What a query and a row share: along the gain's own phase, and across it.
         here, there = torch.stack(stacked(waves * power), -1), torch.stack(stacked(self.first.waves), -1)

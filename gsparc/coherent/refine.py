@@ -68,7 +68,7 @@ def _likelihood(
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its gradient: `d nll = trace(G dK)`, `G = R K^-1 - alpha alpha^H`."""
     transmitter, planes = (v.detach().requires_grad_() for v in values[:2])
-    waves = steering(rows, images(transmitter, planes, scene.words))
+    waves = steering(rows, images(transmitter, planes, scene.words)) * scene.shade(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
     n = len(rows)

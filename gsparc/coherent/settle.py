@@ -70,6 +70,7 @@ def _likelihood(
     words, n = phased.scene.words, len(rows)
     transmitter, planes, phase = (values[i].detach().requires_grad_() for i in (0, 1, 4))
     waves = steering(rows, images(transmitter, planes, words)) * torch.polar(torch.ones(()), phase)
+    waves = waves * phased.scene.shade(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
     covariance = torch.zeros(2, n, 2, n)

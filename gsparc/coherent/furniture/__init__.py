@@ -1,0 +1,1 @@
+"""What blocks paths and where mirrors end: learned once, shared by all sources."""

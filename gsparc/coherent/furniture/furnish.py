@@ -1,0 +1,299 @@
+"""Greedy furnishing: mirrors that end, boxes that hide, words over them; kept while the likelihood pays."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.coherent.backprojection import pick_apart
+from gsparc.coherent.furniture.boxes import find_box, inside_out
+from gsparc.coherent.furniture.clutter import SOFT, shade
+from gsparc.coherent.furniture.descent import Accord, descend
+from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, walls
+from gsparc.coherent.furniture.residual import Explained, Residual
+from gsparc.coherent.inphase import PhasedScene
+from gsparc.coherent.phase import LIGHT
+from gsparc.coherent.planes import Word, all_words, images
+from gsparc.coherent.process import JITTER, Scene, steering
+from gsparc.coherent.rows import Rows
+
+log = logging.getLogger(__name__)
+
+SURE = 1.0  # concentration from which on phases of new sources are foretold
+SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: how far, and how finely, a mirror is moved to fit its phases
+
+
+@dataclass(frozen=True)
+class Furnishing:
+    """What a piece of furniture must gain, and how often to look.
+
+    Attributes:
+        epochs: rounds of everything, softer edges first.
+        box, patch, mirror, word: nats that each must gain to stay.
+        look: least nats promised before one is tried.
+        boxes, mirrors, words: most new ones in an epoch.
+        beyond: how far outside the receivers' box furniture may reach [m].
+        soft: width of edges in each epoch [m], the last for all that follow.
+    """
+
+    epochs: int = 3
+    box: float = 8.0
+    patch: float = 6.0
+    mirror: float = 10.0
+    word: float = 3.0
+    look: float = 12.0
+    boxes: int = 4
+    mirrors: int = 5
+    words: int = 6
+    beyond: float = 0.15
+    soft: tuple[float, ...] = (0.08, 0.05, 0.03)
+
+
+def furnish(
+    rows: Rows,
+    phased: PhasedScene,
+    generator: torch.Generator,
+    settings: Furnishing = Furnishing(),
+    deadline: float = math.inf,
+    noise_floor: float = JITTER,
+) -> PhasedScene:
+    """The phased scene with furniture; rows of one output, as many as a search looks at."""
+    return _Furnisher(rows, phased, generator, settings, noise_floor).run(deadline)
+
+
+class _Furnisher:
+    def __init__(
+        self,
+        rows: Rows,
+        phased: PhasedScene,
+        generator: torch.Generator,
+        settings: Furnishing,
+        noise_floor: float,
+    ) -> None:
+        self.rows, self.generator, self.settings = rows, generator, settings
+        self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
+        ends = torch.stack([rows.position.amin(0) - settings.beyond, rows.position.amax(0) + settings.beyond])
+        self.room = ends.float()
+        self._weigh(phased)
+
+    # ---- where we stand ----
+    def _weigh(self, phased: PhasedScene) -> None:
+        """Factor the residual anew about a scene."""
+        self.residual = Residual(self.rows, phased, self.noise_floor)
+        self.accord = Accord.of(phased)
+        self._stand(self.residual.phased)
+
+    def _stand(self, phased: PhasedScene) -> None:
+        """Go on from a scene, whose varying part is still that of the residual."""
+        self.phased, self.paths = phased, phased.scene.unfolding.paths(self.rows.position)
+        self.waves = phased.unshaded(self.rows)
+        self.seen = shade(self.paths, phased.scene.clutter, phased.scene.planes)
+        self.residual.waves = self.waves
+        self.nll = self.residual.nll(self.seen, phased.scene.log_amplitude).item()
+
+    @property
+    def scene(self) -> Scene:
+        return self.phased.scene
+
+    def _explained(self) -> Explained:
+        return self.residual.explained(self.seen, self.scene.log_amplitude)
+
+    def _try(self, scene: Scene, least: float, phase: Tensor | None = None, steps: int = 6) -> bool:
+        """Stay with a scene, a little descended, when it gains at least `least` nats."""
+        before, nll = self.phased, self.nll
+        self._stand(replace(before, scene=scene, phase=before.phase if phase is None else phase))
+        self._descend(steps)
+        if self.nll > nll - least:
+            self._stand(before)
+            return False
+        return True
+
+    def _descend(self, steps: int, soft: float = SOFT) -> None:
+        found = descend(self.residual, self.phased, self.paths, steps, soft, accord=self.accord)
+        clutter = found.scene.clutter
+        tidy = replace(clutter, boxes=inside_out(clutter.boxes, self.room))
+        self._stand(replace(found, scene=replace(found.scene, clutter=tidy)))
+
+    # ---- the loop ----
+    def run(self, deadline: float) -> PhasedScene:
+        s, start = self.settings, self.nll
+        self._descend(8)
+        for epoch in range(s.epochs):
+            before = self.phased
+            for move in (self._mirrors, self._patches, self._boxes, self._words):
+                if time.monotonic() < deadline:
+                    move()
+            self._descend(16, s.soft[min(epoch, len(s.soft) - 1)])
+            self._descend(10)
+            self._drop()
+            self._weigh(self.phased)
+            if time.monotonic() < deadline:
+                self._look_again()
+                self._descend(10)
+                self._drop()
+                self._weigh(self.phased)
+            log.debug(
+                "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, constant %.2f",
+                epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
+                self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility.constant,
+            )  # fmt: skip
+            if time.monotonic() > deadline or self.scene.clutter is before.scene.clutter:
+                break
+        return self.phased
+
+    def _mirrors(self) -> None:
+        s, scene = self.settings, self.scene
+        found = find_mirrors(
+            self.rows, self._explained(), scene.transmitter, scene.planes,
+            walls(scene.planes, scene.words), self.room, 2 * s.mirrors,
+        )  # fmt: skip
+        added = 0
+        for mirror in found:
+            if added < s.mirrors and mirror.score > s.look:
+                added += self._hang(self._placed(mirror))
+
+    def _placed(self, mirror: SmallMirror) -> SmallMirror:
+        """Moved along its normal to where its words have the phases that mirrors give here."""
+        if self.accord.concentration < SURE:
+            return mirror
+        moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
+        explained, total = self._explained(), []
+        for move in moves:
+            plane = mirror.plane + torch.tensor([0, 0, 0, 1], dtype=torch.float64) * move
+            trial, words = self._with_mirror(replace(mirror, plane=plane))
+            scores, _, _ = self._promises(trial, words, explained)
+            total.append(scores.sum())
+        best = moves[int(torch.stack(total).argmax())]
+        return replace(mirror, plane=mirror.plane + torch.tensor([0, 0, 0, 1], dtype=torch.float64) * best)
+
+    def _with_mirror(self, mirror: SmallMirror) -> tuple[Scene, list[Word]]:
+        scene = self.scene
+        number, known = len(scene.planes), walls(scene.planes, scene.words)
+        words: list[Word] = [(number,), *((w, number) for w in known), *((number, w) for w in known)]
+        trial = replace(
+            scene,
+            planes=torch.cat([scene.planes, mirror.plane[None]]),
+            clutter=scene.clutter.with_patch(mirror.patch, number),
+        )
+        return trial, words
+
+    def _hang(self, mirror: SmallMirror) -> bool:
+        """Try a small mirror with the words over it that pay."""
+        trial, words = self._with_mirror(mirror)
+        return self._add(trial, words, 1.5, self.settings.mirror, len(words))
+
+    def _promises(
+        self, scene: Scene, words: list[Word], explained: Explained
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Of words over a scene's planes: nats (W,), complex gains (W,), positions (W, 3)."""
+        alone = replace(scene, words=tuple(words))
+        paths = alone.unfolding.paths(self.rows.position)
+        seen = shade(paths, scene.clutter, scene.planes) * paths.valid
+        waves = steering(self.rows, alone.sources) * seen.T
+        if self.accord.concentration < SURE:
+            return *explained.score_waves(waves), alone.sources
+        turn = torch.polar(torch.ones(()), self.accord.expected(self.phased.phase[0], alone.words))
+        scores, gains = explained.score_positive(waves * turn)
+        return scores, gains * turn, alone.sources
+
+    def _add(self, scene: Scene, words: list[Word], promised: float, least: float, most: int) -> bool:
+        """Try the words that promise enough, on a scene that may have more planes and patches."""
+        # the words there are are hidden by new patches, too
+        hidden = shade(self.paths, scene.clutter, scene.planes)
+        explained = self.residual.explained(hidden, self.scene.log_amplitude)
+        scores, gains, sources = self._promises(scene, words, explained)
+        clear = torch.cdist(sources, self.scene.sources).amin(1) > 0.5 * self.wavelength
+        chosen = pick_apart(sources, scores * clear, 0.5 * self.wavelength, most, promised)
+        if not chosen:
+            return False
+        strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
+        phase = torch.cat([self.phased.phase, gains[chosen].angle()])
+        return self._try(scene.with_words([words[i] for i in chosen], strong), least, phase)
+
+    def _patches(self) -> None:
+        """Ends of mirrors that have none."""
+        scene, explained = self.scene, self._explained()
+        shaded, found = self.waves * self.seen.T, []
+        for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
+            patch, score = find_patch(
+                explained, self.paths, scene.words, number, scene.planes[number], shaded, self.room,
+                self.generator,
+            )  # fmt: skip
+            found.append((score, number, patch))
+        for score, number, patch in sorted(found, key=lambda f: -f[0]):
+            if score < self.settings.look:
+                break
+            mine = [k for k, word in enumerate(self.scene.words) if number in word]
+            louder = self.scene.log_amplitude.clone()
+            louder[mine] = louder[mine].clamp_min(float(louder.median()))
+            clutter = self.scene.clutter.with_patch(patch, number)
+            self._try(replace(self.scene, log_amplitude=louder, clutter=clutter), self.settings.patch)
+
+    def _boxes(self) -> None:
+        for _ in range(self.settings.boxes):
+            box, score = find_box(
+                self._explained(), self.paths, self.waves * self.seen.T, self.room, self.generator
+            )
+            if score < self.settings.look:
+                break
+            clutter = self.scene.clutter.with_box(box)
+            if not self._try(replace(self.scene, clutter=clutter), self.settings.box):
+                break
+
+    def _words(self) -> None:
+        """More words over the planes there are."""
+        scene, known = self.scene, set(self.scene.words)
+        letters = list(range(len(scene.planes)))
+        longer = [(*w, i) for w in scene.words if 0 < len(w) < 3 for i in letters if w[-1] != i]
+        words = [w for w in dict.fromkeys(all_words(letters, 2) + longer) if w not in known]
+        if not words:
+            return
+        places = images(scene.transmitter, scene.planes, words)
+        scores, _ = self._explained().score_waves(steering(self.rows, places))
+        best = scores.topk(min(60, len(words))).indices.tolist()
+        self._add(scene, [words[i] for i in best], 6.0, self.settings.word, self.settings.words)
+
+    def _look_again(self) -> None:
+        """Every box is looked for anew with the others in place."""
+        for number in range(len(self.scene.clutter.boxes)):
+            before, mine = self.phased, self.scene.clutter.boxes[number]
+            nll = self.nll
+            self._stand(self._with(self.scene.clutter.without_box(number)))
+            near = mine + 0.1 * torch.randn(4, 6, generator=self.generator)
+            box, _ = find_box(
+                self._explained(), self.paths, self.waves * self.seen.T, self.room, self.generator,
+                draws=400, parents=8, seeds=torch.cat([mine[None], near]),
+            )  # fmt: skip
+            self._stand(self._with(self.scene.clutter.with_box(box, number)))
+            if self.nll > nll - 0.5:
+                self._stand(before)
+
+    def _with(self, clutter) -> PhasedScene:
+        return replace(self.phased, scene=replace(self.scene, clutter=clutter))
+
+    def _drop(self) -> None:
+        """Take out what no longer pays."""
+        for kind, least in (("box", self.settings.box), ("patch", self.settings.patch)):
+            number = 0
+            while True:
+                clutter = self.scene.clutter
+                if number >= (len(clutter.boxes) if kind == "box" else len(clutter.patches)):
+                    break
+                rest = clutter.without_box(number) if kind == "box" else clutter.without_patch(number)
+                before, nll = self.phased, self.nll
+                self._stand(self._with(rest))
+                if self.nll > nll + least:
+                    self._stand(before)
+                    number += 1
+        while len(self.scene.words) > 1:
+            gains = self.residual.gains_of_each(self.seen, self.scene.log_amplitude)[1:]
+            worst = int(gains.argmin()) + 1
+            if gains[worst - 1] > 0:
+                break
+            kept = [k for k in range(len(self.scene.words)) if k != worst]
+            self._stand(replace(self.phased, scene=self.scene.only(kept), phase=self.phased.phase[kept]))
