@@ -78,17 +78,24 @@ class Gsparc(LearnedField):
         if self._chosen is None:
             report = super().fit(data, fold, run_dir)
         else:
-            if self.training.resume is not None:
-                raise ValueError(
-                    f"ckpt_path: effects.{self._chosen} trains in one piece, there is nothing to go on from "
-                    "(the splatted field, effects.*=false, resumes)"
-                )
+            self._go_on(self._models[self._chosen])
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             budget_s = self.training.settings.budget_s
             if budget_s is not None and hasattr(self._models[self._chosen], "budget_s"):
                 self._models[self._chosen].budget_s = budget_s - sum(d.seconds for d in self.decisions)
             report = self._models[self._chosen].fit(data, fold, run_dir)
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
+
+    def _go_on(self, model: Method) -> None:
+        """Hand over what an interrupted run has left."""
+        if self.training.resume is None:
+            return
+        if not hasattr(model, "resume"):
+            raise ValueError(
+                f"ckpt_path: effects.{self._chosen} finds the vectors it has recovered by itself; "
+                "start again without ckpt_path"
+            )
+        model.resume = self.training.resume
 
     def _decide(self, data: Measurements, fold: Fold) -> tuple[Decision, ...]:
         hidden = self.settings.emission.hidden

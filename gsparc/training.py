@@ -89,6 +89,12 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
                     resume=_resume(config, number, len(split.folds)),
                     config_yaml=config_yaml,
                 )
+            elif config.ckpt_path is not None:
+                if not hasattr(method, "resume"):
+                    raise ValueError(
+                        f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path"
+                    )
+                method.resume = _resume(config, number, len(split.folds))
             report = method.fit(data, fold, folder)
             for note in report.notes:
                 log.info("%s", note)

@@ -19,7 +19,8 @@ from gsparc.peers.encoding import training_targets
 
 log = logging.getLogger(__name__)
 
-VERSION = 1  # raise it when the recovery changes its answers
+AT_ONCE = 1024  # rows recovered between two writes
+VERSION = 2  # raise it when the recovery changes its answers
 NAMED = 8  # suspect images named in a log line
 
 
@@ -28,7 +29,8 @@ def recovered(
 ) -> tuple[Recovered, float]:
     """Array vectors of the given rows, from disk where known, and the seconds they cost when made [s].
 
-    Only the asked rows are looked at: vectors of a test set are never made for a training run.
+    Only the asked rows are looked at: vectors of a test set are never made for a training run. What is done
+    is on disk after every `AT_ONCE` rows, so that an interrupted run goes on there.
 
     Args:
         data: spectra of a static array.
@@ -40,13 +42,13 @@ def recovered(
     known = _read(path, len(data))
     have = np.zeros(len(data), dtype=bool) if known is None else known["seconds"] >= 0
     missing = rows[~have[rows]]
-    if len(missing):
+    for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         begin = time.perf_counter()
-        found = recover(data.site, training_targets(data, missing), data.tx[missing], seed)
+        found = recover(data.site, training_targets(data, part), data.tx[part], seed)
         spent = time.perf_counter() - begin
         known = known or _empty(len(data), found)
         for name, values in known.items():
-            values[missing] = spent / len(missing) if name == "seconds" else getattr(found, name)
+            values[part] = spent / len(part) if name == "seconds" else getattr(found, name)
         if path is not None:
             _write(path, known)
     assert known is not None

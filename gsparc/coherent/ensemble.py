@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.coherent.furniture.furnish import furnish
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.search import Search, SearchSettings
 from gsparc.coherent.settle import settle
+from gsparc.coherent.shelf import Shelf
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +62,9 @@ def search_many(
     seed: int,
     noise_floor: float,
     budget: Budget,
+    furniture: bool = False,
+    shelf: Shelf | None = None,
+    stage: str = "search",
 ) -> list[Member]:
     """One search on each of the drawn rows, best first; at least one, others while the budget lasts.
 
@@ -70,10 +75,16 @@ def search_many(
         seed: of the first search; the others count on.
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: of all together.
+        furniture: whether boxes and small mirrors are looked for, too.
+        shelf: where finished searches are kept, under the name of `stage`; None keeps none.
+        stage: tells searches of one fit apart.
     """
     threads = torch.get_num_threads()
 
     def search(number: int) -> Member | None:
+        done = None if shelf is None else shelf.find(f"{stage} {number}")
+        if done is not None:
+            return done
         if number > 0 and budget.spent > LAST_START * budget.seconds:
             return None
         rows = draw[number]
@@ -82,6 +93,10 @@ def search_many(
         phased = settle(
             rows, PhasedScene.of(rows, scene, TURNING), settings.visibility, noise_floor=noise_floor
         )
+        if furniture and phased.turning < 1:
+            generator = torch.Generator().manual_seed(seed + number)
+            latest = budget.started + budget.seconds
+            phased = furnish(rows, phased, generator, deadline=latest, noise_floor=noise_floor)
         error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
         left_out = float(error.abs().square().sum() / rows.target.abs().square().sum())
         log.info(
@@ -89,7 +104,10 @@ def search_many(
             number + 1, len(draw), len(scene.words), len(scene.planes), left_out,
             budget.spent, budget.seconds,
         )  # fmt: skip
-        return Member(phased, left_out)
+        member = Member(phased, left_out)
+        if shelf is not None:
+            shelf.put(f"{stage} {number}", member)
+        return member
 
     # Matrices of a few hundred rows gain little from two threads; two searches do.
     torch.set_num_threads(1)

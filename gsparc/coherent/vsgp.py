@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.coherent.edges import Edges, find_edges, with_gains, without
 from gsparc.coherent.ensemble import Budget, Member, search_many, weights
+from gsparc.coherent.furniture.clutter import Clutter
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.offsets import KINDS, Offsets, estimate
 from gsparc.coherent.phase import ranges, wave_over_band
@@ -20,11 +25,15 @@ from gsparc.coherent.process import Scene
 from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows, elements, gather, query_elements, tones_of
 from gsparc.coherent.search import SearchSettings
+from gsparc.coherent.shelf import Shelf
+from gsparc.coherent.sources import SourceKind, box_of, kinds
 from gsparc.coherent.visibility import KernelVisibility
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
+
+log = logging.getLogger(__name__)
 
 SECONDS_PER_MEASUREMENT = 0.4  # a conference room of 350 gets 140 s
 LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 480.0
@@ -62,6 +71,9 @@ class VirtualSourceGP(Method):
         rows: receivers times tones that the final process holds.
         margin, max_sources, order: see `SearchSettings`.
         offsets: what every snapshot has of its own: `none`, `phase`, or `phase_timing`; it is estimated.
+        furniture: look for boxes that hide and mirrors that end, shared by all sources.
+        edges: look for edges, whose diffraction point slides with the receiver; kept when the likelihood
+            wants them.
         seed: of everything random.
 
     Raises:
@@ -69,6 +81,7 @@ class VirtualSourceGP(Method):
     """
 
     name = "vsgp"
+    resume: Path | None = None  # what an interrupted run has left
 
     def __init__(
         self,
@@ -80,6 +93,8 @@ class VirtualSourceGP(Method):
         max_sources: int = 60,
         order: int = 3,
         offsets: Offsets = "none",
+        furniture: bool = True,
+        edges: bool = True,
         seed: int = 0,
     ) -> None:
         if offsets not in KINDS:
@@ -89,7 +104,8 @@ class VirtualSourceGP(Method):
         if search_rows < 8 or rows < 8:
             raise ValueError(f"vsgp: search_rows and rows must be at least 8, got {search_rows} and {rows}")
         self.searches, self.budget_s, self.seed = searches, budget_s, seed
-        self.offsets = offsets
+        self.offsets, self.furniture, self.look_for_edges = offsets, furniture, edges
+        self.edges = Edges.none()
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
         self.site: Site | None = None
@@ -112,16 +128,29 @@ class VirtualSourceGP(Method):
             data = self._aligned(data, known)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
             notes.append(f"vsgp: {self.offsets} of every snapshot estimated; predictions have none")
+        shelf = Shelf(run_dir, self.resume, self._key(data, known), _scene_state, _scene)
+        started -= shelf.spent_s
         budget = Budget(started, self._budget(len(known)))
-        found = self._search(data, known, self.settings, self.searches, budget)
+        found = self._search(data, known, self.settings, self.searches, budget, self.furniture, shelf)
+        if self.look_for_edges:
+            found, held = self._beside_edges(data, known, found, held, shelf)
         self.weights = weights(found)
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
+        scene = self.members[0].scene
+        told = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
+        told[SourceKind.EDGE] = len(self.edges)
+        notes.append("vsgp: the best search has " + ", ".join(f"{told[k]} {k}s" for k in SourceKind))
         notes.append(
             f"vsgp: {len(found)} of {self.searches} searches within {budget.seconds:.0f} s, {counts} sources"
         )
         return FitReport(time.monotonic() - started, tuple(notes))
+
+    def _key(self, data: Measurements, known: np.ndarray) -> str:
+        """What searches depend on; how long they may take and how many there are is not part of it."""
+        facts = (data.site.sha256, self.search_rows, self.row_limit, self.offsets, self.furniture, self.seed)
+        return sha256(f"{facts} {self.settings} ".encode() + known.tobytes()).hexdigest()[:24]
 
     def _budget(self, measurements: int) -> float:
         if self.budget_s is not None:
@@ -129,10 +158,42 @@ class VirtualSourceGP(Method):
         return min(max(SECONDS_PER_MEASUREMENT * measurements, LEAST_BUDGET_S), MOST_BUDGET_S)
 
     def _search(
-        self, data: Measurements, known: np.ndarray, settings: SearchSettings, count: int, budget: Budget
+        self,
+        data: Measurements,
+        known: np.ndarray,
+        settings: SearchSettings,
+        count: int,
+        budget: Budget,
+        furniture: bool = False,
+        shelf: Shelf | None = None,
     ) -> list[Member]:
         draw = [self._inside(data, known, self.search_rows, self.seed + i) for i in range(count)]
-        return search_many(draw, self._start(data.site), settings, self.seed, self.noise_floor, budget)
+        start = self._start(data.site)
+        return search_many(draw, start, settings, self.seed, self.noise_floor, budget, furniture, shelf)
+
+    def _beside_edges(
+        self, data: Measurements, known: np.ndarray, found: list[Member], held: Rows, shelf: Shelf
+    ) -> tuple[list[Member], Rows]:
+        """Searches and rows without the edges that the likelihood wants; as they were when it wants none."""
+        scene, rows = found[0].phased.scene, self._inside(data, known, self.search_rows, self.seed)
+        start, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
+        edges = find_edges(rows, scene, box_of(rows, start), generator, self.noise_floor)
+        if not len(edges):
+            return found, held
+        log.info("%d edges; searching again without what they explain", len(edges))
+        budget = Budget(time.monotonic(), self._budget(len(known)))
+        draw = [self._inside(data, known, self.search_rows, self.seed + i) for i in range(self.searches)]
+        draw = [without(part, edges, start) for part in draw]
+        again = search_many(
+            draw, self._start(data.site), self.settings, self.seed, self.noise_floor, budget,
+            self.furniture, shelf, "beside edges",
+        )  # fmt: skip
+        power = float(draw[0].target.abs().square().mean())  # left-out errors are shares of it
+        if again[0].left_out * power > found[0].left_out:
+            return found, held
+        scene = again[0].phased.scene
+        self.edges = with_gains(held, edges.point, edges.axis, scene, self.noise_floor)
+        return again, without(held, self.edges, scene.transmitter)
 
     def _inside(self, data: Measurements, known: np.ndarray, limit: int, seed: int) -> Rows:
         return self.frame.inside(gather(data, known, limit, seed))
@@ -191,6 +252,8 @@ class VirtualSourceGP(Method):
         tones = torch.from_numpy(tones_of(site))
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
+        if len(self.edges):
+            stack = stack + self.edges.over_band(flat, tones, self.members[0].scene.transmitter)
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
         loudness = (self.frame.carrier_hz / tones).float()
@@ -213,6 +276,7 @@ class VirtualSourceGP(Method):
             "noise_floor": self.noise_floor,
             "frame": [self.frame.middle, self.frame.scale, self.frame.carrier_hz],
             "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
+            "edges": [self.edges.point, self.edges.axis, self.edges.gain],
             "scenes": [_scene_state(member.phased) for member in self.members],
         }
 
@@ -223,12 +287,13 @@ class VirtualSourceGP(Method):
         self.weights = state["weights"]
         self.frame = Frame(*state["frame"])
         rows = Rows(*state["rows"])
+        self.edges = Edges(*state["edges"]) if "edges" in state else Edges.none()
         self.members = [PhasedPosterior(rows, _scene(stored), self.noise_floor) for stored in state["scenes"]]
         self.query = Query(self.members)
 
     def size(self) -> int:
         """Sources of the largest scene."""
-        return max((len(member.scene.words) for member in self.members), default=0)
+        return max((len(member.scene.words) for member in self.members), default=0) + len(self.edges)
 
     def _fitted(self) -> Site:
         if self.site is None or not self.members:
@@ -267,6 +332,9 @@ def _scene_state(phased: PhasedScene) -> dict[str, Any]:
         "visibility": [float(law.constant), float(law.angle), float(law.length)],
         "phase": phased.phase,
         "turning": phased.turning,
+        "boxes": scene.clutter.boxes,
+        "patches": scene.clutter.patches,
+        "patched": list(scene.clutter.plane),
     }
 
 
@@ -278,5 +346,6 @@ def _scene(state: dict[str, Any]) -> PhasedScene:
         state["log_amplitude"],
         float(state["log_noise"]),
         KernelVisibility(*state["visibility"]),
+        Clutter(state["boxes"], state["patches"], tuple(state["patched"])),
     )
     return PhasedScene(scene, state["phase"], float(state["turning"]))

@@ -101,6 +101,24 @@ def test_only_asked_rows_are_recovered_and_kept(known_campaign, tmp_path, monkey
     assert asked == [10, 5, 3]
 
 
+def test_an_interrupted_recovery_goes_on(known_campaign, tmp_path, monkeypatch):
+    data, _ = known_campaign
+    asked, whole = [], store.recover
+
+    def interrupted(site, images, places, seed):
+        asked.append(len(places))
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return whole(site, images, places, seed)
+
+    monkeypatch.setattr(store, "AT_ONCE", 5)
+    monkeypatch.setattr(store, "recover", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        store.recovered(data, np.arange(20), tmp_path)
+    found, _ = store.recovered(data, np.arange(20), tmp_path)
+    assert asked == [5, 5, 5, 5, 5] and len(found.vectors) == 20
+
+
 def test_damaged_store_is_made_anew(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
     store.recovered(data, np.arange(4), tmp_path)

@@ -1,0 +1,90 @@
+"""Finished searches of a run, on disk as soon as they are done: an interrupted run goes on after them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+if TYPE_CHECKING:
+    from gsparc.coherent.ensemble import Member
+    from gsparc.coherent.inphase import PhasedScene
+
+log = logging.getLogger(__name__)
+
+FILE = "last.ckpt"
+
+
+class Shelf:
+    """Searches by name.
+
+    Args:
+        folder: of the run; None or an empty path keeps nothing.
+        resume: the file an interrupted run has left; None starts anew.
+        key: what the searches depend on; those of another key are refused.
+        pack, unpack: a scene as plain containers, and back.
+
+    Attributes:
+        spent_s: seconds that the interrupted run had spent when its last search was done [s].
+
+    Raises:
+        ValueError: `resume` holds no searches, or those of other data or settings.
+    """
+
+    def __init__(
+        self,
+        folder: Path | None,
+        resume: Path | None,
+        key: str,
+        pack: Callable[[PhasedScene], dict[str, Any]],
+        unpack: Callable[[dict[str, Any]], PhasedScene],
+    ) -> None:
+        self._path = None if folder is None or folder == Path() else folder / FILE
+        self._key, self._pack, self._unpack = key, pack, unpack
+        self._kept: dict[str, dict[str, Any]] = {}
+        self._lock = threading.Lock()
+        self.spent_s = 0.0
+        if resume is not None:
+            self._open(resume)
+        self._started = time.monotonic() - self.spent_s
+
+    def _open(self, file: Path) -> None:
+        try:
+            stored = torch.load(file, weights_only=True)
+            key, kept, spent = str(stored["key"]), dict(stored["searches"]), float(stored["spent_s"])
+        except Exception as error:  # whatever another or a damaged file raises
+            raise ValueError(
+                f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"
+            ) from error
+        if key != self._key:
+            raise ValueError(f"ckpt_path={file}: is of other data, rows or settings; start without it")
+        self._kept, self.spent_s = kept, spent
+        log.info("%d finished searches are found again, %.0f s of the bill", len(kept), spent)
+
+    def find(self, name: str) -> Member | None:
+        """The search of this name, when it is done."""
+        from gsparc.coherent.ensemble import Member
+
+        with self._lock:
+            kept = self._kept.get(name)
+        return None if kept is None else Member(self._unpack(kept["scene"]), float(kept["left_out"]))
+
+    def put(self, name: str, member: Member) -> None:
+        """Keep a finished search; the file is written atomically."""
+        with self._lock:
+            self._kept[name] = {"scene": self._pack(member.phased), "left_out": member.left_out}
+            if self._path is None:
+                return
+            spent = time.monotonic() - self._started
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            handle, partial = tempfile.mkstemp(suffix=".pt", dir=self._path.parent)
+            with os.fdopen(handle, "wb") as file:
+                torch.save({"key": self._key, "spent_s": spent, "searches": self._kept}, file)
+            os.replace(partial, self._path)
