@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc import checkpoint
@@ -108,7 +108,9 @@ class Prepared:
 def prepare(cell: Cell, contender: Contender, settings: dict[str, Any], room: Room, kept: Path) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
-    model, trainer = _plain(config.model), _plain(config.trainer)
+    model = _plain(config.model)
+    by_trainer = issubclass(get_class(model["_target_"]), LearnedField)
+    trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks")} if by_trainer else {}
     name = key(model, trainer, room.data.site.sha256, room.folds.sha256)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, config, folder, not contender.timed_only)

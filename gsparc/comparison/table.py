@@ -163,8 +163,8 @@ def remarks(block: Block, ours: str) -> list[str]:
     loads = [r.load for r in block.rows if r.load is not None and r.budget_s is not None]
     if loads and max(loads) > BUSY:
         said.append(
-            f"the machine was busy (load up to {max(loads):.1f} per core): a budget of seconds bought less "
-            "processor time than on a quiet one; the column cpu s says how much"
+            f"the machine was busy (load up to {max(loads):.1f} per core): train s is inflated, "
+            "cpu s is what was spent"
         )
     return said
 

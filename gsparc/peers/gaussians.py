@@ -66,14 +66,8 @@ def render_each(
     Returns:
         (B, C, H, W).
     """
-    means, quats, scales, opacities = geometry
     images = [
-        rasterize(
-            *(means[i], quats[i], scales[i], opacities[i], features[i]),
-            pose[i] if pose.batched else pose,
-            grid,
-            **optics,
-        ).image[0]
-        for i in range(len(features))
+        rasterize(*one, feature, pose[i] if pose.batched else pose, grid, **optics).image[0]  # type: ignore
+        for i, (*one, feature) in enumerate(zip(*geometry, features, strict=True))
     ]
     return torch.stack(images)

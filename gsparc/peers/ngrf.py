@@ -96,9 +96,9 @@ class Radiators(Network):
             response = torch.view_as_real(torch.polar(torch.ones(()), 2 * math.pi * turns))
         self.register_buffer("steering", matrix, persistent=False)
         self.antennas = nn.Parameter(response)
-        site = scene.site
-        tone = [site.carrier_hz] * tones if site.subcarriers_hz is None else site.subcarriers_hz
-        self.register_buffer("wavenumbers", 2 * math.pi / LIGHT * torch.as_tensor(tone).float())
+        hertz = scene.site.subcarriers_hz
+        hertz = torch.as_tensor([scene.site.carrier_hz] * tones if hertz is None else hertz)  # type: ignore
+        self.register_buffer("wavenumbers", (2 * math.pi / LIGHT * hertz).float())  # type: ignore
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Channels (B, A, K) or spectra (B, H, W)."""

@@ -193,7 +193,6 @@ def rate_factor(progress: float) -> float:
 def _scene(data: Measurements, rows: np.ndarray) -> Scene:
     one, moving = data.batch(rows[:1]), data.moving[rows]
     box = torch.from_numpy(np.stack([moving.min(0), moving.max(0)])).float()
-    shape = tuple(data.target.shape[1:])
-    if data.site.static_end == "rx":
-        return Scene(data.site, shape, one.rx, None, box)
-    return Scene(data.site, shape, None, one.tx[0], box)
+    static = data.site.static_end == "rx"
+    ends = (one.rx, None) if static else (None, one.tx[0])
+    return Scene(data.site, tuple(data.target.shape[1:]), *ends, box)  # type: ignore[call-arg]
