@@ -157,7 +157,7 @@ def read(path: str | Path) -> Stored:
             extra=dict(content["extra"]),
             path=path,
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
 
 

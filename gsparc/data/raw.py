@@ -16,6 +16,7 @@ import h5py
 import numpy as np
 
 from gsparc.data.errors import DataError
+from gsparc.data.trial import fails
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
@@ -131,6 +132,9 @@ def _read_hdf5(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
     name = "the file"
+    reason = fails(path)
+    if reason is not None:
+        raise DataError(f"{path}: damaged ({reason}); write it again, text best with a fixed length")
     try:
         with h5py.File(path, "r") as file:
             for key, item in file.items():

@@ -19,7 +19,7 @@ from gsparc.check import main as check
 from gsparc.training import main as train
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "data"))
-from test_bad_input import RFID  # noqa: E402
+from test_bad_input import RFID
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,220 @@
+"""Hostile and damaged checkpoints at the doors that read them: nothing executes, one line says why.
+
+Remedy: gsparc/checkpoint.py (weights-only unpickling, only classes of gsparc are built). Each hostile file
+would leave a mark; no mark may appear. Naive: `pickle.load` and `torch.load(weights_only=False)` leave it.
+"""
+# ruff: noqa: E501 (a case is a row of a table)
+
+from __future__ import annotations
+
+import builtins
+import io
+import os
+import pickle
+import random
+import subprocess
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from campaigns import spectra
+from doors import assert_refused, knock
+from ledger import LEDGER
+
+import gsparc
+from gsparc import checkpoint
+from gsparc.checkpoint import CheckpointError
+from gsparc.data.load import load, split_for
+from gsparc.evaluate import main as evaluate
+from gsparc.registry import build
+from gsparc.training import main as train
+
+MARK = "owned"
+
+
+class Calls:
+    """Pickles to a call."""
+
+    def __init__(self, function: Callable, *arguments: object) -> None:
+        self.parts = function, arguments
+
+    def __reduce__(self):
+        return self.parts
+
+
+def payloads(mark: Path) -> dict[str, object]:
+    """Objects whose unpickling by an ordinary unpickler touches `mark`."""
+    code = f"open({str(mark)!r}, 'w')"
+    return {
+        "os.system": Calls(os.system, f"touch {mark}"),
+        "eval": Calls(eval, code),
+        "exec": Calls(exec, code),
+        "open": Calls(builtins.open, str(mark), "w"),
+        "subprocess": Calls(subprocess.call, ["touch", str(mark)]),
+        "Path.touch": Calls(Path.touch, mark),
+        "torch.save": Calls(torch.save, {}, str(mark)),
+        "numpy.save": Calls(np.save, str(mark), np.ones(1)),
+        "getattr": Calls(getattr, Calls(__import__, "os"), "system"),
+        "a class of ours": checkpoint.Stored("m", "t", "", None, {}),
+    }
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory) -> tuple[Path, Path]:
+    """A checkpoint of IDW, and its data."""
+    folder = tmp_path_factory.mktemp("sound")
+    file = spectra(folder / "own.npz")
+    data = load({"name": "own", "file": str(file)})
+    config = "model: {_target_: gsparc.peers.idw.InverseDistance}\n"
+    method = build({"_target_": "gsparc.peers.idw.InverseDistance"})
+    method.fit(data, split_for({"name": "random"}, data).folds[0], folder)
+    checkpoint.save(folder / "m.ckpt", method, config)
+    return folder / "m.ckpt", file
+
+
+def altered(sound: Path, to: Path, **changes: object) -> Path:
+    content = torch.load(sound, weights_only=True)
+    content.update(changes)
+    torch.save(content, to)
+    return to
+
+
+def refused_everywhere(path: Path, file: Path, run: Path, says: str) -> None:
+    """`gsparc.load`, `python -m gsparc.evaluate` and `train.py ckpt_path=`."""
+    with pytest.raises(CheckpointError, match=says) as refused:
+        gsparc.load(path)
+    assert "\n" not in str(refused.value) and path.name in str(refused.value)
+    given = [f"ckpt={path}", "dataset.name=own", f"dataset.file={file}", f"hydra.run.dir={run}"]
+    assert_refused(knock(evaluate, "evaluate", given), says, run)
+
+
+@pytest.mark.parametrize("place", ["state", "extra", "whole"])
+@pytest.mark.parametrize("name", payloads(Path()))
+def test_nothing_executes(sound, tmp_path, name, place):
+    thing = payloads(tmp_path / MARK)[name]
+    path = tmp_path / "hostile.ckpt"
+    if place == "whole":
+        torch.save(thing, path)
+    else:
+        altered(sound[0], path, **{place: {"x": thing}})
+    with pytest.raises(CheckpointError, match=r"hostile\.ckpt: .*(could run code|cannot be read)"):
+        gsparc.load(path)
+    assert not (tmp_path / MARK).exists()
+    LEDGER.count("bad inputs")
+
+
+@pytest.mark.parametrize("name", ["os.system", "eval", "Path.touch"])
+def test_commands_refuse_them_in_one_line(sound, tmp_path, name):
+    path = altered(sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)[name]})
+    refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
+    given = [
+        "dataset=own",
+        f"dataset.file={sound[1]}",
+        f"ckpt_path={path}",
+        f"hydra.run.dir={tmp_path / 'r2'}",
+    ]
+    answer = knock(train, "train.py", [*given, "logger=none", "threads=1", "model.effects.phase=false"])
+    assert_refused(answer, "could run code", tmp_path / "r2")
+    assert not (tmp_path / MARK).exists()
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["os.system", "builtins.exec", "pathlib.Path.touch", "gsparc.checkpoint.os.system", "gsparc.data.load.log",
+     "torch.load", "gsparc.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
+)  # fmt: skip
+def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
+    mark = tmp_path / MARK
+    config = f"model: {{_target_: '{target}', _args_: ['{mark}']}}\n"
+    for name, changes in {
+        "named": {"config": config, "target": target},
+        "nested": {"config": f"model: {{_target_: gsparc.peers.idw.InverseDistance, power: {config[7:-1]}}}\n",
+                   "target": "gsparc.peers.idw.InverseDistance"},
+    }.items():  # fmt: skip
+        path = altered(sound[0], tmp_path / f"{name}.ckpt", **changes)
+        with pytest.raises(CheckpointError) as refused:
+            gsparc.load(path)
+        assert "\n" not in str(refused.value) and path.name in str(refused.value)
+        LEDGER.count("bad inputs")
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize(
+    "changes,says",
+    [
+        ({"schema_version": 99}, "schema 99"),
+        ({"schema_version": None}, "schema None"),
+        ({"format": "other"}, "not a gsparc checkpoint"),
+        ({"site": {}}, "incomplete"),
+        ({"site": None}, "incomplete"),
+        ({"state": [1, 2]}, "incomplete"),
+        ({"state": {}}, "cannot be restored"),
+        ({"target": "gsparc.peers.gp.GaussianProcess", "config": ""}, "cannot be restored"),
+        ({"config": "model: ["}, "not YAML"),
+        ({"config": "a: !!python/object/apply:os.system ['true']"}, "not YAML"),
+    ],
+    ids=str,
+)
+def test_content_that_does_not_fit(sound, tmp_path, changes, says):
+    path = altered(sound[0], tmp_path / "odd.ckpt", **changes)
+    refused_everywhere(path, sound[1], tmp_path / "run", says)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+def test_cut_short(sound, tmp_path, share):
+    content = sound[0].read_bytes()
+    path = tmp_path / "cut.ckpt"
+    path.write_bytes(content[: int(share * len(content))])
+    refused_everywhere(path, sound[1], tmp_path / "run", "not a gsparc checkpoint, or cut short")
+
+
+def other_files() -> dict[str, bytes]:
+    """Files of other kinds under the name of a checkpoint."""
+    archive, empty = io.BytesIO(), io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as made:
+        made.writestr("data.pkl", b"cos\nsystem\n(S'true'\ntR.")
+    with zipfile.ZipFile(empty, "w"):
+        pass
+    array = io.BytesIO()
+    np.savez(array, a=np.ones(3))
+    weights = io.BytesIO()
+    torch.save({"w": torch.ones(2)}, weights)
+    return {
+        "text": b"hello", "pickle": pickle.dumps({"a": 1}), "zip": archive.getvalue(), "empty zip": empty.getvalue(),
+        "npz": array.getvalue(), "weights": weights.getvalue(), "zeros": bytes(5000),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", other_files())
+def test_files_of_other_kinds(sound, tmp_path, kind):
+    path = tmp_path / "other.ckpt"
+    path.write_bytes(other_files()[kind])
+    refused_everywhere(path, sound[1], tmp_path / "run", r"other\.ckpt: ")
+
+
+def test_flipped_bytes_are_refused_or_harmless(sound, tmp_path):
+    content, path = sound[0].read_bytes(), tmp_path / "flipped.ckpt"
+    for seed in range(60):
+        draw, spoilt = random.Random(seed), bytearray(content)
+        for _ in range(4):
+            spoilt[draw.randrange(len(spoilt))] = draw.randrange(256)
+        path.write_bytes(spoilt)
+        try:
+            gsparc.load(path)
+        except CheckpointError as refused:
+            assert "\n" not in str(refused)
+            LEDGER.count("bad inputs")
+
+
+def test_an_ordinary_unpickler_would_run_them(tmp_path):
+    """Naive: what every payload does to `pickle.load`; without it nothing above would show anything."""
+    for name, thing in payloads(tmp_path / MARK).items():
+        if name in ("a class of ours", "getattr"):
+            continue
+        pickle.loads(pickle.dumps(thing))
+        mark = [path for path in tmp_path.iterdir() if path.name.startswith(MARK)]
+        assert mark, name
+        mark[0].unlink()

@@ -1,0 +1,107 @@
+"""Files whose bytes are damaged: cut short, overwritten, made to hang or crash the library that reads them.
+
+Remedy: gsparc/data/raw.py; text of variable length is first read by a program of its own, for a bounded time
+(gsparc/data/trial.py). Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
+"""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from doors import assert_found_bad, knock
+from ledger import LEDGER
+
+from gsparc.check import main as check
+from gsparc.data import trial
+from gsparc.data.errors import DataError
+from gsparc.data.own import load_own
+
+
+def users_file(path: Path) -> Path:
+    """As h5py writes text by itself: of variable length, in a global heap."""
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        file["rx_position"], file["tx_position"] = rng.uniform(0, 3, (12, 3)), np.array([4.0, 1.0, 2.0])
+        file["csi"], file["frequency_hz"] = rng.normal(size=12) + 1j, 2.4e9
+        file["row_name"] = [f"Raum {i}" for i in range(12)]
+        file.attrs["name"] = "garage"
+        file.attrs["note"] = "by hand " * 40
+    return path
+
+
+def test_variable_length_text_is_read(tmp_path):
+    data = load_own(users_file(tmp_path / "mine.h5"))
+    assert data.site.name == "garage" and data.row_names[3] == "Raum 3"
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("suffix", ["h5", "npz"])
+def test_cut_short(tmp_path, share, suffix):
+    path = users_file(tmp_path / "whole.h5")
+    if suffix == "npz":
+        with h5py.File(path) as file:
+            np.savez(
+                tmp_path / "whole.npz", **{k: file[k][()] for k in ("rx_position", "csi", "frequency_hz")}
+            )
+        path = tmp_path / "whole.npz"
+    content = path.read_bytes()
+    cut = tmp_path / f"cut.{suffix}"
+    cut.write_bytes(content[: int(share * len(content))])
+    assert_found_bad(knock(lambda: check([str(cut)]), "check", []), rf"cut\.{suffix}.*damaged")
+
+
+@pytest.mark.parametrize(
+    "count", [pytest.param(5, id="few"), pytest.param(80, id="many", marks=pytest.mark.slow)]
+)
+def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
+    good = users_file(tmp_path / "good.h5").read_bytes()
+    heap = good.index(trial.HEAP)
+    for seed in range(count):
+        draw, spoilt = random.Random(seed), bytearray(good)
+        for _ in range(3):
+            spoilt[heap + 4 + draw.randrange(60)] = draw.choice([0, 1, 255, draw.randrange(256)])
+        path = tmp_path / f"{seed}.h5"
+        path.write_bytes(spoilt)
+        try:
+            load_own(path)
+        except DataError as refused:
+            assert "\n" not in str(refused) and path.name in str(refused)
+            LEDGER.count("bad inputs")
+
+
+def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
+    path = users_file(tmp_path / "mine.h5")
+    monkeypatch.setattr(trial, "READ", "import time; time.sleep(60)")
+    assert "cannot be read in 0.5 s" in str(trial.fails(path, seconds=0.5))
+    monkeypatch.setattr(trial, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
+        load_own(path)
+    LEDGER.count("bad inputs", 2)
+
+
+def test_ours_need_no_trial(tmp_path, monkeypatch):
+    from gsparc.data.own import write_own
+
+    with h5py.File(users_file(tmp_path / "mine.h5")) as file:
+        arrays = {k: file[k][()] for k in ("rx_position", "tx_position", "csi", "frequency_hz")}
+    write_own(tmp_path / "ours.h5", {**arrays, "row_name": np.array(["a"] * 12)}, {"name": "garage"})
+    monkeypatch.setattr(subprocess, "run", lambda *a, **k: pytest.fail(f"{sys.executable} was started"))
+    assert len(load_own(tmp_path / "ours.h5")) == 12
+
+
+def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
+    """Found by fuzzing: an object that says it is 2 kB larger is walked past for ever."""
+    spoilt = bytearray(users_file(tmp_path / "good.h5").read_bytes())
+    spoilt[spoilt.index(trial.HEAP) + 25] = 8  # second byte of the first object's size
+    path = tmp_path / "loops.h5"
+    path.write_bytes(spoilt)
+    monkeypatch.setattr(trial.fails, "__defaults__", (3.0,))
+    with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 3 s\)"):
+        load_own(path)
+    LEDGER.count("bad inputs")
