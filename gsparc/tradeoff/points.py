@@ -17,7 +17,7 @@ FIGURES: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_
 LOWER_IS_BETTER = ("nmse", "rmse_db")
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",
-    "stride": lambda value: f"every {value}th pixel",
+    "stride": lambda value: f"1 of {value} x {value} pixels",
     "cutoff": lambda value: f"cut-off x{value:g}",
     "projection": lambda value: f"{value} projection",
     "frozen": lambda value: "frozen plan" if value else "live plan",
@@ -63,7 +63,7 @@ class Point:
 
 
 def worded(settings: Settings) -> str:
-    """`25% kept, every 3th pixel`; `as trained` when nothing is spared."""
+    """`25% kept, 1 of 3 x 3 pixels`; `as trained` when nothing is spared."""
     said = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
     return ", ".join(word for word in said if word) or "as trained"
 

@@ -66,5 +66,5 @@ def _fewer(member: PhasedPosterior, share: float, contribution: Tensor) -> Phase
 class MeanQuery(Query):
     """Means alone: the variance is most of a query's work."""
 
-    def _variance(self, part: Tensor, tone: Tensor, correlation: Tensor) -> tuple[Tensor, Tensor]:
+    def _variance(self, part: Tensor, *unused: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros(len(part)), torch.ones(len(part))

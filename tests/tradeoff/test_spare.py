@@ -1,0 +1,161 @@
+"""Each kind of model spares what it says, stays near itself when little is spared, and is left as it was."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, channels, compose
+
+from gsparc.array.field import ArrayField
+from gsparc.array.packets import PacketSettings
+from gsparc.coherent.vsgp import VirtualSourceGP
+from gsparc.committee import Committee
+from gsparc.data.load import load
+from gsparc.data.splits import Fold
+from gsparc.peers.gp import GaussianProcess
+from gsparc.peers.mean import Mean
+from gsparc.peers.nearest import Nearest
+from gsparc.tradeoff import spare, splatted
+from gsparc.training import train
+
+
+def answer(method, data, rows):
+    batch = data.batch(rows)
+    return method.predict(batch.tx, batch.rx)
+
+
+def away(method, other, data, rows) -> float:
+    """Relative squared distance of two methods' answers."""
+    a, b = answer(method, data, rows).mean, answer(other, data, rows).mean
+    return float((a - b).abs().square().sum() / a.abs().square().sum())
+
+
+def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(field):
+    method, data, fold = field.methods[0], field.data, field.split.folds[0]
+    before = answer(method, data, fold.test).mean.clone()
+    measured = spare.measure(method, data, fold.train)
+    assert measured["contribution"].shape == (40,) and (measured["contribution"] >= 0).all()
+    assert away(method, spare.reduced(method, {"keep": 1.0}, measured), data, fold.test) < 1e-3
+    half, few = (spare.reduced(method, {"keep": share}, measured) for share in (0.5, 0.1))
+    assert half.size() == 20 and few.size() == 4 and method.size() == 40
+    assert away(method, half, data, fold.test) < 0.2 < away(method, few, data, fold.test)
+    assert torch.equal(answer(method, data, fold.test).mean, before)
+
+
+def test_the_order_of_keeping_is_spread_over_the_sky(field):
+    method, fold = field.methods[0], field.split.folds[0]
+    measured = spare.measure(method, field.data, fold.train)
+    order = splatted.spread(method.fitted(), measured)
+    assert sorted(order.tolist()) == list(range(40)) and order[0] == measured["contribution"].argmax()
+    seen = torch.nn.functional.normalize(method.fitted().gaussians.means - measured["receiver"][0], dim=1)
+
+    def nearest(rows):
+        apart = torch.cdist(seen[rows], seen[rows])
+        return float((apart + 9 * torch.eye(len(rows))).min())
+
+    assert nearest(order[:8]) > 1.3 * nearest(torch.arange(8))
+
+
+@pytest.mark.parametrize(
+    ("settings", "near"),
+    [
+        ({"stride": 2}, 0.1),
+        ({"cutoff": 4}, 0.1),
+        ({"frozen": False}, 1e-8),
+        ({"projection": "equirect"}, 0.5),
+    ],
+)
+def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
+    method, data, fold = field.methods[0], field.data, field.split.folds[0]
+    reduced = spare.reduced(method, settings, spare.measure(method, data, fold.train))
+    found = answer(reduced, data, fold.test).mean
+    assert found.shape == data.batch(fold.test).target.shape
+    assert away(method, reduced, data, fold.test) < near
+
+
+def test_confidence_that_is_spared_is_not_computed(field):
+    method, data, fold = field.methods[0], field.data, field.split.folds[0]
+    reduced = spare.reduced(method, {"confidence": False}, spare.measure(method, data, fold.train))
+    assert answer(reduced, data, fold.test).confidence is None
+    assert answer(method, data, fold.test).confidence is not None
+    assert away(method, reduced, data, fold.test) == 0
+
+
+@pytest.fixture(scope="module")
+def packets(tmp_path_factory):
+    data = load({"name": "rfid_sim", "count": 48, "root": str(tmp_path_factory.mktemp("sim")), "seed": 0})
+    method = ArrayField(PacketSettings(count=96, samples=500), cache=False)
+    rows = np.arange(48)
+    fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
+    method.fit(data, fold, tmp_path_factory.mktemp("run"))
+    return method, data, fold
+
+
+def test_fewer_packets_say_what_all_of_them_said(packets):
+    method, data, fold = packets
+    measured = spare.measure(method, data, fold.train)
+    half = spare.reduced(method, {"keep": 0.5}, measured)
+    few = spare.reduced(method, {"keep": 0.05}, measured)
+    assert half.size() == 48 and few.size() == 5 and method.size() == 96
+    error = [away(method, way, data, fold.test) for way in (half, few)]
+    assert error[0] < 0.01 and error[0] < error[1]
+    coarse = spare.reduced(method, {"stride": 3, "confidence": False}, measured)
+    assert away(method, coarse, data, fold.test) < 0.05 and answer(coarse, data, fold.test).confidence is None
+
+
+def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path):
+    data = load({"name": "own", "file": str(channels(tmp_path / "own.npz", rows=60, shape="S"))})
+    rows = np.arange(60)
+    fold = Fold(rows[rows % 3 > 0], rows[:0], rows[::3])
+    method = VirtualSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
+    method.fit(data, fold, tmp_path)
+    measured = spare.measure(method, data, fold.train)
+    silent = spare.reduced(method, {"confidence": False}, measured)
+    assert away(method, silent, data, fold.test) < 1e-9 and answer(silent, data, fold.test).variance is None
+    one = spare.reduced(method, {"searches": 1}, measured)
+    assert len(one.members) == 1 and answer(one, data, fold.test).variance is not None
+    few = spare.reduced(method, {"keep": 0.3}, measured)
+    assert 1 <= few.size() <= method.size() and np.isfinite(answer(few, data, fold.test).mean).all()
+
+
+def test_a_gaussian_process_spares_components_and_pixels(field):
+    data, fold = field.data, field.split.folds[0]
+    method = GaussianProcess()
+    method.fit(data, fold, Path())
+    whole = spare.reduced(method, {"keep": 1.0}, {})
+    assert away(method, whole, data, fold.test) < 1e-9
+    assert 0 < away(method, spare.reduced(method, {"keep": 0.2, "stride": 2}, {}), data, fold.test) < 0.3
+
+
+def test_a_committee_answers_with_some_of_its_members(field):
+    data, fold = field.data, field.split.folds[0]
+    method = Committee({"gp": GaussianProcess(), "nearest": Nearest()})
+    method.fit(data, fold, Path())
+    alone = spare.reduced(method, {"members": ["gp"]}, {})
+    assert away(method.members["gp"], alone, data, fold.test) == 0
+    both = spare.reduced(method, {"keep": 1.0}, {})
+    assert away(method, both, data, fold.test) < 1e-9
+    found = list(spare.combinations(method, {"members": None, "keep": [1.0, 0.5]}, {}))
+    assert {} in found and {"members": ["gp"], "keep": 0.5} in found and len(found) == 6
+
+
+def test_a_method_without_knobs_has_one_point(field):
+    method = Mean()
+    method.fit(field.data, field.split.folds[0], Path())
+    assert list(spare.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
+    assert spare.reduced(method, {"keep": 0.5}, {}) is method
+
+
+def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
+    found = train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1]
+    method, data, fold = found.methods[0], found.data, found.split.folds[0]
+    measured = spare.measure(method, data, fold.train)
+    assert "frozen" not in spare.knobs(method)
+    strongest = spare.reduced(method, {"keep": 0.5}, measured)
+    weakest = spare.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
+    assert strongest.size() == weakest.size() == 20
+    assert away(method, strongest, data, fold.test) < away(method, weakest, data, fold.test)
+    assert away(method, spare.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
