@@ -131,7 +131,7 @@ def fill(prepared: Prepared, room: Room) -> Filled:
             method.training = Training(
                 settings=instantiate(config.trainer),
                 seed=int(config.seed),
-                callbacks=lambda: [instantiate(node) for node in config.callbacks.values()],
+                callbacks=lambda: [instantiate(node) for node in config.callbacks.values() if node],
                 config_yaml=OmegaConf.to_yaml(config, resolve=True),
             )
         before = time.process_time()
