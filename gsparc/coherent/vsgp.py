@@ -35,8 +35,9 @@ from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
-SECONDS_PER_MEASUREMENT = 0.4  # a conference room of 350 gets 140 s
-LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 480.0
+SECONDS = 0.02  # times measurements^1.5: a conference room of 350 gets 130 s, 700 get 370
+LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 420.0
+AGAIN = 0.2  # of the budget, at least, for searching again beside edges
 ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
 ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
 
@@ -66,7 +67,8 @@ class VirtualSourceGP(Method):
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
-        budget_s: what all searches may take, about; None: 0.4 s per measurement, 120 to 480 s.
+        budget_s: what all searches may take, about; None: 120 to 420 s, growing with the
+            measurements.
         search_rows: receivers times tones that a search looks at.
         rows: receivers times tones that the final process holds.
         margin, max_sources, order: see `SearchSettings`.
@@ -133,7 +135,7 @@ class VirtualSourceGP(Method):
         budget = Budget(started, self._budget(len(known)))
         found = self._search(data, known, self.settings, self.searches, budget, self.furniture, shelf)
         if self.look_for_edges:
-            found, held = self._beside_edges(data, known, found, held, shelf)
+            found, held = self._beside_edges(data, known, found, held, shelf, budget)
         self.weights = weights(found)
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
@@ -155,7 +157,7 @@ class VirtualSourceGP(Method):
     def _budget(self, measurements: int) -> float:
         if self.budget_s is not None:
             return self.budget_s
-        return min(max(SECONDS_PER_MEASUREMENT * measurements, LEAST_BUDGET_S), MOST_BUDGET_S)
+        return min(max(SECONDS * measurements**1.5, LEAST_BUDGET_S), MOST_BUDGET_S)
 
     def _search(
         self,
@@ -172,7 +174,13 @@ class VirtualSourceGP(Method):
         return search_many(draw, start, settings, self.seed, self.noise_floor, budget, furniture, shelf)
 
     def _beside_edges(
-        self, data: Measurements, known: np.ndarray, found: list[Member], held: Rows, shelf: Shelf
+        self,
+        data: Measurements,
+        known: np.ndarray,
+        found: list[Member],
+        held: Rows,
+        shelf: Shelf,
+        budget: Budget,
     ) -> tuple[list[Member], Rows]:
         """Searches and rows without the edges that the likelihood wants; as they were when it wants none."""
         scene, rows = found[0].phased.scene, self._inside(data, known, self.search_rows, self.seed)
@@ -181,7 +189,8 @@ class VirtualSourceGP(Method):
         if not len(edges):
             return found, held
         log.info("%d edges; searching again without what they explain", len(edges))
-        budget = Budget(time.monotonic(), self._budget(len(known)))
+        remaining = max(budget.seconds - budget.spent, AGAIN * budget.seconds)
+        budget = Budget(time.monotonic(), remaining)
         draw = [self._inside(data, known, self.search_rows, self.seed + i) for i in range(self.searches)]
         draw = [without(part, edges, start) for part in draw]
         again = search_many(

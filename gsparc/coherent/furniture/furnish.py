@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsparc.coherent.backprojection import pick_apart
 from gsparc.coherent.furniture.boxes import find_box, inside_out
-from gsparc.coherent.furniture.clutter import SOFT, shade
+from gsparc.coherent.furniture.clutter import SOFT, Screens, shade, tangents
 from gsparc.coherent.furniture.descent import Accord, descend
-from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, walls
+from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, same_mirror, walls
 from gsparc.coherent.furniture.residual import Explained, Residual
 from gsparc.coherent.inphase import PhasedScene
 from gsparc.coherent.phase import LIGHT
@@ -25,6 +25,7 @@ from gsparc.coherent.rows import Rows
 log = logging.getLogger(__name__)
 
 SURE = 1.0  # concentration from which on phases of new sources are foretold
+NEAR_WALL = 0.25  # [m]; faces that close to the end of the room are not tried as mirrors
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: how far, and how finely, a mirror is moved to fit its phases
 
 
@@ -35,7 +36,7 @@ class Furnishing:
     Attributes:
         epochs: rounds of everything, softer edges first.
         box, patch, mirror, word: nats that each must gain to stay.
-        look: least nats promised before one is tried.
+        look: least nats promised before one is tried; `face`: before a mirror is, once in place.
         boxes, mirrors, words: most new ones in an epoch.
         beyond: how far outside the receivers' box furniture may reach [m].
         soft: width of edges in each epoch [m], the last for all that follow.
@@ -47,6 +48,7 @@ class Furnishing:
     mirror: float = 10.0
     word: float = 3.0
     look: float = 12.0
+    face: float = 8.0
     boxes: int = 4
     mirrors: int = 5
     words: int = 6
@@ -152,35 +154,66 @@ class _Furnisher:
             self.rows, self._explained(), scene.transmitter, scene.planes,
             walls(scene.planes, scene.words), self.room, 2 * s.mirrors,
         )  # fmt: skip
-        added = 0
-        for mirror in found:
-            if added < s.mirrors and mirror.score > s.look:
-                added += self._hang(self._placed(mirror))
+        found = [mirror for mirror in found if mirror.score > s.look]
+        explained = self._explained()
+        placed = [self._placed(mirror, explained) for mirror in [*found, *self._faces()]]
+        hung: list[SmallMirror] = []
+        for mirror in sorted(placed, key=lambda m: -m.score):
+            if len(hung) == s.mirrors or mirror.score < s.face:
+                break
+            if not any(same_mirror(mirror, other, self.wavelength) for other in hung) and self._hang(mirror):
+                hung.append(mirror)
 
-    def _placed(self, mirror: SmallMirror) -> SmallMirror:
+    def _faces(self) -> list[SmallMirror]:
+        """The faces of boxes, as far as they are not on floor or walls."""
+        found = []
+        for box in self.scene.clutter.boxes:
+            for axis in range(3):
+                for end in (0, 3):
+                    offset = float(box[axis + end])
+                    if min(offset - self.room[0, axis], self.room[1, axis] - offset) < NEAR_WALL:
+                        continue
+                    plane = torch.zeros(4, dtype=torch.float64)
+                    plane[axis], plane[3] = 1.0, offset
+                    corners = box.view(2, 3) @ tangents(plane).T
+                    patch = torch.cat([corners.amin(0), corners.amax(0)])
+                    found.append(SmallMirror(plane, patch, 0.0))
+        return found
+
+    def _placed(self, mirror: SmallMirror, explained: Explained) -> SmallMirror:
         """Moved along its normal to where its words have the phases that mirrors give here."""
         if self.accord.concentration < SURE:
             return mirror
         moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
-        explained, total = self._explained(), []
-        for move in moves:
-            plane = mirror.plane + torch.tensor([0, 0, 0, 1], dtype=torch.float64) * move
-            trial, words = self._with_mirror(replace(mirror, plane=plane))
-            scores, _, _ = self._promises(trial, words, explained)
-            total.append(scores.sum())
-        best = moves[int(torch.stack(total).argmax())]
-        return replace(mirror, plane=mirror.plane + torch.tensor([0, 0, 0, 1], dtype=torch.float64) * best)
+        planes = mirror.plane.repeat(len(moves), 1)
+        planes[:, 3] += moves
+        scene, known = self.scene, walls(self.scene.planes, self.scene.words)
+        clutter, words, first = scene.clutter, list[Word](), len(scene.planes)
+        for number in range(first, first + len(moves)):
+            clutter = clutter.with_patch(mirror.patch, number)
+            words += _over(number, known)
+        trial = replace(scene, planes=torch.cat([scene.planes, planes]), words=tuple(words), clutter=clutter)
+        paths = trial.unfolding.paths(self.rows.position)
+        screens = Screens.of(clutter, trial.planes, len(words))
+        owner = torch.arange(len(words)) // len(_over(0, known))
+        others = torch.arange(len(moves))[:, None] != owner
+        screens.patched[len(scene.clutter.plane) :, :, 0] &= ~others
+        seen = screens.shade(paths) * paths.valid
+        turn = torch.polar(torch.ones(()), self.accord.expected(self.phased.phase[0], trial.words))
+        scores = explained.score(steering(self.rows, trial.sources) * seen.T * turn)
+        total = scores.view(len(moves), -1).sum(1)
+        best = int(total.argmax())
+        return SmallMirror(planes[best], mirror.patch, float(total[best]))
 
     def _with_mirror(self, mirror: SmallMirror) -> tuple[Scene, list[Word]]:
         scene = self.scene
         number, known = len(scene.planes), walls(scene.planes, scene.words)
-        words: list[Word] = [(number,), *((w, number) for w in known), *((number, w) for w in known)]
         trial = replace(
             scene,
             planes=torch.cat([scene.planes, mirror.plane[None]]),
             clutter=scene.clutter.with_patch(mirror.patch, number),
         )
-        return trial, words
+        return trial, _over(number, known)
 
     def _hang(self, mirror: SmallMirror) -> bool:
         """Try a small mirror with the words over it that pay."""
@@ -297,3 +330,8 @@ class _Furnisher:
                 break
             kept = [k for k in range(len(self.scene.words)) if k != worst]
             self._stand(replace(self.phased, scene=self.scene.only(kept), phase=self.phased.phase[kept]))
+
+
+def _over(number: int, known: list[int]) -> list[Word]:
+    """Words of a plane: itself, after and before each wall."""
+    return [(number,), *((wall, number) for wall in known), *((number, wall) for wall in known)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import product
 
 import torch
 from torch import Tensor
@@ -25,6 +26,7 @@ LEAST_SIDE = 0.05  # [m]
 PARALLEL = 0.999  # cosine of normals that are one
 CELL = 0.35  # [m] of the raster on which small mirrors are looked for
 STEP = 0.08  # of a wavelength, between planes tried
+LONGEST = 6  # cells along each side of a rectangle
 TINY = 4  # receivers that a small mirror must serve
 
 
@@ -126,7 +128,7 @@ def find_mirrors(
     """Small mirrors parallel to walls, best first.
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its words (itself, after and
-    before each wall) are collected in a raster of where it is met; integral images give all rectangles.
+    before each wall) are collected in a raster of where it is met; integral images give every rectangle.
 
     Args:
         rows: n.
@@ -150,14 +152,18 @@ def find_mirrors(
     return _apart(found, 0.5 * wavelength)[:most]
 
 
+def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
+    """Whether two mirrors are parallel, closer than `apart` [m] and overlap."""
+    if (one.plane[:3] @ other.plane[:3]).abs() < PARALLEL or (one.plane[3] - other.plane[3]).abs() > apart:
+        return False
+    low, high = torch.maximum(one.patch, other.patch)[:2], torch.minimum(one.patch, other.patch)[2:]
+    return bool((high > low).all())
+
+
 def _apart(found: list[SmallMirror], least: float) -> list[SmallMirror]:
     kept: list[SmallMirror] = []
     for mirror in sorted(found, key=lambda m: -m.score):
-        if all(
-            (mirror.plane[:3] @ other.plane[:3]).abs() < PARALLEL
-            or (mirror.plane[3] - other.plane[3]).abs() > least
-            for other in kept
-        ):
+        if not any(same_mirror(mirror, other, least) for other in kept):
             kept.append(mirror)
     return kept
 
@@ -186,32 +192,23 @@ def _raster(
             into.append(_binned(values * inside, index, cells))
         power.append(_binned(wave.abs().square() * scale * inside, index, cells))
         served.append(_binned(inside.float(), index, cells))
+    sums = [_integral(torch.stack(t)) for t in (matched[::2], matched[1::2], power, served)]
     total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
-    tables = [torch.stack(t).flatten(0, 0) for t in (matched[::2], matched[1::2], power, served)]
-    sums = [_integral(t) for t in tables]
-    for u0 in range(cells[0]):
-        for u1 in range(u0 + 1, cells[0] + 1):
-            for v0 in range(cells[1]):
-                area = [
-                    s[..., u1, v0 + 1 :] - s[..., u0, v0 + 1 :] - s[..., u1, v0, None] + s[..., u0, v0, None]
-                    for s in sums
-                ]
-                score = (area[0].square() + area[1].square()) / area[2].clamp_min(1e-3) / 2
-                score = torch.where(area[3] >= TINY, score, torch.zeros_like(score))
-                summed = (score - 1).clamp_min(0).sum(0)  # words add up: (C, v1)
-                value, at = summed.max(1)
-                corners = torch.stack(
-                    [
-                        low[0] + CELL * torch.full_like(value, u0),
-                        low[1] + CELL * torch.full_like(value, v0),
-                        low[0] + CELL * torch.full_like(value, u1),
-                        low[1] + CELL * (v0 + 1 + at).float(),
-                    ],
-                    1,
-                )
-                better = value > total
-                total = torch.where(better, value, total)
-                best = torch.where(better[:, None], corners, best)
+    for wide, high_by in product(range(1, min(LONGEST, cells[0]) + 1), range(1, min(LONGEST, cells[1]) + 1)):
+        real, imag, energy, count = (
+            s[..., wide:, high_by:] - s[..., :-wide, high_by:] - s[..., wide:, :-high_by]
+            + s[..., :-wide, :-high_by]
+            for s in sums
+        )  # fmt: skip
+        score = (real.square() + imag.square()) / energy.clamp_min(1e-3) / 2
+        summed = ((score - 1).clamp_min(0) * (count >= TINY)).sum(0)  # words add up: (C, u, v)
+        value, at = summed.flatten(1).max(1)
+        first = torch.stack([at // summed.shape[2], at % summed.shape[2]], 1)
+        span = torch.tensor([wide, high_by])
+        corners = torch.cat([low + CELL * first, low + CELL * (first + span)], 1)
+        better = value > total
+        total = torch.where(better, value, total)
+        best = torch.where(better[:, None], corners, best)
     return total, best
 
 
