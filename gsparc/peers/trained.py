@@ -22,6 +22,7 @@ from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.network import Network, Scene
 
+DEFAULT_BUDGET_S = 60.0
 FINAL_RATE = 0.02  # share of the initial learning rate that is left at the end
 WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
@@ -33,6 +34,7 @@ class TrainedPeer(Method):
     Args:
         budget_s: seconds of training in processor time per thread, so that a busy machine gives the same
             training (on a quiet one they are the clock's); the learning-rate schedule stretches to them.
+            None takes 60.
         max_steps: ends training earlier; null for no limit (with it a run repeats exactly).
         batch_size: samples per step.
         rate: Adam's learning rate where `rates` names no other.
@@ -46,12 +48,13 @@ class TrainedPeer(Method):
     def __init__(
         self,
         name: str,
-        budget_s: float = 60.0,
+        budget_s: float | None = None,
         max_steps: int | None = None,
         batch_size: int = 8,
         rate: float = 2e-3,
         seed: int = 0,
     ) -> None:
+        budget_s = DEFAULT_BUDGET_S if budget_s is None else budget_s
         if not budget_s > 0 or batch_size < 1:
             raise ValueError(
                 f"{name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {batch_size}"
