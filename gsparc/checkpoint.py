@@ -73,7 +73,7 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
         extra: tensors, numbers, strings, None, nested dicts and lists.
 
     Raises:
-        CheckpointError: something in the state is of another type; its place is named.
+        CheckpointError: something in the state is of another type, its place is named; or there is no room.
     """
     site = getattr(method, "site", None)
     if site is None:
@@ -113,9 +113,20 @@ def _write(path: Path, content: dict[str, Any]) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
-    except BaseException:
+    except BaseException as error:
         Path(partial).unlink(missing_ok=True)
+        if isinstance(error, (OSError, RuntimeError)):  # torch's writer makes the second of the first
+            raise CheckpointError(
+                f"{path}: cannot be written ({_why(error)}); what was there is kept"
+            ) from error
         raise
+
+
+def _why(error: BaseException | None) -> str:
+    """What the system said, under whatever a library wrapped around it."""
+    while error is not None and not isinstance(error, OSError):
+        error = error.__cause__ or error.__context__
+    return (error.strerror if error is not None else None) or "is the disk full?"
 
 
 def read(path: str | Path) -> Stored:

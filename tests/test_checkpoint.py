@@ -96,7 +96,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(fitted, tmp_path, m
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(torch, "save", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(CheckpointError, match="No space"):
         checkpoint.save(path, fitted[0])
     assert path.read_bytes() == before and [p.name for p in tmp_path.iterdir()] == ["m.ckpt"]
 

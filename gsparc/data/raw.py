@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import struct
 import zipfile
 import zlib
@@ -69,29 +70,43 @@ def read_raw(path: str | Path) -> Raw:
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
-    """Write `raw`, whole or not at all: to a partial file that is renamed when complete."""
+    """Write `raw`, whole or not at all: to a partial file that is renamed when complete.
+
+    Raises:
+        DataError: another ending, or there is no room; what was there is kept.
+    """
     path = Path(path)
+    if path.suffix.lower() not in (".npz", *HDF5_SUFFIXES):
+        raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5")
     partial = path.with_name(f".{path.name}.partial")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix.lower() == ".npz":
+    try:
+        _write(partial, raw)
+        os.replace(partial, path)
+    except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
+        partial.unlink(missing_ok=True)
+        said = re.search(r"error message = '([^']+)'", str(error))
+        why = said[1] if said else getattr(error, "strerror", None) or _one_line(error)
+        raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
+
+
+def _write(path: Path, raw: Raw) -> None:
+    if path.name.removesuffix(".partial").lower().endswith(".npz"):
         about = json.dumps({**raw.attributes, "units": raw.units}, ensure_ascii=False)
-        with partial.open("wb") as file:
+        with path.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, attributes=np.array(about), **raw.arrays)
-    elif path.suffix.lower() in HDF5_SUFFIXES:
-        # Checksums and text of fixed length: libhdf5 crashes or hangs on damage that it cannot see.
-        with h5py.File(partial, "w", libver=("v110", "v110")) as file:
-            for name, array in raw.arrays.items():
-                data = np.char.encode(array, "utf-8") if array.dtype.kind == "U" else array
-                if data.dtype.kind == "S":
-                    data = data.astype(h5py.string_dtype("utf-8", data.dtype.itemsize))
-                stored = file.create_dataset(name, data=data, fletcher32=data.ndim > 0 and data.size > 0)
-                if name in raw.units:
-                    stored.attrs["units"] = np.bytes_(raw.units[name], "utf-8")
-            for name, value in raw.attributes.items():
-                file.attrs[name] = np.bytes_(value, "utf-8") if isinstance(value, str) else value
-    else:
-        raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5")
-    os.replace(partial, path)
+        return
+    # Checksums and text of fixed length: libhdf5 crashes or hangs on damage that it cannot see.
+    with h5py.File(path, "w", libver=("v110", "v110")) as file:
+        for name, array in raw.arrays.items():
+            data = np.char.encode(array, "utf-8") if array.dtype.kind == "U" else array
+            if data.dtype.kind == "S":
+                data = data.astype(h5py.string_dtype("utf-8", data.dtype.itemsize))
+            stored = file.create_dataset(name, data=data, fletcher32=data.ndim > 0 and data.size > 0)
+            if name in raw.units:
+                stored.attrs["units"] = np.bytes_(raw.units[name], "utf-8")
+        for name, value in raw.attributes.items():
+            file.attrs[name] = np.bytes_(value, "utf-8") if isinstance(value, str) else value
 
 
 def _read_npz(path: Path) -> Raw:

@@ -1,0 +1,118 @@
+"""Runs in a process of their own that may be killed: forked from a server that has imported everything once.
+
+Equivalent to starting the command and killing it, except that 50 kills do not cost 50 imports of torch.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import random
+import resource
+import signal
+import time
+from pathlib import Path
+
+from ledger import LEDGER
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(
+    ["crashes", "campaigns", "gsparc.training", "gsparc.learned", "gsparc.callbacks"]
+)
+
+
+def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
+    """`train.py` with these overrides into `folder`; errors are one line in `error.txt`."""
+    import torch
+    from campaigns import compose
+
+    from gsparc.cli import one_line
+    from gsparc.training import train
+
+    torch.set_num_threads(1)
+    with Limited(most_bytes):
+        try:
+            train(compose(*overrides), Path(folder))
+        except Exception as error:
+            Path(folder, "error.txt").write_text(one_line(error))
+            os._exit(1)
+    os._exit(0)
+
+
+def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
+    """`python -m gsparc.simulate` of a box room in many small shards."""
+    from gsparc.cli import one_line
+    from gsparc.simulate.campaign import simulate
+
+    with Limited(most_bytes):
+        try:
+            simulate(small_campaign(rows), Path(out))
+        except Exception as error:
+            Path(out).with_suffix(".txt").write_text(one_line(error))
+            os._exit(1)
+    os._exit(0)
+
+
+def small_campaign(rows: int):
+    """`rows` receivers in a box, four to a shard; spectra of 18 x 36."""
+    from gsparc.simulate.effects import Effects
+    from gsparc.simulate.scenes.build import SceneSettings
+    from gsparc.simulate.settings import Campaign
+    from gsparc.simulate.spectrum import SpectrumSettings
+
+    scene = SceneSettings(
+        name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
+        num_receivers=rows, carrier_hz=2.4e9, bandwidth_hz=40e6, subcarriers=4,
+        room={"size_m": [6, 5, 3], "reflection": -0.6, "boxes_m": [[[2.6, 2.2, 0], [3.0, 2.6, 3]]]},
+    )  # fmt: skip
+    effects = Effects(
+        refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
+    )
+    spectrum = SpectrumSettings(height=18, width=36, rows=4, columns=4)
+    return Campaign(scene=scene, effects=effects, spectrum=spectrum, shard=4)
+
+
+class Limited:
+    """No file may grow beyond so many bytes: what a full disk does, without filling one. 0 is no limit."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self.most = most_bytes
+
+    def __enter__(self) -> None:
+        self.before = resource.getrlimit(resource.RLIMIT_FSIZE)
+        if self.most:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (self.most, self.before[1]))
+
+    def __exit__(self, *unused: object) -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, self.before)
+
+
+def run(target, *arguments) -> tuple[int, float]:
+    """Exit code and seconds of an undisturbed run."""
+    child = CONTEXT.Process(target=target, args=arguments)
+    began = time.monotonic()
+    child.start()
+    child.join(timeout=300)
+    return int(child.exitcode if child.exitcode is not None else -1), time.monotonic() - began
+
+
+def killed(target, *arguments, after_s: float) -> bool:
+    """SIGKILL a run after so many seconds; False when it had ended by itself."""
+    child = CONTEXT.Process(target=target, args=arguments)
+    child.start()
+    child.join(timeout=after_s)
+    if child.exitcode is not None:
+        assert child.exitcode == 0, f"it failed by itself: {child.exitcode}"
+        return False
+    os.kill(child.pid, signal.SIGKILL)
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    LEDGER.count("kills")
+    return True
+
+
+def moments(count: int, longest_s: float, seed: int) -> list[float]:
+    """Random moments of a run of that length [s]."""
+    draw = random.Random(seed)
+    return [draw.uniform(0.02, longest_s) for _ in range(count)]

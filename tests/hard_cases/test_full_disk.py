@@ -1,0 +1,90 @@
+"""Full disk: a checkpoint or a dataset that no longer fits.
+
+Remedy: written beside and renamed, so that the good one survives; the error is one line that says which file
+(gsparc/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which fails like a full
+disk does: in the middle of writing. Naive: writing in place loses the good one first.
+"""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import pytest
+import torch
+from campaigns import brief, spectra
+from crashes import Limited, run, simulation, training
+
+from gsparc import checkpoint
+from gsparc.checkpoint import CheckpointError
+
+
+@pytest.fixture
+def fitted(campaign, folds, tmp_path):
+    from gsparc.peers.gp import GaussianProcess
+
+    method = GaussianProcess()
+    method.fit(campaign("spectrum", 30), folds(30).folds[0], tmp_path)
+    return method
+
+
+def left(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted)
+    before, names = path.read_bytes(), left(tmp_path)
+    with (
+        Limited(len(before) // 2),
+        pytest.raises(CheckpointError, match=r"m\.ckpt: cannot be written \(") as e,
+    ):
+        checkpoint.save(path, fitted)
+    assert "\n" not in str(e.value) and path.read_bytes() == before and left(tmp_path) == names
+
+
+def test_no_space_is_said_so(fitted, tmp_path, monkeypatch):
+    def full(*unused, **named):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(CheckpointError, match=r"m\.ckpt: cannot be written \(No space left on device\)"):
+        checkpoint.save(tmp_path / "m.ckpt", fitted)
+    assert left(tmp_path) == []
+
+
+@pytest.mark.slow
+def test_training_stops_with_one_line_and_goes_on_when_there_is_room(tmp_path):
+    settings = brief(spectra(tmp_path / "own.npz"), "trainer.checkpoint_every=5", "model.refit=false")
+    folder = tmp_path / "run"
+    assert run(training, str(folder), settings)[0] == 0
+    good, size = (folder / "last.ckpt").read_bytes(), (folder / "last.ckpt").stat().st_size
+    code, _ = run(training, str(folder), [*settings, "trainer.max_steps=40"], size // 2)
+    said = (folder / "error.txt").read_text()
+    assert code == 1 and "last.ckpt: cannot be written (" in said and "\n" not in said, said
+    assert (folder / "last.ckpt").read_bytes() == good
+    on = [*settings, "trainer.max_steps=40", f"ckpt_path={folder / 'last.ckpt'}"]
+    assert run(training, str(folder), on)[0] == 0
+    assert checkpoint.read(folder / "last.ckpt").extra["trainer"]["global_step"] == 40
+
+
+def test_simulation_keeps_its_finished_shards(tmp_path):
+    whole, out = tmp_path / "whole.h5", tmp_path / "box.h5"
+    assert run(simulation, str(whole), 20)[0] == 0
+    code, _ = run(simulation, str(out), 20, int(0.9 * whole.stat().st_size))
+    said = out.with_suffix(".txt").read_text()
+    assert code == 1 and "box.h5: cannot be written (File too large)" in said and "\n" not in said, said
+    assert left(tmp_path) == ["box.h5.parts", "box.txt", "whole.h5"]
+    assert len(list((tmp_path / "box.h5.parts").glob("shard_*.npz"))) == 5
+    assert run(simulation, str(out), 20)[0] == 0 and out.read_bytes()
+
+
+def test_writing_in_place_breaks(tmp_path):
+    """Naive: open the good file for writing, then run out of space."""
+    path = tmp_path / "m.ckpt"
+    path.write_bytes(bytes(10_000))
+    with Limited(5_000), pytest.raises(OSError), path.open("wb") as file:
+        file.write(bytes(10_000))
+        file.flush()
+    assert path.stat().st_size < 10_000

@@ -1,0 +1,136 @@
+"""Kills: SIGKILL at random moments of training and of simulation.
+
+Remedy: every file appears by renaming (gsparc/checkpoint.py, gsparc/simulate/shards.py); everything a run needs
+to go on is in its last checkpoint, or in its finished shards. Shown: after any kill what is there is whole;
+going on always works; the end is bit-identical to an uninterrupted run's. Tolerance: none. Naive: a file written
+in place is cut short by the kill.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, spectra
+from crashes import killed, moments, run, simulation, training
+
+from gsparc import checkpoint
+
+STEPS = 42  # a multiple of 7: the last checkpoint of a stage is its end
+SETTINGS = (
+    f"trainer.max_steps={STEPS}",
+    "trainer.checkpoint_every=7",  # in the middle of an interval
+    "trainer.val_every=20",
+    "callbacks=densify",
+    "callbacks.densify.start=10",
+    "callbacks.densify.interval=10",
+    "callbacks.densify.stop=35",
+    "callbacks.densify.grad_threshold=1e-5",
+    "callbacks.densify.max_gaussians=200",
+    "callbacks.reset.interval=25",
+)
+ROWS = 60
+
+
+def last_checkpoint(folder: Path) -> list[str]:
+    """The override that goes on: from the refit when it has begun to leave checkpoints."""
+    found = [p for p in (folder / "refit" / "last.ckpt", folder / "last.ckpt") if p.exists()]
+    return [f"ckpt_path={found[0]}"] if found else []
+
+
+def assert_whole(folder: Path) -> None:
+    """Whatever a kill left under its own name is complete; partial files have other names."""
+    for path in folder.rglob("*"):
+        if path.name.startswith(".") or path.name.endswith(".partial"):
+            continue
+        if path.suffix == ".ckpt":
+            checkpoint.read(path)
+        elif path.suffix == ".json":
+            json.loads(path.read_text())
+        elif path.suffix == ".npz":
+            assert zipfile.is_zipfile(path) and np.load(path).files
+        elif path.suffix == ".h5":
+            with h5py.File(path) as file:
+                assert len(file["rx_position"]) == ROWS
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, torch.Tensor):
+        return torch.equal(a, b)
+    if isinstance(a, dict):
+        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
+    if isinstance(a, (list, tuple)):
+        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
+    return a == b
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A training nobody disturbed, its data and its length."""
+    folder = tmp_path_factory.mktemp("kills")
+    settings = brief(spectra(folder / "own.npz"), *SETTINGS)
+    code, seconds = run(training, str(folder / "whole"), settings)
+    assert code == 0
+    return folder / "whole", settings, seconds
+
+
+@pytest.mark.parametrize("chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 7))])
+def test_training_killed_again_and_again(trained, tmp_path, chain):
+    """Four kills in a row, each of a run that goes on from what the one before it left."""
+    whole, settings, seconds = trained
+    for moment in moments(4, seconds, seed=chain):
+        if not killed(training, str(tmp_path), [*settings, *last_checkpoint(tmp_path)], after_s=moment):
+            break
+        assert_whole(tmp_path)
+    code, _ = run(training, str(tmp_path), [*settings, *last_checkpoint(tmp_path)])
+    assert code == 0, (tmp_path / "error.txt").read_text()
+    one, two = (checkpoint.read(folder / "model.ckpt").state for folder in (whole, tmp_path))
+    assert same(one, two)
+    figures = [json.loads((folder / "summary.json").read_text()) for folder in (whole, tmp_path)]
+    assert figures[0]["test/psnr_db"] == figures[1]["test/psnr_db"]
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    """A simulation nobody disturbed, and its length."""
+    out = tmp_path_factory.mktemp("kills") / "box.h5"
+    code, seconds = run(simulation, str(out), ROWS)
+    assert code == 0
+    return out, seconds
+
+
+@pytest.mark.parametrize("chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 6))])
+def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
+    whole, seconds = simulated
+    out = tmp_path / "box.h5"
+    for moment in moments(5, seconds, seed=100 + chain):
+        if not killed(simulation, str(out), ROWS, after_s=moment):
+            break
+        assert_whole(tmp_path)
+    if not out.exists():
+        code, _ = run(simulation, str(out), ROWS)
+        assert code == 0, out.with_suffix(".txt").read_text()
+    with h5py.File(whole) as one, h5py.File(out) as two:
+        assert set(one) == set(two)
+        assert all(np.array_equal(one[name][()], two[name][()]) for name in one)
+    assert not (tmp_path / "box.h5.parts").exists()
+
+
+def test_writing_in_place_breaks(tmp_path):
+    """Naive: the file under its own name while it is being written; a kill half way leaves half a file."""
+    path = tmp_path / "last.ckpt"
+    child = os.fork()
+    if child == 0:
+        with path.open("wb") as file:
+            file.write(b"PK\x03\x04" + bytes(1000))
+            file.flush()
+            os.kill(os.getpid(), 9)
+    os.waitpid(child, 0)
+    with pytest.raises(checkpoint.CheckpointError, match="cut short"):
+        checkpoint.read(path)
