@@ -4,6 +4,9 @@
 one orientation and one gain give the phase, its slope over the elements and the moving direction of arrival
 of a path for every x. Mirroring in a plane with normal n takes (p, Q) to (p', (1 - 2 n n^T) Q): the images of
 Allen and Berkley (1979), taken of the receiving end.
+
+A scatterer at p is another kind of source: two legs, `g exp(-j k (d1 + d2)) / (d1 d2)`, the second from p to
+the true array, so that its direction of arrival stays where it is.
 """
 
 from __future__ import annotations
@@ -24,15 +27,26 @@ class MirroredArrays(nn.Module):
         frames: (N, 3, 3) orthogonal Q_i, receiver frame to world; determinant -1 after an odd number of
             mirrors.
         gains: (N,) complex.
+        scattering: (N,) bool, sources that are scatterers (their frames mean nothing); None when none is. The
+            first source is the array itself.
     """
 
     array: Tensor
     frames: Tensor
+    scattering: Tensor
 
     def __init__(
-        self, array: Tensor, wavelength: float, positions: Tensor, frames: Tensor, gains: Tensor
+        self,
+        array: Tensor,
+        wavelength: float,
+        positions: Tensor,
+        frames: Tensor,
+        gains: Tensor,
+        scattering: Tensor | None = None,
     ) -> None:
         super().__init__()
+        none = torch.zeros(len(positions), dtype=torch.bool)
+        self.register_buffer("scattering", none if scattering is None else scattering)
         self.wavelength = wavelength
         self.register_buffer("array", array.double())
         self.register_buffer("frames", frames.double())
@@ -49,12 +63,18 @@ class MirroredArrays(nn.Module):
     def paths(self, x: Tensor) -> Tensor:
         """Unit-gain vectors (B, N, M) complex128 of transmitters at (B, 3) [m]."""
         elements = self.positions[:, None] + self.array @ self.orthogonal().transpose(1, 2)
-        return spherical(x.double(), elements, self.wavelength)
+        seen = spherical(x.double(), elements, self.wavelength)
+        if not self.scattering.any():
+            return seen
+        both = two_legs(x.double(), self.positions, elements[0], self.wavelength)
+        return torch.where(self.scattering[:, None], both, seen)
 
     def arrival(self, x: Tensor) -> Tensor:
         """Directions of arrival (B, N, 3), unit vectors in the receiver's frame."""
-        seen = (x.double()[:, None] - self.positions)[:, :, None] @ self.orthogonal()
-        return nn.functional.normalize(seen.squeeze(2), dim=-1)
+        q = self.orthogonal()
+        seen = ((x.double()[:, None] - self.positions)[:, :, None] @ q).squeeze(2)
+        fixed = (self.positions - self.positions[0]) @ q[0]
+        return nn.functional.normalize(torch.where(self.scattering[:, None], fixed, seen), dim=-1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Array vectors h (B, M) complex128 at (B, 3) [m]."""
@@ -78,7 +98,7 @@ class MirroredArrays(nn.Module):
         keep[0] = True
         return MirroredArrays(
             self.array, self.wavelength, self.positions[keep], self.orthogonal()[keep],
-            torch.view_as_complex(self.gains[keep].contiguous()),
+            torch.view_as_complex(self.gains[keep].contiguous()), self.scattering[keep],
         )  # fmt: skip
 
 
@@ -87,6 +107,13 @@ def spherical(x: Tensor, elements: Tensor, wavelength: float) -> Tensor:
     distance = torch.linalg.vector_norm(x[:, None, None] - elements, dim=-1).clamp_min(1e-3)
     cycles = torch.remainder(distance / wavelength, 1.0)
     return torch.polar(1 / distance, -2 * math.pi * cycles)
+
+
+def two_legs(x: Tensor, points: Tensor, elements: Tensor, wavelength: float) -> Tensor:
+    """`exp(-j k (d1 + d2)) / (d1 d2)` (B, N, M): from (B, 3) by points (N, 3) to elements (M, 3) [m]."""
+    before = spherical(x, points[:, None], wavelength)
+    after = spherical(points, elements[None], wavelength)[:, 0]
+    return before * after
 
 
 def mirror(position: Tensor, frame: Tensor, image: Tensor) -> Tensor:

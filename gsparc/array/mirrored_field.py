@@ -201,7 +201,8 @@ class MirroredField(Method):
         count = len(state["sources"]["positions"])
         blank = (torch.zeros(count, 3), torch.zeros(count, 3, 3), torch.zeros(count))
         self.model = MirroredArrays(torch.from_numpy(site.array), site.wavelength, *blank)
-        self.model.load_state_dict(state["sources"])
+        none = torch.zeros(count, dtype=torch.bool)  # files written before there were scatterers
+        self.model.load_state_dict({"scattering": none, **state["sources"]})
         self.model.requires_grad_(False)
         self.site, self.background, self.share = site, state["background"], float(state["share"])
         self.renderer = SpectrumRenderer(site, self.background)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.array.mirrored import MirroredArrays, mirror, rotation, spherical
+from gsparc.array.mirrored import MirroredArrays, mirror, rotation, spherical, two_legs
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +31,7 @@ class SearchSettings:
         candidates: drawn per source.
         polished: best candidates that are moved by gradient.
         patience: additions without progress on validation samples before the search ends.
+        scatterers: propose scatterers beside mirrored arrays; of the two the one that explains more is added.
     """
 
     sources: int = 24
@@ -38,6 +39,7 @@ class SearchSettings:
     candidates: int = 4000
     polished: int = 24
     patience: int = 4
+    scatterers: bool = True
 
 
 def best_gains(paths: Tensor, unit: Tensor) -> tuple[Tensor, float]:
@@ -100,17 +102,15 @@ def find_sources(
             settings.candidates, 3, generator=generator, dtype=torch.float64
         )
         current = model(x).detach()
-        scores = torch.cat(
-            [_gain(part, base, array, wavelength, x, unit, current) for part in drawn.split(500)]
-        )
-        top = drawn[scores.topk(min(settings.polished, len(drawn))).indices]
-        top, turns, final = _polished(top, base, array, wavelength, x, unit, current)
-        pick = int(final.argmax())
-        place = top[pick : pick + 1]
-        turned = rotation(turns[pick : pick + 1]) @ mirror(*base, place)
+        true = position + array @ frame.T
+        kinds = [None, true] if settings.scatterers else [None]
+        found = [_best(drawn, base, array, wavelength, x, unit, current, settings, kind) for kind in kinds]
+        which = max(range(len(found)), key=lambda i: found[i][2])
+        place, turned, _ = found[which]
         positions = torch.cat([model.positions.detach(), place])
         frames = torch.cat([model.orthogonal().detach(), turned])
-        model = _fitted(array, wavelength, positions, frames, x, unit)
+        scattering = torch.cat([model.scattering, torch.tensor([which == 1])])
+        model = _fitted(array, wavelength, positions, frames, x, unit, scattering)
         refine(model, x, unit, steps=20)
         now = judged(model)
         if now > score + PROGRESS:
@@ -123,7 +123,10 @@ def find_sources(
     refine(refined, x, unit, steps=100)
     if judged(refined) > score:
         best, score = refined, judged(refined)
-    log.info("%d mirrored arrays explain %.1f %% of validation vectors", len(best.positions), 100 * score)
+    log.info(
+        "%d mirrored arrays and %d scatterers explain %.1f %% of validation vectors",
+        int((~best.scattering).sum()), int(best.scattering.sum()), 100 * score,
+    )  # fmt: skip
     return best
 
 
@@ -148,10 +151,37 @@ def _unit(vectors: Tensor) -> Tensor:
     return vectors / vectors.abs().square().sum(1, keepdim=True).sqrt().clamp_min(1e-30)
 
 
+def _best(
+    drawn: Tensor,
+    base: tuple[Tensor, Tensor],
+    array: Tensor,
+    wavelength: float,
+    x: Tensor,
+    unit: Tensor,
+    current: Tensor,
+    settings: SearchSettings,
+    true: Tensor | None,
+) -> tuple[Tensor, Tensor, float]:
+    """Place (1, 3), frame (1, 3, 3), score of the best candidate; with `true` elements, of a scatterer."""
+    known = (base, array, wavelength, x, unit, current)
+    scores = torch.cat([_gain(part, *known, true=true) for part in drawn.split(500)])
+    top = drawn[scores.topk(min(settings.polished, len(drawn))).indices]
+    top, turns, final = _polished(top, *known, true=true)
+    pick = int(final.argmax())
+    place = top[pick : pick + 1]
+    return place, rotation(turns[pick : pick + 1]) @ mirror(*base, place), float(final[pick])
+
+
 def _fitted(
-    array: Tensor, wavelength: float, positions: Tensor, frames: Tensor, x: Tensor, unit: Tensor
+    array: Tensor,
+    wavelength: float,
+    positions: Tensor,
+    frames: Tensor,
+    x: Tensor,
+    unit: Tensor,
+    scattering: Tensor | None = None,
 ) -> MirroredArrays:
-    model = MirroredArrays(array, wavelength, positions, frames, torch.ones(len(positions)))
+    model = MirroredArrays(array, wavelength, positions, frames, torch.ones(len(positions)), scattering)
     with torch.no_grad():
         model.gains.copy_(torch.view_as_real(best_gains(model.paths(x), unit)[0]))
     return model
@@ -166,14 +196,19 @@ def _gain(
     unit: Tensor,
     current: Tensor,
     turns: Tensor | None = None,
+    true: Tensor | None = None,
 ) -> Tensor:
     """Share explained (K,) by the present field and one more source at each of `places` (K, 3), gains free.
 
-    The 2 x 2 case of `best_gains` for K candidates at once.
+    The 2 x 2 case of `best_gains` for K candidates at once: mirrored arrays, or scatterers before the `true`
+    elements (M, 3).
     """
-    frames = mirror(*base, places)
-    frames = frames if turns is None else rotation(turns) @ frames
-    paths = spherical(x, places[:, None] + array @ frames.transpose(1, 2), wavelength)
+    if true is None:
+        frames = mirror(*base, places)
+        frames = frames if turns is None else rotation(turns) @ frames
+        paths = spherical(x, places[:, None] + array @ frames.transpose(1, 2), wavelength)
+    else:
+        paths = two_legs(x, places, true, wavelength)
     a11, a22 = current.abs().square().sum(), paths.abs().square().sum((0, 2))
     a12 = torch.einsum("bm,bkm->k", current.conj(), paths)
     own = (current.conj() * unit).sum(1)
@@ -196,6 +231,7 @@ def _polished(
     x: Tensor,
     unit: Tensor,
     current: Tensor,
+    true: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Places, turns and scores (K,) after a short ascent of each candidate on its own."""
     places = places.clone().requires_grad_()
@@ -203,8 +239,8 @@ def _polished(
     optimizer = torch.optim.Adam([{"params": [places], "lr": 0.1}, {"params": [turns], "lr": 0.01}])
     for _ in range(20):
         optimizer.zero_grad()
-        (-_gain(places, base, array, wavelength, x, unit, current, turns).sum()).backward()
+        (-_gain(places, base, array, wavelength, x, unit, current, turns, true).sum()).backward()
         optimizer.step()
     with torch.no_grad():
-        final = _gain(places, base, array, wavelength, x, unit, current, turns)
+        final = _gain(places, base, array, wavelength, x, unit, current, turns, true)
     return places.detach(), turns.detach(), final

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from known_arrays import RECEIVER, TURN, WAVELENGTH, room_vectors, walk
 
@@ -132,3 +133,53 @@ def test_search_finds_the_walls_of_a_room():
         found = float(explained(model(x[test]), unit).mean())
         alone = float(explained(direct(x[test]), unit).mean())
     assert found > 0.9 and alone < 0.8
+
+
+SCATTERERS = np.array([[3.5, 3.0, 1.5], [4.0, 0.8, 0.7]])
+
+
+def _scattered(tx: np.ndarray) -> np.ndarray:
+    """Array vectors of free space and two scatterers, written out: both legs, 1 / (d1 d2)."""
+    elements = RECEIVER + planar_array() @ TURN.T
+    direct = np.linalg.norm(tx[:, None] - elements[None], axis=-1)
+    h = np.exp(-2j * np.pi * direct / WAVELENGTH) / direct
+    before = np.linalg.norm(tx[:, None] - SCATTERERS[None], axis=-1)[:, :, None]
+    after = np.linalg.norm(SCATTERERS[:, None] - elements[None], axis=-1)[None]
+    return h + 0.9 * (np.exp(-2j * np.pi * (before + after) / WAVELENGTH) / before / after).sum(1)
+
+
+def test_scatterers_have_two_legs_and_a_direction_of_arrival_that_stays():
+    array, tx = torch.from_numpy(planar_array()), walk(6)
+    places = torch.from_numpy(np.concatenate([RECEIVER[None], SCATTERERS]))
+    model = MirroredArrays(
+        array, WAVELENGTH, places, torch.from_numpy(TURN).expand(3, 3, 3), torch.tensor([1.0, 0.9, 0.9]),
+        torch.tensor([False, True, True]),
+    )  # fmt: skip
+    with torch.no_grad():
+        np.testing.assert_allclose(model(torch.from_numpy(tx)).numpy(), _scattered(tx), atol=1e-12)
+        arrival = model.arrival(torch.from_numpy(tx)).numpy()
+    assert np.ptp(arrival[:, 1:], axis=0).max() < 1e-12 < np.ptp(arrival[:, 0], axis=0).max()
+    towards = (SCATTERERS - RECEIVER) @ TURN
+    np.testing.assert_allclose(arrival[0, 1:], towards / np.linalg.norm(towards, axis=1)[:, None], atol=1e-12)
+    kept = model.pruned(torch.from_numpy(tx), 1e-9)
+    assert kept.scattering.tolist() == [False, True, True]
+
+
+@pytest.mark.slow
+def test_scatterers_are_proposed_where_they_are_and_not_where_walls_are():
+    tx = walk(60, step=0.025)
+    x, array = torch.from_numpy(tx), torch.from_numpy(planar_array())
+    receiver = (torch.from_numpy(RECEIVER), torch.from_numpy(TURN))
+    cut = slice(0, 48), slice(48, 60)
+    settings = SearchSettings(sources=4, candidates=1500, polished=16, reach=3.0, patience=2)
+    for vectors, scatter in ((_scattered(tx), True), (room_vectors(tx, 1, planar_array())[0], False)):
+        v = torch.from_numpy(vectors)
+        model = find_sources(
+            array, WAVELENGTH, receiver, x[cut[0]], v[cut[0]], (x[cut[1]], v[cut[1]]), settings, seed=0
+        )
+        if scatter:
+            found = model.positions.detach().numpy()[model.scattering]
+            nearest = np.linalg.norm(SCATTERERS[:, None] - found[None], axis=-1).min(1)
+            assert nearest.min() < 0.3 * WAVELENGTH
+        else:
+            assert (~model.scattering).sum() > model.scattering.sum()
