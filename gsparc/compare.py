@@ -21,7 +21,7 @@ from gsparc import cli
 from gsparc.baselines import platform_cache
 from gsparc.comparison import figure, table
 from gsparc.comparison.cells import Cell, contenders, plan
-from gsparc.comparison.fitting import Filled, Prepared, Room, fill, kept_in, open_room, prepare
+from gsparc.comparison.fitting import Filled, Prepared, Room, fill, kept_in, open_rooms, prepare
 from gsparc.comparison.latency import Latency, latencies
 from gsparc.summary import provenance, write_summary
 
@@ -62,12 +62,12 @@ def _rooms(settings: Mapping[str, Any]) -> list[Room]:
     present = {name: paths for name, paths in settings["datasets"].items() if name not in absent}
     if not present:
         raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
-    rooms = []
-    for split in settings["splits"]:
-        for name, paths in present.items():
-            wanted = [str(p) for p in settings["only"]]
-            if not wanted or any(_may_match(p, name, split) for p in wanted):
-                rooms.append(open_room(name, paths, split))
+    wanted = [str(pattern) for pattern in settings["only"]]
+    rooms: list[Room] = []
+    for name, paths in present.items():
+        splits = [s for s in settings["splits"] if not wanted or any(_may_match(p, name, s) for p in wanted)]
+        rooms += open_rooms(name, paths, splits) if splits else []
+    rooms.sort(key=lambda room: settings["splits"].index(room.split))
     if not rooms:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
     return rooms

@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,11 +49,14 @@ class Room:
     folds: Split
 
 
-def open_room(dataset: str, settings: dict[str, Any], split: str) -> Room:
-    """Load what `conf/dataset` and `conf/split` name, with the given paths."""
-    config = compose(dataset, settings, split, [])
-    data = load(_plain(config.dataset))
-    return Room(dataset, split, data, split_for(_plain(config.split), data))
+def open_rooms(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Room]:
+    """Load what `conf/dataset` names, with the given paths, once for all splits of `conf/split`."""
+    configs = [compose(dataset, settings, split, []) for split in splits]
+    data = load(_plain(configs[0].dataset))
+    return [
+        Room(dataset, split, data, split_for(_plain(config.split), data))
+        for split, config in zip(splits, configs, strict=True)
+    ]
 
 
 def compose(dataset: str, settings: dict[str, Any], split: str, overrides: list[str]) -> DictConfig:
