@@ -8,7 +8,8 @@ export OMP_WAIT_POLICY ?= passive
 SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup sionna cuda demo test test-slow bench lint typecheck format clean
+RFID ?= ../shared/data/rfid-s23-160
+.PHONY: browser results help setup sionna cuda demo test test-slow bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -40,7 +41,14 @@ demo: setup ## train on a small simulated site, print the table, draw the spectr
 test: setup ## fast tests (under 10 minutes on two cores)
 	$(RUN) -m pytest -m "not slow" --durations=10
 
-test-slow: setup sionna ## slow tests: whole training runs, kills, sanitizers, ray tracing
+browser: ## Debian's chromium for the test of the report, where packages can be reached
+	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || (apt-get update -qq && apt-get install -y -qq chromium chromium-driver) >/dev/null 2>&1 || echo "no chromium here: the test of the report in a browser is skipped"
+
+results: setup ## README's results table, measured anew (RFID=folder of the release; about ten minutes)
+	$(RUN) train.py -m experiment=results dataset.root=$(RFID) hydra.sweep.dir=outputs/results
+	$(RUN) -m gsparc.report outputs/results readme=README.md
+
+test-slow: setup sionna browser ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(RUN) -m pytest -m slow --durations=10
 
 bench: setup ## timings of the kernels as ratios

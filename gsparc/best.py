@@ -20,6 +20,7 @@ from gsparc.effects import (
     probe_array,
     probe_phase,
 )
+from gsparc.hybrid import Rest, learn_rest
 from gsparc.learned import LearnedField
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
@@ -58,6 +59,7 @@ class Gsparc(LearnedField):
         self._models = {"phase": phase_model, "array": array_model}
         self._probe = phase_probe
         self._chosen: str | None = None
+        self._rest: Rest | None = None
         self.decisions: tuple[Decision, ...] = ()
 
     @property
@@ -65,7 +67,9 @@ class Gsparc(LearnedField):
         """The effects that are computed, for `summary.json`."""
         response = self.settings.response
         splatted = [name for name, on in (("array", response.array), ("phase", response.carrier)) if on]
-        return self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
+        hybrid = "" if self._rest is None else "+hybrid"
+        chosen = self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
+        return chosen + hybrid
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Decide, then train what was decided on; the probe's time is part of the bill."""
@@ -81,9 +85,13 @@ class Gsparc(LearnedField):
             self._go_on(self._models[self._chosen])
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             budget_s = self.training.settings.budget_s
-            if budget_s is not None and hasattr(self._models[self._chosen], "budget_s"):
-                self._models[self._chosen].budget_s = budget_s - sum(d.seconds for d in self.decisions)
+            chosen = self._models[self._chosen]
+            if budget_s is not None and hasattr(chosen, "budget_s"):
+                chosen.budget_s = budget_s - sum(d.seconds for d in self.decisions)
             report = self._models[self._chosen].fit(data, fold, run_dir)
+            decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data)
+            log.info("%s", decision)
+            self.decisions = (*self.decisions, decision)
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
 
     def _go_on(self, model: Method) -> None:
@@ -109,13 +117,19 @@ class Gsparc(LearnedField):
         return phase, array
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
-        return super().predict(tx, rx) if self._chosen is None else self._models[self._chosen].predict(tx, rx)
+        """See `Method.predict`; the variance errs high by what a process of the rest explains."""
+        if self._chosen is None:
+            return super().predict(tx, rx)
+        said = self._models[self._chosen].predict(tx, rx)
+        if self._rest is None:
+            return said
+        return replace(said, mean=said.mean + self._rest.at(rx.position.reshape(-1, 3).expand(len(tx), 3)))
 
     def state(self) -> dict[str, Any]:
         """What was chosen, and its state."""
         inner = super().state() if self._chosen is None else self._models[self._chosen].state()
-        return {"chosen": self._chosen, "inner": inner}
+        rest = None if self._rest is None else self._rest.state()
+        return {"chosen": self._chosen, "inner": inner, "rest": rest}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
@@ -124,6 +138,8 @@ class Gsparc(LearnedField):
             super().restore(site, state["inner"])
         else:
             self._models[self._chosen].restore(site, state["inner"])
+        rest = state.get("rest")
+        self._rest = None if rest is None else Rest.restore(site, rest)
 
     def size(self) -> int:
         """Number of Gaussians or sources."""

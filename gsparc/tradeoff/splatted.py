@@ -91,7 +91,7 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
         if _linear(model):
             _keep(model, spread(model, measured)[: math.ceil(share * total)])
             with torch.no_grad():
-                model.gaussians.log_scales -= 0.5 * math.log(share)  # together they cover as much sky
+                model.gaussians.log_scales.sub_(0.5 * math.log(share))  # together they cover as much sky
             teach(model, method.fitted(), measured["receiver"])
         else:
             _keep(model, measured["contribution"].topk(math.ceil(share * total)).indices)

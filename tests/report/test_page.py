@@ -1,0 +1,143 @@
+"""The page holds everything itself, opens in a browser, sorts, and is legible on a phone."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from xml.etree import ElementTree
+
+import pytest
+from campaigns import compose
+from hydra.core.hydra_config import HydraConfig
+
+from gsparc.report import plots
+from gsparc.report.__main__ import arguments, task
+from gsparc.report.page import html, studies, warnings
+from gsparc.report.readme import BEGIN, END, refresh
+from gsparc.report.runs import find_runs
+
+FETCHED = re.compile(
+    r"""(?:src|href)\s*=\s*["'](?!data:|#)|@import|url\((?!#|["']?data:)|<link|<script[^>]+src"""
+)
+
+
+@pytest.fixture(scope="module")
+def written(three_for_all, tmp_path_factory):
+    out = tmp_path_factory.mktemp("report")
+    place = type("C", (), {"runtime": type("R", (), {"output_dir": out})})
+    config = compose(*arguments([str(path) for path in three_for_all]), config="report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HydraConfig, "get", lambda: place)
+        return task(config), out
+
+
+def test_it_writes_a_page_markdown_and_a_csv_file_per_table(written):
+    facts, out = written
+    text = (out / "report.html").read_text()
+    assert facts["report/runs"] == 3 and "toy, split random" in text and "The three worst receivers" in text
+    names = {path.stem for path in out.glob("*.csv")}
+    assert {"toy-split-random-results", "toy-split-random-the-whole-bill"} <= names and len(names) >= 5
+    assert (out / "report.md").read_text().count("### ") == len(names)
+    assert (out / "summary.json").exists()
+
+
+def test_the_page_fetches_nothing(written):
+    text = (written[1] / "report.html").read_text()
+    drawings = re.sub(r'xmlns(:\w+)?="[^"]*"|xlink:href="#[^"]*"', "", text)
+    assert not FETCHED.search(drawings)
+    ids = re.findall(r'\sid="([^"]+)"', text)
+    assert len(ids) == len(set(ids))  # several drawings share one page
+
+
+def test_what_a_run_is_called_cannot_become_a_script(run_dir, tmp_path):
+    run_dir(tmp_path / "x", name="<script>alert(1)</script>")
+    text = html("<b>", "now", studies(find_runs([tmp_path / "x"])))
+    assert "<script>alert" not in text and "<b>" not in text
+
+
+def test_every_plot_is_a_whole_drawing(three):
+    runs = find_runs(three)
+    drawn = [plots.pareto(runs), plots.accuracy_cdf(runs), plots.learning(runs), plots.bill(runs)]
+    drawn += [plots.measurements(runs), plots.confidence(runs)]
+    for figure in drawn:
+        assert figure is not None
+        assert ElementTree.fromstring(plots.svg(figure)).tag.endswith("svg")
+    assert plots.latency_cdf(runs) is None and plots.measurements(runs[:2]) is None
+
+
+def test_the_figure_that_ends_a_sweep(three, tmp_path):
+    plots.distributions(find_runs(three), "a title", tmp_path / "sweep.png")
+    assert (tmp_path / "sweep.png").stat().st_size > 20_000
+
+
+def test_a_busy_machine_is_said_once(three):
+    runs = find_runs(three)
+    for load, run in zip((1.5, 3.0, 0.2), runs, strict=True):
+        run.facts["machine/load"] = load
+    said = [text for text in warnings(runs) if "busy" in text]
+    assert said == ["the machine was busy (load 0.2 to 3.0 per core): times are inflated, ratios less so"]
+
+
+def test_paths_without_a_name_are_runs():
+    assert arguments(["a b", "c", "title=x", "--cfg"]) == ["title=x", "--cfg", "runs=['a b','c']"]
+    assert compose(*arguments(["it's, here"]), config="report").runs == ["it's, here"]
+
+
+def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
+    document = tmp_path / "README.md"
+    document.write_text(f"before\n{BEGIN}\nold\n{END}\nafter\n")
+    refresh(document, find_runs(three))
+    text = document.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
+    assert "28.20 [28.00, 28.40]" in text and "| gp |" in text and "a processor, 1 threads" in text
+    document.write_text("no marks")
+    with pytest.raises(ValueError, match="are needed, in this order"):
+        refresh(document, find_runs(three))
+    assert document.read_text() == "no marks"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("width", [1280, 360])
+def test_a_real_browser_opens_sorts_and_fits(written, width, browser):
+    browser.set_window_size(width, 900)
+    browser.get((written[1] / "report.html").as_uri())
+    assert browser.get_log("browser") == []  # no error, nothing that could not be fetched
+    assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
+    page = browser.execute_script("return document.documentElement.scrollWidth")
+    assert page <= browser.execute_script("return window.innerWidth")  # tables scroll, the page does not
+    table = browser.execute_script("return [...document.querySelectorAll('table')][1]")
+
+    def column(name):
+        heads = browser.execute_script(
+            "return [...arguments[0].tHead.rows[0].cells].map(c => c.innerText)", table
+        )
+        index = next(i for i, head in enumerate(heads) if head.startswith(name))
+        read = "return [...arguments[0].tBodies[0].rows].map(r => r.cells[arguments[1]].dataset.key)"
+        return index, browser.execute_script(read, table, index)
+
+    for sign in (1, -1):
+        index, _ = column("query ms p50")
+        browser.execute_script("arguments[0].tHead.rows[0].cells[arguments[1]].click()", table, index)
+        values = [float(value) for value in column("query ms p50")[1] if value]
+        assert values == sorted(values, key=lambda v: sign * v) and len(set(values)) > 2
+    size = "return parseFloat(getComputedStyle(document.querySelector('td')).fontSize)"
+    assert browser.execute_script(size) >= 12
+    shown = "return [...document.querySelectorAll('figure svg, figure img')].map(e => e.clientWidth)"
+    assert min(browser.execute_script(shown)) >= 280
+
+
+@pytest.fixture
+def browser():
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no chromium and chromedriver here: `make browser` installs Debian's")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for switch in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(switch)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(executable_path=driver)  # never looked for or fetched elsewhere
+    running = webdriver.Chrome(options=options, service=service)
+    yield running
+    running.quit()

@@ -1,0 +1,142 @@
+"""Tables say what the runs left, with intervals that cover and times beside."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+
+import numpy as np
+import pytest
+
+from gsparc.report import effects, learning, tables
+from gsparc.report.intervals import Interval, bootstrap, interval
+from gsparc.report.runs import columns, find_runs, told_apart
+from gsparc.report.table import Column, Table
+
+
+def cells(table, row: int) -> dict:
+    return dict(zip([c.name for c in table.columns], table.rows[row], strict=True))
+
+
+def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
+    runs = find_runs([three[0].parent])
+    assert [run.folder.name for run in runs] == ["a0", "a1", "b0"] and find_runs(three[:1])[0].facts[
+        "seed"
+    ] == 0
+    assert [run.setting for run in told_apart(runs)] == ["gsparc emission.hidden=8"] * 2 + [
+        "gsparc emission.hidden=64"
+    ]
+    assert {run.setting for run in told_apart(runs[:2])} == {"gsparc"}
+    assert list(tables.grouped(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
+
+
+@pytest.mark.parametrize("wrong", ["absent", "empty"])
+def test_a_directory_without_runs_is_named(wrong, tmp_path):
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=wrong):
+        find_runs([tmp_path / wrong])
+
+
+def test_a_damaged_summary_is_named(tmp_path):
+    (tmp_path / "summary.json").write_text("{")
+    with pytest.raises(ValueError, match=r"summary.json: cannot be read as a summary"):
+        find_runs([tmp_path])
+
+
+def test_results_have_accuracy_beside_time_memory_and_origin(three):
+    table = tables.results(find_runs(three))
+    row = cells(table, 0)
+    assert row["PSNR dB"].value == 28.0 and row["PSNR dB"].low < 28.0 < row["PSNR dB"].high
+    assert row["train s"] == 10 and row["query ms p50"] == 0.5 and row["memory MB"] == 800
+    assert (
+        row["Gaussians"] == 500
+        and row["effects"] == "none"
+        and row["data"] == "d" * 8
+        and row["commit"] == "c" * 8
+    )
+    named = [r[0] for r in table.rows]
+    assert named[3:] == ["mean", "gp"] and cells(table, 4)["query ms p50"] == 0.7
+
+
+def test_seeds_are_put_together_with_their_spread(three):
+    table = tables.seeds(find_runs(three))
+    found = cells(table, 0)["PSNR dB"]
+    assert (found.value, found.low, found.high) == (pytest.approx(28.2), 28.0, 28.4)
+    assert cells(table, 0)["seeds"] == 2 and cells(table, 1)["PSNR dB"] == Interval(29.5)
+
+
+def test_an_interval_covers_as_often_as_it_says():
+    draw = np.random.default_rng(0)
+    hits = 0
+    for _ in range(100):
+        low, high = bootstrap(draw.normal(5, 2, 40))
+        hits += low < 5 < high
+    assert 86 <= hits <= 100
+
+
+def test_an_interval_of_a_ratio_weighs_samples(three):
+    low, high = bootstrap(np.array([1.0, 1.0, 1.0]), np.array([10.0, 10.0, 10.0]))
+    assert low == high == pytest.approx(0.1)
+    assert interval(find_runs(three)[0], "no_such_figure") is None
+
+
+def test_time_to_accuracies_and_best_within_minutes(three):
+    runs = find_runs(three)
+    table = learning.within_minutes(runs)
+    first, last = cells(table, 0), cells(table, 2)
+    assert first["PSNR dB within 1 min"] == 27.0  # the curve ends at 28 - 1
+    assert last["PSNR dB within 1 min"] is None and last["PSNR dB within 5 min"] == 29.5  # 130 s in one piece
+    reached = [c for c in first if c.startswith("s to ")]
+    assert reached and all(first[c] is None or 0 < first[c] <= 10 for c in reached)
+
+
+def test_effects_are_paired_by_sample_and_seed(three):
+    table = effects.effects(find_runs(three))
+    row = cells(table, 0)
+    assert len(table.rows) == 1 and row["effect"] == "array" and row["train s more"] == 120
+    assert row["PSNR dB gained"].value == pytest.approx(1.5) and row["query ms more"] == pytest.approx(-0.3)
+    assert effects.effects(find_runs(three[:2])) is None
+
+
+def test_the_worst_receivers_are_the_worst(three):
+    runs = find_runs(three[:1])
+    table = tables.worst(runs)
+    values = [row[4] for row in table.rows]
+    assert values == sorted(runs[0].samples["psnr_db"])[:3]
+    assert table.rows[0][5] == pytest.approx(values[0] - 0.5)  # the Gaussian process at the same place
+
+
+def test_the_bill_counts_measurements_and_every_second(three):
+    row = cells(tables.bill(find_runs(three)), 2)
+    assert row["points measured"] == 60 and row["seconds trained"] == 130 and row["seconds simulated"] is None
+    assert row["ms a query"] == 0.2
+
+
+def test_a_table_survives_csv_and_markdown():
+    table = Table("T", [Column("name"), Column("x", ".1f"), Column("n", "d")], note="note")
+    table.add("a|b", Interval(1.25, 1.0, 2.0), 3)
+    table.add("c", None, None)
+    rows = list(csv.DictReader(io.StringIO(table.csv())))
+    assert (
+        rows[0] == {"name": "a|b", "x": "1.25", "x low": "1.0", "x high": "2.0", "n": "3"}
+        and rows[1]["x"] == ""
+    )
+    text = table.markdown()
+    assert "| a\\|b | 1.2 [1.0, 2.0] | 3 |" in text and "| c | – | – |" in text and "note" in text
+    with pytest.raises(ValueError, match="2 values under 3 headings"):
+        table.add(1, 2)
+
+
+def test_columns_keep_text_as_text(tmp_path):
+    (tmp_path / "x.csv").write_text("a,b\n1,x\n,y\n")
+    found = columns(tmp_path / "x.csv")
+    assert (
+        np.isnan(found["a"][1]) and found["b"].tolist() == ["x", "y"] and columns(tmp_path / "none.csv") == {}
+    )
+
+
+def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
+    (three[0] / "render_ms.csv").write_text("render_ms\n0.1\n0.1\n0.3\n")
+    assert find_runs(three[:1])[0].latency[0] == 0.1 and find_runs(three[1:2])[0].latency[0] == 0.5
+    assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
