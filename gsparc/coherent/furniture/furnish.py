@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.coherent.backprojection import pick_apart
 from gsparc.coherent.furniture.boxes import find_box, inside_out
-from gsparc.coherent.furniture.clutter import SOFT, Screens, shade, tangents
+from gsparc.coherent.furniture.clutter import SOFT, shade, tangents, within
 from gsparc.coherent.furniture.descent import Accord, descend
 from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, same_mirror, walls
 from gsparc.coherent.furniture.residual import Explained, Residual
@@ -24,18 +24,23 @@ from gsparc.coherent.rows import Rows
 
 log = logging.getLogger(__name__)
 
+BOX, PATCH, MIRROR = 6, 4, 5  # numbers of a box, a patch, a patch on a plane of its own
 SURE = 1.0  # concentration from which on phases of new sources are foretold
+SAME_FACE = 0.03  # [m]; a face that has moved less is not tried again
 NEAR_WALL = 0.25  # [m]; faces that close to the end of the room are not tried as mirrors
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: how far, and how finely, a mirror is moved to fit its phases
 
 
 @dataclass(frozen=True)
 class Furnishing:
-    """What a piece of furniture must gain, and how often to look.
+    """How often to look for furniture, and how hard.
+
+    What a piece must gain to stay is half the logarithm of the rows' real numbers for each of its own:
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
 
     Attributes:
         epochs: rounds of everything, softer edges first.
-        box, patch, mirror, word: nats that each must gain to stay.
+        progress: nats; an epoch that gains fewer is the last.
         look: least nats promised before one is tried; `face`: before a mirror is, once in place.
         boxes, mirrors, words: most new ones in an epoch.
         beyond: how far outside the receivers' box furniture may reach [m].
@@ -43,10 +48,7 @@ class Furnishing:
     """
 
     epochs: int = 3
-    box: float = 8.0
-    patch: float = 6.0
-    mirror: float = 10.0
-    word: float = 3.0
+    progress: float = 10.0
     look: float = 12.0
     face: float = 8.0
     boxes: int = 4
@@ -79,6 +81,8 @@ class _Furnisher:
     ) -> None:
         self.rows, self.generator, self.settings = rows, generator, settings
         self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
+        self.number = math.log(2 * len(rows)) / 2  # price of a number [nats]
+        self.tried: list[SmallMirror] = []
         ends = torch.stack([rows.position.amin(0) - settings.beyond, rows.position.amax(0) + settings.beyond])
         self.room = ends.float()
         self._weigh(phased)
@@ -126,7 +130,7 @@ class _Furnisher:
         s, start = self.settings, self.nll
         self._descend(8)
         for epoch in range(s.epochs):
-            before = self.phased
+            before = self.nll
             for move in (self._mirrors, self._patches, self._boxes, self._words):
                 if time.monotonic() < deadline:
                     move()
@@ -144,7 +148,7 @@ class _Furnisher:
                 epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
                 self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility.constant,
             )  # fmt: skip
-            if time.monotonic() > deadline or self.scene.clutter is before.scene.clutter:
+            if time.monotonic() > deadline or self.nll > before - s.progress:
                 break
         return self.phased
 
@@ -177,7 +181,10 @@ class _Furnisher:
                     plane[axis], plane[3] = 1.0, offset
                     corners = box.view(2, 3) @ tangents(plane).T
                     patch = torch.cat([corners.amin(0), corners.amax(0)])
-                    found.append(SmallMirror(plane, patch, 0.0))
+                    face = SmallMirror(plane, patch, 0.0)
+                    if not any(same_mirror(face, other, SAME_FACE) for other in self.tried):
+                        found.append(face)
+        self.tried += found
         return found
 
     def _placed(self, mirror: SmallMirror, explained: Explained) -> SmallMirror:
@@ -188,17 +195,13 @@ class _Furnisher:
         planes = mirror.plane.repeat(len(moves), 1)
         planes[:, 3] += moves
         scene, known = self.scene, walls(self.scene.planes, self.scene.words)
-        clutter, words, first = scene.clutter, list[Word](), len(scene.planes)
-        for number in range(first, first + len(moves)):
-            clutter = clutter.with_patch(mirror.patch, number)
-            words += _over(number, known)
-        trial = replace(scene, planes=torch.cat([scene.planes, planes]), words=tuple(words), clutter=clutter)
+        first = len(scene.planes)
+        words = [word for i in range(len(moves)) for word in _over(first + i, known)]
+        trial = replace(scene, planes=torch.cat([scene.planes, planes]), words=tuple(words))
         paths = trial.unfolding.paths(self.rows.position)
-        screens = Screens.of(clutter, trial.planes, len(words))
-        owner = torch.arange(len(words)) // len(_over(0, known))
-        others = torch.arange(len(moves))[:, None] != owner
-        screens.patched[len(scene.clutter.plane) :, :, 0] &= ~others
-        seen = screens.shade(paths) * paths.valid
+        inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
+        inside = torch.where(paths.letter >= first, inside, 1.0).prod(-1)
+        seen = shade(paths, scene.clutter, trial.planes) * inside * paths.valid
         turn = torch.polar(torch.ones(()), self.accord.expected(self.phased.phase[0], trial.words))
         scores = explained.score(steering(self.rows, trial.sources) * seen.T * turn)
         total = scores.view(len(moves), -1).sum(1)
@@ -218,7 +221,7 @@ class _Furnisher:
     def _hang(self, mirror: SmallMirror) -> bool:
         """Try a small mirror with the words over it that pay."""
         trial, words = self._with_mirror(mirror)
-        return self._add(trial, words, 1.5, self.settings.mirror, len(words))
+        return self._add(trial, words, 1.5, MIRROR * self.number, len(words))
 
     def _promises(
         self, scene: Scene, words: list[Word], explained: Explained
@@ -265,7 +268,7 @@ class _Furnisher:
             louder = self.scene.log_amplitude.clone()
             louder[mine] = louder[mine].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
-            self._try(replace(self.scene, log_amplitude=louder, clutter=clutter), self.settings.patch)
+            self._try(replace(self.scene, log_amplitude=louder, clutter=clutter), PATCH * self.number)
 
     def _boxes(self) -> None:
         for _ in range(self.settings.boxes):
@@ -275,7 +278,7 @@ class _Furnisher:
             if score < self.settings.look:
                 break
             clutter = self.scene.clutter.with_box(box)
-            if not self._try(replace(self.scene, clutter=clutter), self.settings.box):
+            if not self._try(replace(self.scene, clutter=clutter), BOX * self.number):
                 break
 
     def _words(self) -> None:
@@ -289,7 +292,7 @@ class _Furnisher:
         places = images(scene.transmitter, scene.planes, words)
         scores, _ = self._explained().score_waves(steering(self.rows, places))
         best = scores.topk(min(60, len(words))).indices.tolist()
-        self._add(scene, [words[i] for i in best], 6.0, self.settings.word, self.settings.words)
+        self._add(scene, [words[i] for i in best], 6.0, self.number, self.settings.words)
 
     def _look_again(self) -> None:
         """Every box is looked for anew with the others in place."""
@@ -311,7 +314,7 @@ class _Furnisher:
 
     def _drop(self) -> None:
         """Take out what no longer pays."""
-        for kind, least in (("box", self.settings.box), ("patch", self.settings.patch)):
+        for kind, least in (("box", BOX * self.number), ("patch", PATCH * self.number)):
             number = 0
             while True:
                 clutter = self.scene.clutter
