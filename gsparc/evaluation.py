@@ -158,6 +158,9 @@ def dataset_facts(data: Measurements) -> dict[str, Any]:
         "dataset/stand_in": site.stand_in,
         "dataset/convergence_error": site.convergence_error,
         "dataset/rows": len(data),
+        "dataset/simulate_s": float(data.provenance["simulate_s"])
+        if "simulate_s" in data.provenance
+        else None,
     }
 
 

@@ -92,12 +92,13 @@ class Run:
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Run]:
-    """Training runs in and below directories, in the order given.
+    """Training runs in and below directories, in the order given; simulations there tell what data cost.
 
     Raises:
         ValueError: a directory that does not exist or holds no run; it is named.
     """
     found: dict[Path, Run] = {}
+    simulated: dict[str, float] = {}
     for path in map(Path, paths):
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
@@ -105,12 +106,27 @@ def find_runs(paths: Iterable[str | Path]) -> list[Run]:
             [path / "summary.json"] if _is_run(path / "summary.json") else sorted(path.rglob("summary.json"))
         )
         here = {file.parent.resolve(): file for file in files if _is_run(file)}
-        if not here and not any(path.rglob("tradeoff.csv")):
+        made = _simulated(files)
+        simulated |= made
+        if not here and not made and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
         found |= {folder: read_run(folder) for folder in here if folder not in found}
     if not found:
-        raise ValueError("a swept front alone is no report: give the directory of its run too")
+        raise ValueError("a swept front or a simulation is no report: give the directory of a run too")
+    for run in found.values():
+        if run.facts.get("dataset/simulate_s") is None:
+            run.facts["dataset/simulate_s"] = simulated.get(str(run.facts.get("dataset/sha256")))
     return list(found.values())
+
+
+def _simulated(files: Iterable[Path]) -> dict[str, float]:
+    """Seconds that `gsparc.simulate` took [s], by the content hash of what it made."""
+    every = [_facts(file) for file in files if file.is_file()]
+    return {
+        str(facts["dataset/sha256"]): float(facts["time/total_s"])
+        for facts in every
+        if "time/total_s" in facts and "dataset/receivers" in facts
+    }
 
 
 def told_apart(runs: Sequence[Run]) -> list[Run]:

@@ -140,3 +140,14 @@ def test_latency_measured_alone_wins_over_the_one_of_the_sweep(three):
     (three[0] / "render_ms.csv").write_text("render_ms\n0.1\n0.1\n0.3\n")
     assert find_runs(three[:1])[0].latency[0] == 0.1 and find_runs(three[1:2])[0].latency[0] == 0.5
     assert json.loads((three[0] / "summary.json").read_text())["time/render_ms_p50"] == 0.5
+
+
+def test_a_simulation_among_the_directories_is_on_the_bill(three):
+    folder = three[0].parent / "simulated"
+    folder.mkdir()
+    made = {"dataset/sha256": "d" * 64, "time/total_s": 62.0, "dataset/receivers": 500}
+    (folder / "summary.json").write_text(json.dumps(made))
+    table = tables.bill(find_runs([three[0], folder]))
+    assert cells(table, 0)["seconds simulated"] == 62.0 and len(table.rows) == 1
+    with pytest.raises(ValueError, match="give the directory of a run too"):
+        find_runs([folder])
