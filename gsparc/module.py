@@ -16,6 +16,7 @@ from gsparc.confidence import weighted
 from gsparc.data.schema import Batch
 from gsparc.losses import Snapshot, channel_loss, spectrum_loss, ssim
 from gsparc.model import GaussianModel, Rendered
+from gsparc.ops import UnsoundGaussian
 from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
 
 
@@ -71,6 +72,7 @@ class GaussianModule(L.LightningModule):
         self.pace = pace
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
+        self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
@@ -81,14 +83,17 @@ class GaussianModule(L.LightningModule):
             return spectrum_loss(prediction, batch.target, self.loss.ssim_weight)
         return channel_loss(prediction, batch.target, batch.mask, self.loss.snapshot)
 
+    def _render(self, batch: Batch) -> Rendered:
+        try:
+            return self.model(batch.tx, batch.rx)
+        except UnsoundGaussian as refused:  # a NaN, an infinity, or what would overflow to one
+            row = int(self.model.gaussians.ids[refused.index])
+            raise self._stop(batch, int(batch.index[0]), f"Gaussian id {row}: {refused}") from refused
+
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Confidence-weighted loss of a batch."""
-        try:
-            self.rendered = self.model(batch.tx, batch.rx)
-        except ValueError as refused:  # the rasterizer makes no footprint of a NaN
-            if self._offender() is None:
-                raise
-            raise self._stop(batch, int(batch.index[0])) from refused
+        self.batch = batch
+        self.rendered = self._render(batch)
         task = self.task_loss(self.rendered.mean, batch)
         confidence = self.model.confidence
         if confidence is None:
@@ -105,7 +110,7 @@ class GaussianModule(L.LightningModule):
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""
-        mean = self.model(batch.tx, batch.rx).mean
+        mean = self._render(batch).mean
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
         size = len(batch)
@@ -131,9 +136,8 @@ class GaussianModule(L.LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A poisoned state never replaces a good checkpoint."""
-        offender = self._offender()
-        if offender is not None:
-            raise NonFiniteLoss(f"the step before {self.global_step} left a NaN or an infinity: {offender}")
+        if self._offender() is not None and self.batch is not None:
+            raise self._stop(self.batch, int(self.batch.index[0]))
 
     def _offender(self) -> str | None:
         """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
@@ -148,13 +152,17 @@ class GaussianModule(L.LightningModule):
             return f"Gaussian id {int(self.model.gaussians.ids[row])}, {name}"
         return None
 
-    def _stop(self, batch: Batch, sample: int) -> NonFiniteLoss:
-        """Leave batch and parameters on disk; the error that says so."""
+    def _stop(self, batch: Batch, sample: int, refused: str | None = None) -> NonFiniteLoss:
+        """Leave batch, parameters and the first offender on disk; the error that says so."""
         path = self.run_dir / "nonfinite.pt"
         path.parent.mkdir(parents=True, exist_ok=True)
-        evidence = {"index": batch.index, "tx": batch.tx, "target": batch.target, "step": self.global_step}
+        offender = self._offender() or refused
+        evidence = {
+            **{"step": self.global_step, "sample": sample, "offender": offender},
+            **{"index": batch.index, "tx": batch.tx, "target": batch.target, "mask": batch.mask},
+            **{"rx_position": batch.rx.position, "rx_rotation": batch.rx.rotation},
+        }
         torch.save({**evidence, "state_dict": self.model.state_dict()}, path)
-        offender = self._offender()
         culprit = f"first offender: {offender}" if offender else "all parameters are finite, see the batch"
         return NonFiniteLoss(
             f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "

@@ -36,6 +36,7 @@ def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -
 
 
 @torch.no_grad()
+@torch.autocast("cpu", enabled=False)  # a Gram matrix rounded to half precision has no Cholesky factor
 def warm_start(
     model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, noise: float
 ) -> None:

@@ -8,6 +8,7 @@ if __name__ != "gsparc.ops":
     raise ImportError(f"this package is installed as gsparc.ops; import that instead of {__name__!r}")
 
 from gsparc.ops.backends import BackendUnavailable
+from gsparc.ops.door import UnsoundGaussian
 from gsparc.ops.frozen import FrozenPlan, StalePlan
 from gsparc.ops.geometry import Pose, SphereGrid
 from gsparc.ops.plan import Plan
@@ -25,6 +26,7 @@ __all__ = [
     "Raster",
     "SphereGrid",
     "StalePlan",
+    "UnsoundGaussian",
     "Weights",
     "composite",
     "freeze",

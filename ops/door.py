@@ -9,6 +9,18 @@ from gsparc.ops.geometry import Pose
 from gsparc.ops.settings import FARTHEST, WIDEST
 
 
+class UnsoundGaussian(ValueError):
+    """A Gaussian that no footprint can be made of.
+
+    Attributes:
+        index: its row.
+    """
+
+    def __init__(self, message: str, index: int) -> None:
+        super().__init__(message)
+        self.index = index
+
+
 def gaussians(
     means: Tensor,
     quats: Tensor,
@@ -49,13 +61,15 @@ def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor) -> N
 
 
 def raise_for(name: str, index: int) -> None:
-    """The error for Gaussian `index` whose `name` no footprint can be made of (ValueError)."""
+    """The error for Gaussian `index` whose `name` no footprint can be made of (UnsoundGaussian)."""
     wanted = {
         "means": f"finite and within {FARTHEST:.0e} m",
         "scales": f"finite and from 0 to {WIDEST:.0e} m",
         "opacities": "in [0, 1]",
     }.get(name, "finite")
-    raise ValueError(f"Gaussian {index} has {name} that are not {wanted}; find where they come from")
+    raise UnsoundGaussian(
+        f"Gaussian {index} has {name} that are not {wanted}; find where they come from", index
+    )
 
 
 def raise_for_pose() -> None:

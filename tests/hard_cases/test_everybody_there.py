@@ -44,6 +44,12 @@ def test_too_many_entries_are_refused_before_allocation(monkeypatch):
         raster.image.sum().backward()
 
 
+def test_room_for_all_that_could_be_breaks():
+    """Naive: a slot of gradients for every strip that a Gaussian might touch, a million of them, 16 poses."""
+    naive = 16 * 1_000_000 * native._strips(GRID.height) * native._native.MOMENTS * 4
+    assert naive > native.MEMORY_BOUND
+
+
 @pytest.mark.slow
 def test_a_million_huge_ones():
     n = 1_000_000

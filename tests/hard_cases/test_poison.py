@@ -2,6 +2,7 @@
 
 Remedy: the loss is looked at before the step; a run that meets a NaN or an infinity stops, names sample or
 Gaussian, leaves batch and parameters on disk, and keeps the last good checkpoint. Never silently zeroed.
+The rasterizer's door refuses what is not finite or would overflow inside. Exact: refused, or finite.
 """
 
 from __future__ import annotations
@@ -58,25 +59,54 @@ def test_a_spoilt_parameter_stops_the_run_and_is_named(data, folds, tmp_path, na
         method.fit(data, folds(len(data)).folds[0], tmp_path)
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
     assert left["step"] == 7 and left["state_dict"][name][3].isnan().any() and len(left["index"])
+    assert left["offender"] == f"Gaussian id 3, {name}" and left["sample"] in left["index"]
     good = checkpoint.read(tmp_path / "last.ckpt")
     assert good.extra["trainer"]["global_step"] == 5
     assert all(t.isfinite().all() for t in good.state["inner"]["model"].values())
 
 
+class SpoilAfterStep(Spoil):
+    """The same between a step and whatever comes before the next: a validation, a checkpoint."""
+
+    def on_train_batch_start(self, *unused):
+        pass
+
+    def on_train_batch_end(self, trainer, module, *unused):
+        Spoil.on_train_batch_start(self, trainer, module)
+
+
 def test_a_poisoned_state_replaces_no_checkpoint(data, folds, tmp_path):
     """A NaN that a step itself makes is met one step later; a checkpoint must not be written in between."""
-
-    class SpoilAfter(Spoil):
-        def on_train_batch_start(self, *unused):
-            pass
-
-        def on_train_batch_end(self, trainer, module, *unused):
-            Spoil.on_train_batch_start(self, trainer, module)
-
-    method = field(tmp_path / "own.npz", [SpoilAfter(10, "log_gain", ...)])
+    method = field(tmp_path / "own.npz", [SpoilAfterStep(10, "log_gain", ...)])
     with pytest.raises(NonFiniteLoss, match="log_gain"):
         method.fit(data, folds(len(data)).folds[0], tmp_path)
     assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
+    assert torch.load(tmp_path / "nonfinite.pt", weights_only=True)["offender"] == "log_gain"
+
+
+def test_a_parameter_that_would_overflow_stops_the_run_too(data, folds, tmp_path):
+    """Finite, but a Gaussian of 1e30 m: found when the rasterizer's door got limits."""
+
+    class Widen(Spoil):
+        def on_train_batch_start(self, trainer, module, *unused):
+            if trainer.global_step == self.step:
+                with torch.no_grad():
+                    module.model.gaussians.log_scales[self.row] = 70.0
+
+    method = field(tmp_path / "own.npz", [Widen(7, "", 3)])
+    with pytest.raises(NonFiniteLoss, match=r"at step 7 .*Gaussian id 3: Gaussian 3 has scales that are not"):
+        method.fit(data, folds(len(data)).folds[0], tmp_path)
+    left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
+    assert "Gaussian id 3" in left["offender"] and len(left["target"]) == len(left["index"])
+    assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
+
+
+def test_a_run_that_is_poisoned_before_a_validation_leaves_the_evidence_too(data, folds, tmp_path):
+    method = field(tmp_path / "own.npz", [SpoilAfterStep(9, "gaussians.means", 2)])
+    method.training.settings = dataclasses.replace(method.training.settings, val_every=10)
+    with pytest.raises(NonFiniteLoss, match="Gaussian id 2, gaussians.means"):
+        method.fit(data, folds(len(data)).folds[0], tmp_path)
+    assert (tmp_path / "nonfinite.pt").exists()
 
 
 def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_path):

@@ -40,6 +40,7 @@ def test_equals_float64(backend, size):
 
 
 def test_plain_normalising_breaks():
+    """Naive: q / |q|."""
     q = torch.zeros(4, requires_grad=True)
     (q / q.norm()).sum().backward()
     assert q.grad.isnan().any()
