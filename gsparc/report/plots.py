@@ -41,7 +41,8 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and who is not beaten."""
     name = runs[0].figure
     figure, axes = _one()
-    x, y = [], []
+    x: list[float] = []
+    y: list[float] = []
     for number, (setting, group) in enumerate(grouped(runs).items()):
         for run in group:
             p50, p95 = run.latency
@@ -50,12 +51,13 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
                 continue
             low, high = (found.low or found.value), (found.high or found.value)
             axes.errorbar(
-                [p50], [found.value], xerr=[[0], [max((p95 or p50) - p50, 0)]],
-                yerr=[[max(found.value - low, 0)], [max(high - found.value, 0)]],
+                [p50], [found.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
+                yerr=[[max(found.value - low, 0.0)], [max(high - found.value, 0.0)]],
                 fmt="o", ms=4, lw=0.7, color=f"C{number % 10}",
                 label=setting if run is group[0] else None,
             )  # fmt: skip
-            x.append(p50), y.append(found.value)
+            x.append(p50)
+            y.append(found.value)
     for base in BASELINES:
         value = runs[0].facts.get(f"baseline/{base}/{name}")
         ms = runs[0].facts.get(f"baseline/{base}/render_ms_p50")
@@ -64,7 +66,8 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
             axes.annotate(
                 base, (ms, value), xytext=(4, -3), textcoords="offset points", fontsize=7, color="0.4"
             )
-            x.append(ms), y.append(value)
+            x.append(float(ms))
+            y.append(float(value))
     for columns in fronts:
         if name in columns:
             on = columns["front"] == 1

@@ -55,7 +55,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         pace=Pace(rounds=config.rounds, budget_s=config.budget_s), others={COPY: reference_copy(), **clocks},
     )  # fmt: skip
     figure = FIGURES[data.site.kind]
-    shown = front([p.p50 for p in points], [score_of(figure, _value(p, figure)) for p in points])
+    shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.chosen_by for p in points])
     if config.store:
         stored.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
@@ -117,13 +117,6 @@ def _scored(method: Method, data: Measurements, fold: Fold, eval_on: str) -> dic
     return score([method], data, Split("tradeoff", (fold,), ""), eval_on).figures()
 
 
-def _value(point: Point, figure: str) -> float:
-    value = point.figures[figure]
-    if value is None:
-        raise ValueError(f"{figure} is not defined on these rows")
-    return value
-
-
 def _columns(
     points: list[Point], shown: list[int], chosen: list[int], copy_ms: float
 ) -> dict[str, list[Any]]:
@@ -155,7 +148,7 @@ def _facts(
     points: list[Point], best: list[Point], figure: str, rivals: dict[str, Rival], copy_ms: float
 ) -> dict[str, Any]:
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
-    scores = [score_of(figure, _value(p, figure)) for p in best]
+    scores = [score_of(figure, p.value(figure)) for p in best]
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
@@ -165,7 +158,7 @@ def _facts(
         "time/copy_ms": copy_ms,
         "time/render_ms_p50": full.p50,
         "time/render_ms_p95": full.p95,
-        f"test/{figure}": _value(full, figure),
+        f"test/{figure}": full.value(figure),
     }
     for number, p in enumerate(best, 1):
         stem = f"front/{number}"
@@ -184,7 +177,7 @@ def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run
     for p in best:
         gap, error = p.difference
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
-        table.add_row(p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{_value(p, figure):.4g}", apart)
+        table.add_row(p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart)
     console = Console()
     console.print(table)
     slope = facts["tradeoff/per_halving"]

@@ -47,7 +47,7 @@ def draw(
     figure = Figure(figsize=(11, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes, legend = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    value = [p.figures[figure_name] for p in points]
+    value = [p.value(figure_name) for p in points]
     inside = [i for i in range(len(points)) if i not in on_front]
     axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
     x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]

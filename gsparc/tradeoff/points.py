@@ -51,6 +51,13 @@ class Point:
     size: int = 0
     difference: tuple[float | None, float | None] = field(default=(None, None))
 
+    def value(self, figure: str) -> float:
+        """A figure; `ValueError` when these rows do not define it."""
+        found = self.figures[figure]
+        if found is None:
+            raise ValueError(f"{figure} is not defined on these rows")
+        return found
+
     @property
     def p50(self) -> float:
         """Median latency [ms]."""

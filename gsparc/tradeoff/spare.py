@@ -70,7 +70,7 @@ def combinations(
     """
     known = knobs(method)
     alone = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
-    offered = getattr(family(method), "offered", lambda method: {})(answering(method))
+    offered: Mapping[str, Sequence[Any]] = getattr(family(method), "offered", lambda _: {})(answering(method))
     axes = {
         knob: offered.get(knob, ()) if values is None else values
         for knob, values in grid.items()

@@ -43,7 +43,7 @@ def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -
             "settings": dict(p.settings),
             "threads": p.threads,
             "score": p.chosen_by,
-            "figure": [figure, p.figures[figure]],
+            "figure": [figure, p.value(figure)],
             "p50_ms": p.p50,
         }
         for p in points

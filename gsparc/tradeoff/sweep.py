@@ -85,7 +85,9 @@ def sweep(
         scored.append((there, score_of(figure, float("inf") if deciding is None else deciding)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
-    calls: dict[tuple[int, int] | str, Callable[[int], object]] = dict(others)
+    calls: dict[tuple[int, int] | str, Callable[[int], object]] = {
+        name: call for name, call in others.items()
+    }
     threads: dict[tuple[int, int] | str, int] = dict.fromkeys(others, 1)
     rows = rows_of(fold, eval_on)
     for index, candidate in enumerate(candidates):
