@@ -30,10 +30,12 @@ class EffectSettings:
     Attributes:
         phase: carrier phase from source positions (channels of a moving receiver).
         array: array response (spectra of a static receiver with a declared array).
+        hybrid: a process for what the sources of `phase` leave over; never `splat`.
     """
 
     phase: Switch = "auto"
     array: Switch = "auto"
+    hybrid: Switch = "auto"
 
 
 @dataclass(frozen=True)

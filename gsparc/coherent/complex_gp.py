@@ -82,14 +82,21 @@ class ComplexGP(Method):
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
         moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
         cross = self._kernel(moving.detach().cpu().double(), self.places, self.length)
-        mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)
         known = torch.linalg.solve_triangular(self.factor, cross.T, upper=False).square().sum(0)
         left = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
         return Prediction(
-            mean.to(torch.complex64).reshape(len(tx), *self.shape),
+            self._mean(cross),
             confidence=(1 - left).float().clamp(0, 1),
             variance=(self.power * left).float(),
         )
+
+    def mean_at(self, places: Tensor) -> Tensor:
+        """The mean alone (B, A, K) complex64, at places (B, 3) [m] of the moving end."""
+        return self._mean(self._kernel(places.detach().cpu().double(), self.places, self.length))
+
+    def _mean(self, cross: Tensor) -> Tensor:
+        mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)
+        return mean.to(torch.complex64).reshape(len(cross), *self.shape)
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

@@ -140,13 +140,18 @@ class VirtualSourceGP(Method):
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
+        notes.append(
+            f"vsgp: {len(found)} of {self.searches} searches within {budget.seconds:.0f} s, {counts} sources"
+        )
         scene = self.members[0].scene
         told = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
         told[SourceKind.EDGE] = len(self.edges)
         notes.append("vsgp: the best search has " + ", ".join(f"{told[k]} {k}s" for k in SourceKind))
-        notes.append(
-            f"vsgp: {len(found)} of {self.searches} searches within {budget.seconds:.0f} s, {counts} sources"
-        )
+        clutter = scene.clutter
+        if len(clutter):
+            notes.append(
+                f"vsgp: furniture: {len(clutter.boxes)} boxes that hide, {len(clutter.patches)} mirror ends"
+            )
         return FitReport(time.monotonic() - started, tuple(notes))
 
     def _key(self, data: Measurements, known: np.ndarray) -> str:
@@ -273,6 +278,14 @@ class VirtualSourceGP(Method):
             confidence=(1 - variance / prior).clamp(0, 1),
             variance=variance * self.frame.scale**2,
         )
+
+    def left_over(self) -> tuple[np.ndarray, Tensor]:
+        """Receivers (n,) and what all others leave unexplained of their channels (n, R), in stored units."""
+        self._fitted()
+        rows, weight = self.members[0].rows, self.weights[:, None, None]
+        said = (weight * torch.stack([member.left_out() for member in self.members])).sum(0)
+        loud = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
+        return rows.receiver.numpy(), (rows.target - said) * loud
 
     # ---- keeping ----
     def state(self) -> dict[str, Any]:
