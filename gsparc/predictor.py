@@ -15,6 +15,7 @@ from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
+    from gsparc.link.export import Paths
     from gsparc.tradeoff.stored import Operating
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
@@ -56,9 +57,42 @@ class Predictor:
         """
         return self._ask("spectrum", tx, rx)
 
-    def csi(self, tx: Any = None, rx: Any = None) -> Any:
-        """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements."""
-        return self._ask("csi", tx, rx)
+    def csi(
+        self,
+        tx: Any = None,
+        rx: Any = None,
+        *,
+        uplink: Any = None,
+        frequency_hz: Any = None,
+        symbols: int | None = None,
+    ) -> Any:
+        """Channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
+
+        Args:
+            tx, rx: positions; where the model reads a fresh uplink, none.
+            uplink: (B, U, L) or (U, L) complex channels heard now, for a model that reads them.
+            frequency_hz: (K,) [Hz] of any OFDM grid within the band; None for the measured tones.
+            symbols: OFDM symbols of a slot; then the result is Sionna's
+                [rx, rx_ant, tx, tx_ant, symbols, K].
+        """
+        if uplink is None and frequency_hz is None and symbols is None:
+            return self._ask("csi", tx, rx)
+        from gsparc.link import export
+
+        if uplink is not None:
+            channel = export.heard(self.method, self.site, uplink, frequency_hz)
+            found = export.on_grid(channel, self.site, None, symbols)
+            return found if isinstance(uplink, Tensor) else found.numpy()
+        asked = torch.as_tensor(self._ask("csi", tx, rx))
+        asked = asked[None] if asked.ndim == 2 else asked
+        found = export.on_grid(asked, self.site, frequency_hz, symbols)
+        return found if any(isinstance(end, Tensor) for end in (tx, rx)) else found.numpy()
+
+    def paths(self, uplink: Any) -> Paths:
+        """Gains, delays and directions of what a fresh uplink (B, U, L) holds; see `gsparc.link.export`."""
+        from gsparc.link import export
+
+        return export.paths(self.method, self.site, uplink)
 
     def rssi(self, tx: Any = None, rx: Any = None) -> Any:
         """Received power (B, 1) float32, linear, in the physical units of the measurements."""

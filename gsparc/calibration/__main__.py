@@ -6,6 +6,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
@@ -30,11 +31,18 @@ log = logging.getLogger(__name__)
 def collect(
     paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
 ) -> tuple[Evidence, dict[str, Any]]:
-    """Evidence of all folds' test rows, and the facts that name them."""
-    run = open_files(paths, dataset, split)
-    pairs = zip(run.methods, run.split.folds, strict=True)
-    parts = [gather(method, run.data, fold, rows_of(fold, "test")) for method, fold in pairs]
-    facts = {**dataset_facts(run.data), **split_facts(run.split), "model/name": run.methods[0].name}
+    """Evidence of every checkpoint's own test rows, and the facts that name them; no row twice."""
+    parts, seen, facts = [], np.zeros(0, np.int64), {}
+    for path in paths:
+        run = open_files([path], dataset, split)
+        fold = run.split.folds[0]
+        rows = np.setdiff1d(rows_of(fold, "test"), seen)
+        if len(rows):
+            parts.append(gather(run.methods[0], run.data, fold, rows))
+        seen = np.concatenate([seen, rows])
+        facts = facts or {
+            **dataset_facts(run.data), **split_facts(run.split), "model/name": run.methods[0].name
+        }  # fmt: skip
     return joined(parts), facts
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.stats import beta, binom
+from scipy.special import betainc
+from scipy.stats import beta
 
 LEVELS = 50
 
@@ -66,11 +67,19 @@ def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
     return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
 
 
-def choose(score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Promise) -> Threshold:
+def choose(
+    score: np.ndarray,
+    bad: np.ndarray,
+    levels: np.ndarray,
+    promise: Promise,
+    group: np.ndarray | None = None,
+) -> Threshold:
     """The laxest threshold that the calibration set (n,) supports.
 
-    A level too strict to be tested (no outcome could reject: fewer than log delta / log(1 - alpha) accepted)
-    is passed over; nothing is tested there, so nothing is spent.
+    Where neighbours err together, `group` (n,) names the patch each position belongs to: counts are divided
+    by the design effect, how much more the share varies between patches than binomial counts would (Kish
+    1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
+    could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
     """
     least = int(np.ceil(np.log(promise.delta) / np.log1p(-promise.alpha)))
     found = Threshold(float("inf"), 0, 0)
@@ -79,10 +88,27 @@ def choose(score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Prom
         accepted, wrong = int(taken.sum()), int(bad[taken].sum())
         if accepted < least:
             continue
-        if binom.cdf(wrong, accepted, promise.alpha) > promise.delta:
+        effect = 1.0 if group is None else design_effect(bad[taken], group[taken])
+        if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:
             break
         found = Threshold(float(level), accepted, wrong)
     return found
+
+
+def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
+    """Variance of the share of bad ones between groups over that of independent draws; at least 1."""
+    _, which = np.unique(group, return_inverse=True)
+    counts, wrong = np.bincount(which), np.bincount(which, bad)
+    share, groups = wrong.sum() / counts.sum(), len(counts)
+    if groups < 2 or share in (0.0, 1.0):
+        return 1.0
+    between = groups / (groups - 1) * ((wrong - share * counts) ** 2).sum() / counts.sum()
+    return max(1.0, float(between / (share * (1 - share))))
+
+
+def _tail(wrong: float, accepted: float, alpha: float) -> float:
+    """P(at most `wrong` of `accepted` are bad) when a share alpha is, for counts that need not be whole."""
+    return float(betainc(max(accepted - wrong, 1e-9), wrong + 1, 1 - alpha))
 
 
 def spread_out(

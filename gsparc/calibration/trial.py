@@ -55,18 +55,20 @@ def divided(
     `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
     across a cell's border.
     """
-    if how == "random":
-        unit = np.arange(len(evidence))
-    else:
-        flat = evidence.position[:, :2]
-        low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
-        cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
-        unit = np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
+    unit = np.arange(len(evidence)) if how == "random" else cells(evidence.position)
     order = rng.permutation(unit.max() + 1)
     first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
     parts = order[:first], order[first:second], order[second:]
     choose_on, calibrate, test = (np.flatnonzero(np.isin(unit, part)) for part in parts)
     return choose_on, calibrate, test
+
+
+def cells(position: np.ndarray) -> np.ndarray:
+    """Which patch of the plane each position (n, 3) lies in: (n,) numbers from 0."""
+    flat = position[:, :2]
+    low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
+    cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
+    return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
 def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
@@ -101,7 +103,8 @@ def trials(
         used = best_kind(evidence, choose_on) if kind == "auto" else kind
         score, bad = evidence.scores[used], promise.bad(evidence.error)
         calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
-        found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise)
+        patch = cells(evidence.position)[calibrate] if how == "spatial" else None
+        found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
         taken = test[score[test] >= found.value]
         kinds.append(used)
         realised.append(bad[taken].mean() if len(taken) else np.nan)

@@ -18,7 +18,7 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 from gsparc import cli
 from gsparc.calibration.evidence import Evidence, gather
 from gsparc.calibration.threshold import Promise, Threshold, choose, levels_of
-from gsparc.calibration.trial import best_kind, divided
+from gsparc.calibration.trial import best_kind, cells, divided
 from gsparc.clock import machine_facts
 from gsparc.evaluate import open_files
 from gsparc.evaluation import dataset_facts, split_facts
@@ -51,15 +51,17 @@ def need_sionna() -> None:
 
 def accept(
     evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int
-) -> tuple[str, Threshold, np.ndarray]:
-    """Confidence, threshold, and the positions (indices of the evidence) that neither has seen."""
+) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
+    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside."""
     rng = np.random.default_rng(seed)
     choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], promise.bad(evidence.error)
-    return used, choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise), test
+    patch = cells(evidence.position)[calibrate] if spatial else None
+    found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
+    return used, found, test, choose_on
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -76,7 +78,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     started = time.perf_counter()
     evidence = gather(method, data, fold, fold.test)
     promise = Promise(**settings["promise"])
-    kind, threshold, test = accept(evidence, promise, config.confidence, config.spatial, int(config.seed))
+    kind, threshold, test, aside = accept(
+        evidence, promise, config.confidence, config.spatial, int(config.seed)
+    )
     rows, score = fold.test[test], evidence.scores[kind][test]
     accepted = score >= threshold.value
     bad = promise.bad(evidence.error[test])
@@ -100,9 +104,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     ) as bar:
         levels = settings["mcs"]["snr_db"]
         adapting = bar.add_task("rate adaptation", total=len(levels), now="")
-        true, guess = own.true[:, antenna], own.predicted[:, antenna]
-        rates = adapt(true, guess, levels, settings["mcs"], lambda: bar.advance(adapting))
-        facts |= rate_facts(rates, accepted) | {"time/mcs_s": time.perf_counter() - started}
+        sure = aside[evidence.scores[kind][aside] >= threshold.value]
+        other = channels(method, data, fold.test[sure if len(sure) else aside], data.site.subcarriers_hz)
+        pairs = [(one.true[:, antenna], one.predicted[:, antenna]) for one in (own, other)]
+        rates = adapt(*pairs, levels, settings["mcs"], lambda: bar.advance(adapting))
+        facts |= rate_facts(rates, accepted, score) | {"time/mcs_s": time.perf_counter() - started}
         draw_rates(rates, score, title, run_dir / "mcs.png")
         shape = settings["pusch"]
         wanted = {name: values for name, values in shape["ebno_db"].items() if values}

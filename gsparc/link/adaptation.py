@@ -22,6 +22,7 @@ class Rates:
         oracle, chosen: (n,) MCS from the true and from the predicted channel.
         oracle_bps, chosen_bps: (n,) throughput with the transport blocks that arrive [bit/s].
         outage: (n,) bool, the oracle's transport blocks mostly fail.
+        backoff_db: subtracted from predicted signal-to-noise ratios before choosing [dB].
     """
 
     snr_db: float
@@ -30,6 +31,7 @@ class Rates:
     oracle_bps: np.ndarray
     chosen_bps: np.ndarray
     outage: np.ndarray
+    backoff_db: float
 
 
 class Adaptation:
@@ -53,8 +55,9 @@ class Adaptation:
         order, rate = decode_mcs_index(torch.arange(28), table_index=1, is_pusch=True)
         self.efficiency = (order.double() * rate.double()).cpu().numpy()
 
-    def rates(self, true: Tensor, predicted: Tensor, noise: float) -> Rates:
+    def rates(self, true: Tensor, predicted: Tensor, noise: float, backoff_db: float = 0.0) -> Rates:
         """Choose on `predicted`, live with `true`: both (n, K) complex, `noise` their noise power."""
+        predicted = predicted * 10 ** (-backoff_db / 20)
         oracle, chosen, oracle_fails, chosen_fails = [], [], [], []
         for start in range(0, len(true), CHUNK):
             there, guess = (self._sinr(h[start : start + CHUNK], noise) for h in (true, predicted))
@@ -76,6 +79,7 @@ class Adaptation:
             full[best] * (1 - lost_best),
             full[own] * (1 - lost_own),
             lost_best > OUTAGE,
+            backoff_db,
         )
 
     def _sinr(self, channel: Tensor, noise: float) -> Tensor:

@@ -49,25 +49,35 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
 
 
 def adapt(
-    true: Tensor,
-    predicted: Tensor,
+    channels: tuple[Tensor, Tensor],
+    aside: tuple[Tensor, Tensor],
     snr_db: list[float],
     settings: Mapping[str, Any],
     tick: Callable[[], None],
 ) -> list[Rates]:
-    """Rates at noise levels that put the median position at `snr_db`; channels (n, K)."""
+    """Rates at noise levels that put the median position at `snr_db`.
+
+    Args:
+        channels: true and predicted, (n, K) each.
+        aside: the same of other positions, on which the backoff is chosen.
+        snr_db, settings: see conf/link.yaml.
+        tick: called after each level.
+    """
+    true, predicted = channels
     loop = Adaptation(
         float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
     )
     median = float(true.abs().square().mean(1).median())
     found = []
     for level in snr_db:
-        found.append(loop.rates(true, predicted, median / 10 ** (level / 10)))
+        noise = median / 10 ** (level / 10)
+        tried = {b: loop.rates(*aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
+        found.append(loop.rates(true, predicted, noise, max(tried, key=lambda b: tried[b])))
         tick()
     return found
 
 
-def rate_facts(found: list[Rates], accepted: np.ndarray) -> dict[str, Any]:
+def rate_facts(found: list[Rates], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
     """`mcs/<snr>dB/*`: throughput against the oracle, misses, outage; of all and of accepted positions."""
     facts: dict[str, Any] = {}
     for one in found:
@@ -83,7 +93,12 @@ def rate_facts(found: list[Rates], accepted: np.ndarray) -> dict[str, Any]:
             f"{room}/exact": float((miss == 0).mean()),
             f"{room}/off_by_more_than_2": float((miss > 2).mean()),
             f"{room}/outage": float(one.outage.mean()),
+            f"{room}/backoff_db": one.backoff_db,
         }
+        for share in (0.5, 0.7, 0.9):
+            surest = score >= np.quantile(score, 1 - share)
+            short = 1 - one.chosen_bps[surest].mean() / one.oracle_bps[surest].mean()
+            facts[f"{room}/shortfall_surest_{share:.0%}"] = short
         if accepted.any():
             taken = one.chosen_bps[accepted].mean() / one.oracle_bps[accepted].mean()
             facts[f"{room}/shortfall_accepted"] = 1 - taken

@@ -83,11 +83,11 @@ class Ridge(UplinkMethod):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        return {"maps": self.maps, "unit": self.unit}
+        return {"maps": self.maps, "unit": self.unit, "inputs": self.inputs}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.maps, self.unit = site, state["maps"], state["unit"]
+        self.site, self.maps, self.unit, self.inputs = site, state["maps"], state["unit"], state["inputs"]
 
 
 def _solve(gram: Tensor, product: Tensor, penalty: float) -> Tensor:

@@ -87,3 +87,8 @@ def gram(antennas: Tensor, tones: Tensor, antennas2: Tensor, tones2: Tensor) -> 
 def inner(antennas: Tensor, tones: Tensor, snapshot: Tensor) -> Tensor:
     """Inner products (B, N) of atoms with snapshots (B, A, K)."""
     return ((antennas.conj() @ snapshot) * tones.conj()).sum(-1)
+
+
+def mean_delay(snapshot: Tensor) -> Tensor:
+    """Power-weighted mean delay (B,) of snapshots (B, A, K), turns per tone, from neighbouring tones."""
+    return -torch.angle((snapshot[..., 1:] * snapshot[..., :-1].conj()).sum((1, 2))) / (2 * math.pi)

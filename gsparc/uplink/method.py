@@ -15,7 +15,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.method import FitReport, Prediction
-from gsparc.uplink.atoms import Aperture, Sources, flat_places
+from gsparc.uplink.atoms import Aperture, Sources, flat_places, mean_delay, phasor
 from gsparc.uplink.face import UplinkMethod
 from gsparc.uplink.search import SearchSettings, SourceSearch
 from gsparc.uplink.trust import Trust, learn, signs, unheard_noise
@@ -116,12 +116,16 @@ class UplinkField(UplinkMethod):
         aperture = self.search.aperture
         if noise is None:
             noise = unheard_noise(uplink, aperture, self.settings.delay_window)
+        # Timing is the snapshot's own: delays are sought about their mean, and put back where they were.
+        mean = mean_delay(uplink)
+        straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
         parts = [
-            self.search(uplink[i : i + CHUNK], noise[i : i + CHUNK]) for i in range(0, len(uplink), CHUNK)
+            self.search(straight[i : i + CHUNK], noise[i : i + CHUNK]) for i in range(0, len(uplink), CHUNK)
         ]
         found = Sources(*(torch.cat([getattr(p, name) for p, _ in parts]) for name in vars(parts[0][0])))
         left = torch.cat([rest for _, rest in parts])
-        return found, signs(found, left, uplink, noise, self._downlink.tones)
+        seen = signs(found, left, uplink, noise, self._downlink.tones)
+        return replace(found, delay=found.delay + mean[:, None]), seen
 
     def _heard(self, found: Sources) -> Tensor:
         return found.response(self._downlink)

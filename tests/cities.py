@@ -1,0 +1,39 @@
+"""A small city, made once a session: the stand-in with few users, and a loader for it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import mkdtemp
+
+import numpy as np
+
+from gsparc.data.argos import load_argos
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.simulate.argos_sim import ensure_argos_sim
+
+COUNT = 120
+
+
+@cache
+def folder() -> Path:
+    """Its folder."""
+    return ensure_argos_sim(Path(mkdtemp()), count=COUNT, seed=1)
+
+
+def city(antenna: int | str = 0) -> Measurements:
+    """Its measurements at true positions."""
+    return load_argos(folder(), antenna=antenna, positions="true")
+
+
+def fold() -> Fold:
+    """80 training, 16 validation and 24 test rows."""
+    rows = np.arange(COUNT)
+    return Fold(rows[:80], rows[80:96], rows[96:])
+
+
+def deaf(data: Measurements) -> Measurements:
+    """The same without its uplink."""
+    return replace(data, uplink=None)

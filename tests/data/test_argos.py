@@ -1,0 +1,95 @@
+"""The Argos layout: what is read, what is refused, and what aligning may not change."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from cities import city, folder
+
+from gsparc.data.argos import TONES, aligned, load_argos, peers_normalisation
+from gsparc.data.errors import DataError
+from gsparc.data.load import load
+
+
+def _copy(tmp_path, *without: str):
+    place = tmp_path / "argos"
+    place.mkdir()
+    for name in ("csidata.npy", "base-station.yml"):
+        if name not in without:
+            shutil.copy(folder() / name, place)
+    return place
+
+
+def _flat(uplink, rows):
+    return np.abs(uplink[:, 0, :3]).astype(float)
+
+
+def test_reads_the_release_s_two_files(tmp_path) -> None:
+    data = load_argos(_copy(tmp_path), _flat)
+    assert data.target.shape[1:] == (1, 26) and data.uplink.shape[1:] == (8, 26)
+    assert data.site.moving_end == "rx" and data.site.kind == "csi"
+    assert np.allclose(np.diff(data.site.subcarriers_hz), 312.5e3)
+
+
+def test_stand_in_is_named_and_has_all_antennas() -> None:
+    data = city("all")
+    assert data.site.name == "argos-sim" and data.site.stand_in == "argos"
+    assert data.target.shape[1:] == (64, 26) and data.noise_variance is not None
+    assert np.array_equal(city(3).target[:, 0], data.target[:, 3])
+
+
+def test_batches_carry_the_uplink() -> None:
+    data = city()
+    batch = data.batch(np.array([3, 5]))
+    assert np.array_equal(batch.uplink.numpy(), data.uplink[[3, 5]])
+
+
+def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
+    csi = np.load(folder() / "csidata.npy")[:10].astype(np.complex128)
+    tones = np.array(TONES, dtype=float)
+    moved = csi * np.exp(1j * (1.3 - 0.2 * tones))
+    assert np.allclose(aligned(moved, tones), aligned(csi, tones), atol=1e-12)
+    assert np.allclose(np.abs(aligned(csi, tones)), np.abs(csi))
+
+
+def test_peers_normalisation_is_one_number_for_all() -> None:
+    data = city()
+    mean, spread = peers_normalisation(data.target, np.arange(50))
+    rest = (data.target[:50] - mean) / spread
+    assert abs(rest.mean()) < 1e-6 and np.isclose((np.abs(rest) ** 2).mean(), 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda p: (p / "csidata.npy").unlink(), "csidata.npy: missing"),
+        (lambda p: np.save(p / "csidata.npy", np.zeros((4, 8, 52))), "expected complex"),
+        (lambda p: np.save(p / "csidata.npy", np.full((4, 8, 52), np.nan + 0j)), "snapshot 0: NaN"),
+        (lambda p: np.save(p / "csidata.npy", np.zeros((4, 8, 52), complex)), "uplink is silent"),
+        (lambda p: (p / "base-station.yml").write_text("base_station: [1, 2]"), "expected 8 x 3"),
+        (lambda p: (p / "base-station.yml").write_text("- 1"), "expected `base_station:`"),
+        (lambda p: [(p / f"{n}_index.txt").write_text("0 1") for n in ("train", "test")], "twice"),
+    ],
+)  # fmt: skip
+def test_bad_folders_are_refused_in_words(tmp_path, change, words) -> None:
+    place = _copy(tmp_path)
+    change(place)
+    with pytest.raises(DataError, match=words):
+        load_argos(place, _flat)
+
+
+def test_no_such_antenna_or_positions(tmp_path) -> None:
+    with pytest.raises(DataError, match="from 0 to 63"):
+        city(64)
+    with pytest.raises(DataError, match="true positions exist in the stand-in only"):
+        load_argos(_copy(tmp_path), positions="true")
+
+
+def test_absent_release_is_loud(tmp_path, caplog) -> None:
+    encoder = {"folder": str(tmp_path / "enc"), "steps": 2, "hidden": 8}
+    stand_in = {"root": str(folder().parent), "count": 120, "seed": 1}
+    data = load({"name": "argos", "root": None, "stand_in": stand_in, "encoder": encoder})
+    assert "SIMULATED" in caplog.text and data.site.stand_in == "argos"
+    assert data.moving.shape == (120, 3) and np.ptp(data.moving) > 0

@@ -1,0 +1,186 @@
+"""Grids, beams, statistics and the export; with Sionna itself in the slow part."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import torch
+from campaigns import compose
+from cities import city, fold
+
+from gsparc import checkpoint, load
+from gsparc.link.beams import gain, loss_db
+from gsparc.link.channels import truth
+from gsparc.link.grid import centred, interpolated, resource_grid
+from gsparc.link.statistics import crossing, interval
+from gsparc.uplink.method import UplinkField
+from gsparc.uplink.search import SearchSettings
+
+needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    data = city("all")
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), None)
+    file = tmp_path_factory.mktemp("link") / "model.ckpt"
+    checkpoint.save(file, method)
+    return data, file
+
+
+def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
+    tones = 2.4e9 + 312.5e3 * np.arange(26)
+    delays = np.array([0, 80e-9, 210e-9, 700e-9])
+    gains = np.array([1, 0.6j, -0.4, 0.1 + 0.1j])
+
+    def response(frequency):
+        turns = np.outer(delays, frequency - 2.4e9)
+        return torch.from_numpy((gains @ np.exp(-2j * np.pi * turns)).astype(np.complex64))[None, None]
+
+    wanted = centred(float(tones.mean()), 30e3, 240)
+    miss = interpolated(response(tones), tones, wanted) - response(wanted)
+    assert miss.abs().square().mean() < 1e-3 * response(wanted).abs().square().mean()
+    with pytest.raises(ValueError, match="fewer blocks"):
+        interpolated(response(tones), tones, centred(float(tones.mean()), 30e3, 2400))
+
+
+def test_one_tone_is_flat() -> None:
+    assert torch.equal(
+        interpolated(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
+    )
+
+
+def test_grid_is_sionna_s_order() -> None:
+    channel = torch.arange(12.0).reshape(2, 3, 2)
+    down = resource_grid(channel, 14, "rx")
+    assert down.shape == (2, 1, 1, 3, 14, 2) and torch.equal(down[1, 0, 0, 2, 5], channel[1, 2])
+    up = resource_grid(channel, 14, "tx")
+    assert up.shape == (1, 3, 2, 1, 14, 2) and torch.equal(up[0, 2, 1, 0, 5], channel[1, 2])
+
+
+def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
+    generator = torch.Generator().manual_seed(0)
+    true = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
+    assert torch.allclose(gain(true, true).mean(), torch.tensor(16.0), rtol=0.01)
+    assert loss_db(true, true * (2 - 1j)).abs().max() < 1e-4
+    noise = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
+    # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
+    assert abs(float(loss_db(true, true + noise).mean()) - 3.0) < 0.3
+
+
+def test_crossing_and_intervals() -> None:
+    x = np.array([0.0, 1, 2])
+    assert np.isclose(crossing(x, np.array([1.0, 0.1, 0.01])), 1.0)
+    assert crossing(x, np.array([1.0, 0.5, 0.2])) is None
+    low, high = interval(10, 100)
+    assert (
+        low < 0.1 < high and interval(0, 10)[0] == 0 and interval(10, 10)[1] == 1 and interval(0, 0) == (0, 1)
+    )
+
+
+def test_truth_of_the_streets_is_in_the_snapshot_s_own_frame() -> None:
+    """Recomputed rays, turned by offsets found on the uplink, equal the measured downlink up to its noise."""
+    data = city("all")
+    rows = fold().test
+    exact, source = truth(data, rows, data.site.subcarriers_hz)
+    miss = (exact - data.targets(rows)).abs().square().mean((1, 2))
+    power = exact.abs().square().mean((1, 2))
+    # Noise, and the tones a frequency offset leaks into one another.
+    assert source == "rays" and (miss < 1.2 * float(data.noise_variance[0]) + 1e-3 * power).all()
+
+
+def test_export_on_any_grid(trained) -> None:
+    data, file = trained
+    predictor = load(file)
+    rows = fold().test[:2]
+    heard = data.uplink[rows] * data.site.target_scale
+    wanted = centred(float(data.site.subcarriers_hz.mean()), 30e3, 48)
+    slot = predictor.csi(uplink=heard, frequency_hz=wanted, symbols=14)
+    assert slot.shape == (2, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
+    tones = predictor.csi(uplink=heard)
+    assert tones.shape == (2, 64, 26)
+    exact, _ = truth(data, rows, wanted)
+    miss = np.abs(slot[:, 0, 0, :, 0] - exact.numpy() * data.site.target_scale) ** 2
+    assert miss.mean() < 0.3 * np.mean(np.abs(exact.numpy() * data.site.target_scale) ** 2)
+    found = predictor.paths(heard)
+    assert found.gain.shape == found.delay_s.shape == (2, 16) and found.cosines.shape == (2, 16, 2)
+    assert np.abs(found.delay_s).max() < 1 / 312.5e3
+    with pytest.raises(ValueError, match=r"expected \(B, 64, 26\)"):
+        predictor.csi(uplink=heard[:, :8])
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
+    from gsparc.link.adaptation import Adaptation
+
+    generator = torch.Generator().manual_seed(0)
+    true = torch.randn(40, 26, dtype=torch.complex64, generator=generator)
+    loop = Adaptation()
+    found = loop.rates(true, true, 0.03)
+    assert np.array_equal(found.oracle, found.chosen) and found.oracle_bps.mean() > 5e6
+    careful = loop.rates(true, true, 0.03, backoff_db=3.0)
+    assert (careful.chosen <= found.oracle).all() and (careful.chosen < found.oracle).mean() > 0.5
+    deaf = loop.rates(true, true, 1e4)
+    assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_pusch_knows_who_knows_more() -> None:
+    from gsparc.link.pusch import Pusch, frequency_correlation
+
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    true = torch.randn(16, 1, dtype=torch.complex64, generator=generator).expand(16, 48).contiguous()
+    error = torch.randn(16, 48, dtype=torch.complex64, generator=generator) * 0.6
+    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
+    pusch = Pusch("qpsk", 4, 30, known, iterations=8)
+    assert np.isclose(pusch.pilot_share, 2 / 14)
+    power = true.abs().square().mean(1, keepdim=True).sqrt()
+    found = pusch.run(true, true + error * power, torch.full((16,), 0.36), 3.0, np.arange(128) % 16, 64)
+    wrong = {name: failed.mean() for name, failed in found.failed.items()}
+    assert wrong["perfect"] <= wrong["lmmse"] + 0.05 and wrong["lmmse"] <= wrong["ls"] + 0.05
+    assert wrong["predicted"] > wrong["perfect"] + 0.3
+    bits = {name: share.mean() for name, share in found.bit_errors.items()}
+    assert bits["perfect"] < bits["predicted"]
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
+    from hydra.core.hydra_config import HydraConfig
+
+    import gsparc.link.__main__ as command
+
+    data, file = trained
+    monkeypatch.setattr("gsparc.evaluate.load", lambda settings: data)
+    monkeypatch.setattr("gsparc.evaluate.split_for", lambda settings, found: _split())
+    config = compose(
+        f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
+        "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",
+        "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
+        config="link",
+    )  # fmt: skip
+    monkeypatch.setattr(
+        HydraConfig, "get", lambda: type("H", (), {"runtime": type("R", (), {"output_dir": tmp_path})})
+    )
+    facts = command.task(config)
+    assert {"mcs.png", "bler.png", "acceptance.png", "summary.json"} <= {p.name for p in tmp_path.iterdir()}
+    assert facts["beams/64/gain_db"] > facts["beams/8/gain_db"]
+    assert facts["pusch/qpsk/perfect/4dB/bler"] <= facts["pusch/qpsk/perfect/3dB/bler"]
+    assert facts["pusch/truth"] == "rays"
+
+
+def _split():
+    from gsparc.data.splits import Split, indices_hash
+
+    rows = np.arange(120)
+    one = fold()
+    whole = type(one)(
+        one.train[:40], one.val, rows[40:80].tolist() and np.concatenate([rows[40:80], one.test])
+    )
+    return Split("toy", (whole,), indices_hash((whole,)))

@@ -1,0 +1,69 @@
+"""The stand-in for Argos: its physics, its offsets, its layout."""
+
+from __future__ import annotations
+
+import numpy as np
+import yaml
+from cities import COUNT, folder
+
+from gsparc.simulate.argos_sim import CARRIER_HZ, SPACING_HZ, TONES, Offsets, snapshots, world
+from gsparc.simulate.streets import LIGHT, Streets, trace
+
+
+def _street(buildings: list, **more) -> Streets:
+    none = {"scatterers": np.zeros((0, 3)), "cross_section": np.zeros(0), "scatterer_phase": np.zeros(0)}
+    boxes = np.array(buildings, dtype=float).reshape(-1, 2, 2)
+    return Streets(boxes, np.full(len(boxes), -0.7), base=np.array([0.0, 0.0, 5.0]), **{**none, **more})
+
+
+def test_free_space_is_friis() -> None:
+    users = np.array([[30.0, 40.0, 5.0]])
+    rays = trace(_street([], ground=0.0), users, 0.125)
+    assert np.isclose(np.abs(rays.gain).max(), 0.125 / (4 * np.pi * 50))
+    assert np.isclose(rays.delay[0, np.abs(rays.gain[0]).argmax()], 50 / LIGHT)
+
+
+def test_a_wall_is_an_image() -> None:
+    """A wall at y = 10 to 20: the user at (20, 0) hears the mirrored base at (0, 20) through it."""
+    rays = trace(_street([[[-50, 10], [50, 20]]], ground=0.0), np.array([[20.0, 0.0, 5.0]]), 0.125)
+    strength = np.sort(np.abs(rays.gain[0]))[::-1]
+    assert np.isclose(strength[0], 0.125 / (4 * np.pi * 20))
+    assert np.isclose(strength[1], 0.7 * 0.125 / (4 * np.pi * np.hypot(20, 20)))
+    assert strength[2] == 0
+
+
+def test_a_building_blocks_and_its_corner_bends() -> None:
+    streets = _street([[[8, -10], [12, 2]]], ground=0.0)
+    behind = trace(streets, np.array([[20.0, 4.0, 5.0]]), 0.125)
+    assert streets.blocked(np.zeros((1, 2)), np.array([[20.0, 4.0]]))[0]
+    assert 0 < np.abs(behind.gain).max() < 0.5 * 0.125 / (4 * np.pi * 20)
+
+
+def test_delay_spread_and_hearing_are_as_stated() -> None:
+    there = world(400, seed=0)
+    spread = np.median(there.rays.delay_spread())
+    assert 50e-9 <= spread <= 100e-9
+    power = (np.abs(there.rays.gain) ** 2).sum(1)
+    assert (power > there.noise_power * 10**0.5).all()
+
+
+def test_offsets_are_a_switch() -> None:
+    there = world(40, seed=0)
+    clean = there.response(CARRIER_HZ + TONES * SPACING_HZ)
+    still = snapshots(there, Offsets(0.0, 0.0, 0.0))
+    noise = np.abs(still - clean) ** 2
+    assert np.isclose(noise.mean(), there.noise_power, rtol=0.02)
+    turned = snapshots(there, Offsets(1.0, 0.0, 0.0))
+    angle = np.angle((turned * clean.conj()).sum((1, 2)))
+    assert np.ptp(angle) > 3
+    assert np.ptp(np.angle((still * clean.conj()).sum((1, 2)))) < 0.1
+
+
+def test_layout_is_the_release_s() -> None:
+    place = folder()
+    csi = np.load(place / "csidata.npy")
+    assert csi.shape == (COUNT, 8, 52) and csi.dtype == np.complex64
+    content = yaml.safe_load((place / "base-station.yml").read_text())
+    assert np.shape(content["base_station"]) == (8, 3) and content["dataset_name"] == "argos-sim"
+    assert np.load(place / "csidata-64.npy").shape == (COUNT, 64, 52)
+    assert not list(place.parent.glob("*.partial"))

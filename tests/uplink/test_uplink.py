@@ -1,0 +1,128 @@
+"""Sources found in an uplink, and the methods that read one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from cities import city, deaf, fold
+
+from gsparc import checkpoint
+from gsparc.peers.fire import Fire
+from gsparc.peers.ridge import Ridge
+from gsparc.uplink.atoms import Aperture, Sources
+from gsparc.uplink.method import UplinkField
+from gsparc.uplink.search import SearchSettings, SourceSearch
+from gsparc.uplink.trust import unheard_noise
+
+
+def _aperture() -> Aperture:
+    side = torch.arange(8.0) - 3.5
+    return Aperture(torch.cartesian_prod(side, side) / 2, torch.arange(26.0) - 12.5)
+
+
+def _three() -> Sources:
+    direction = torch.tensor([[[0.31, -0.2], [-0.52, 0.11], [0.05, 0.63]]])
+    delay, gain = torch.tensor([[0.013, 0.091, -0.04]]), torch.tensor([[1.0, 0.5j, -0.3 + 0.1j]])
+    return Sources(direction, delay, gain, torch.zeros(1, 3), torch.zeros(1, 3))
+
+
+def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
+    aperture, truth = _aperture(), _three()
+    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=6, leakage=1e-6))
+    heard = truth.response(aperture)
+    found, left = search(heard, torch.tensor([1e-6]))
+    assert left.abs().square().mean() < 1e-5 * heard.abs().square().mean()
+    for which in range(3):
+        near = (found.delay[0] - truth.delay[0, which]).abs().argmin()
+        assert (found.direction[0, near] - truth.direction[0, which]).abs().max() < 1e-2
+        assert (found.gain[0, near] - truth.gain[0, which]).abs() < 1e-2
+    other = aperture.at(aperture.tones + 27)
+    miss = (found.response(other) - truth.response(other)).abs().square().mean()
+    assert miss < 1e-3 * truth.response(other).abs().square().mean()
+
+
+def test_noise_is_read_off_empty_delays() -> None:
+    aperture = _aperture()
+    generator = torch.Generator().manual_seed(0)
+    noise = torch.randn(1, 64, 26, dtype=torch.complex64, generator=generator) * 0.1
+    guess = unheard_noise(_three().response(aperture) + noise, aperture, (-0.12, 0.3))
+    assert 0.005 < float(guess) < 0.02
+
+
+@pytest.fixture(scope="module")
+def fitted():
+    data = city("all")
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), None)
+    return method, data
+
+
+def _share(method, data, rows) -> float:
+    batch = data.batch(rows)
+    miss = method.answer(batch).mean - batch.target
+    return float((miss.abs().square().sum((1, 2)) / batch.target.abs().square().sum((1, 2))).median())
+
+
+def test_beats_ridge_by_more_than_three_decibels(fitted) -> None:
+    method, data = fitted
+    ridge = Ridge()
+    ridge.fit(data, fold(), None)
+    assert _share(method, data, fold().test) < 0.5 * _share(ridge, data, fold().test)
+
+
+def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
+    """Whatever turns the uplink turns the prediction: offsets are the snapshot's, not the model's."""
+    method, data = fitted
+    uplink = data.batch(fold().test[:4]).uplink
+    noise = torch.full((4,), float(data.noise_variance[0]))
+    plain = method.listen(uplink, noise).mean
+    up, down = method.search.aperture.tones, method._downlink.tones
+    turned = method.listen(uplink * torch.polar(torch.ones(26), 0.4 - 0.15 * up), noise).mean
+    expected = plain * torch.polar(torch.ones(26), 0.4 - 0.15 * down)
+    close = (turned - expected).abs().square().sum() / expected.abs().square().sum()
+    assert close < 1e-2
+
+
+def test_confidence_is_a_share_and_is_larger_where_errors_are_smaller(fitted) -> None:
+    method, data = fitted
+    batch = data.batch(np.concatenate([fold().val, fold().test]))
+    found = method.answer(batch)
+    assert ((found.confidence > 0) & (found.confidence < 1)).all()
+    error = (found.mean - batch.target).abs().square().sum((1, 2)) / batch.target.abs().square().sum((1, 2))
+    sure = found.confidence > found.confidence.median()
+    assert error[sure].median() < error[~sure].median()
+
+
+@pytest.mark.parametrize(
+    "make", [lambda: Ridge(), lambda: Ridge("all"), lambda: Fire(hidden=16, code=4, steps=20, batch=16)]
+)
+def test_peers_answer_and_keep(make, tmp_path) -> None:
+    data = city()
+    method = make()
+    method.fit(data, fold(), tmp_path)
+    batch = data.batch(fold().test)
+    before = method.answer(batch).mean
+    assert before.shape == batch.target.shape
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, _ = checkpoint.load(tmp_path / "m.ckpt")
+    assert torch.allclose(again.answer(batch).mean, before)
+
+
+def test_kept_and_restored(fitted, tmp_path) -> None:
+    method, data = fitted
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    again, _ = checkpoint.load(tmp_path / "m.ckpt")
+    batch = data.batch(fold().test[:3])
+    assert torch.equal(again.answer(batch).mean, method.answer(batch).mean)
+
+
+def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
+    method, data = fitted
+    with pytest.raises(ValueError, match="has none"):
+        Ridge().fit(deaf(data), fold(), None)
+    batch = data.batch(fold().test[:2])
+    with pytest.raises(ValueError, match="not positions"):
+        method.predict(batch.tx, batch.rx)
+    with pytest.raises(ValueError, match="fit or restore"):
+        UplinkField().answer(batch)
