@@ -122,6 +122,8 @@ class GaussianModule(L.LightningModule):
             )
         else:
             self.log("val/mse", error.mean(), batch_size=size, prog_bar=True)
+        # Dashboards get the seconds beside every figure too.
+        self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
 
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""

@@ -73,7 +73,8 @@ def test_validation_names_its_figures(campaign, tmp_path, kind):
     data = campaign(kind)
     found = {}
     trained = module(data, tmp_path)
-    trained.log = lambda name, value, **k: found.update({name: value.item()})
+    trained.log = lambda name, value, **k: found.update({name: float(value)})
     trained.validation_step(data.batch(np.arange(4)), 0)
-    assert set(found) == ({"val/ssim_gauss", "val/psnr_db"} if kind == "spectrum" else {"val/mse"})
+    figures = {"val/ssim_gauss", "val/psnr_db"} if kind == "spectrum" else {"val/mse"}
+    assert set(found) == {*figures, "time/train_s"}  # seconds beside every figure
     assert np.isfinite(list(found.values())).all()

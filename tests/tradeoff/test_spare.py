@@ -118,7 +118,7 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     one = spare.reduced(method, {"searches": 1}, measured)
     assert len(one.members) == 1 and answer(one, data, fold.test).variance is not None
     few = spare.reduced(method, {"keep": 0.3}, measured)
-    assert 1 <= few.size() <= method.size() and np.isfinite(answer(few, data, fold.test).mean).all()
+    assert 1 <= few.size() <= method.size() and torch.isfinite(answer(few, data, fold.test).mean).all()
 
 
 def test_a_gaussian_process_spares_components_and_pixels(field):
