@@ -34,7 +34,7 @@ class Ledger:
         self.engine: str | None = None  # who stands in for the CPU's kernels; None: nobody
         self.tallies: dict[tuple[str, str, str], Tally] = defaultdict(Tally)
         self.counts: dict[str, Counter[str]] = defaultdict(Counter)
-        self.seconds: Counter[str] = Counter()
+        self.seeds: dict[str, list[tuple[float, float]]] = defaultdict(list)
 
     def rendered(self, engine: str, precision: str, seconds: float) -> None:
         """One forward and backward pass."""
@@ -51,6 +51,11 @@ class Ledger:
     def count(self, what: str, number: int = 1) -> None:
         """Examples of a property, bad inputs, kills, seeds."""
         self.counts[what][self.case] += number
+
+    def seed(self, dataset: str, figure_db: float, seconds: float) -> None:
+        """The error of one seed's short run [dB relative to the power], and what it took [s]."""
+        self.count("seeds")
+        self.seeds[dataset].append((figure_db, seconds))
 
 
 LEDGER = Ledger()

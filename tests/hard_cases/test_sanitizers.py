@@ -1,0 +1,94 @@
+"""The C++ kernels under AddressSanitizer and UndefinedBehaviorSanitizer, over hard cases and random fields.
+
+Remedy: none needed where nothing is found. The module is built apart (CMake option GSPARC_SANITIZE), and the
+tests of the kernels run on it unchanged: memory beside a tensor or a plan, overflowing integers, casts of
+numbers that the integer cannot hold end the run. Able to fail: a plan whose order leaves the tensors does.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ledger import LEDGER
+
+ROOT = Path(__file__).parents[2]
+SOURCES = sorted([*(ROOT / "ops" / "csrc").glob("*.*"), ROOT / "CMakeLists.txt"])
+CASES = [
+    *("seam", "pole", "horizon", "at_the_receiver", "needle_pancake", "zero_quaternion", "near_opaque"),
+    *("underflow", "ties", "nobody_there", "everybody_there", "threads", "fields_and_poses"),
+]
+OVERRUN = """
+import torch
+from gsparc.ops import SphereGrid, composite, make_plan
+def test_a_box_that_leaves_the_image():
+    means = torch.tensor([[2.0, 0.1, 0.5]])
+    model = (means, torch.tensor([[1.0, 0, 0, 0]]), torch.full((1, 3), 0.3), torch.tensor([0.5]))
+    plan = make_plan(*model, POSE, SphereGrid.hemisphere(8, 16))
+    plan.buffers[2][0, 0] = 100_000_000  # the Gaussian at this rank
+    composite(plan, *model, torch.ones(1, 1))
+"""
+
+
+def build() -> Path:
+    """The sanitized module; made again when a source has changed."""
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in SOURCES)).hexdigest()[:16]
+    folder = ROOT / "build" / f"sanitized-{digest}"
+    found = list(folder.glob("ops/csrc/_native*.so"))
+    if found:
+        return found[0]
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    given = ["-DGSPARC_SANITIZE=ON", f"-DPython_EXECUTABLE={sys.executable}", "-DCMAKE_BUILD_TYPE=Release"]
+    for command in (["cmake", "-S", ROOT, "-B", folder, *given], ["cmake", "--build", folder, "-j2"]):
+        subprocess.run(command, check=True, capture_output=True, text=True, env=environment, timeout=900)
+    return next(folder.glob("ops/csrc/_native*.so"))
+
+
+def library(name: str) -> str:
+    return subprocess.run(
+        ["g++", f"-print-file-name={name}"], check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+def watched(module: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """pytest on the sanitized module; leaks are Python's own, so they are not looked for."""
+    environment = {
+        **os.environ,
+        "LD_PRELOAD": f"{library('libasan.so')} {library('libstdc++.so')}",
+        "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=1:detect_odr_violation=0",
+        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
+        "OMP_NUM_THREADS": "2",
+    }
+    command = [sys.executable, "tests/sanitized.py", str(module), "-q", "-p", "no:cacheprovider", *arguments]
+    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
+
+
+@pytest.fixture(scope="module")
+def module() -> Path:
+    if not os.path.isabs(library("libasan.so")):
+        pytest.skip("this compiler has no AddressSanitizer")
+    return build()
+
+
+@pytest.mark.slow
+def test_nothing_is_found(module):
+    files = [f"tests/hard_cases/test_{case}.py" for case in CASES]
+    files += ["tests/ops/test_kernels.py", "tests/ops/test_face.py", "tests/ops/test_channels.py"]
+    files += ["tests/ops/test_networks.py", "tests/ops/test_similarity.py"]
+    done = watched(module, *files, "-m", "not slow", "-k", "not reference and not shim and not forked")
+    assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"
+    LEDGER.count("tests under sanitizers", int(done.stdout.rsplit(" passed", 1)[0].split()[-1]))
+
+
+@pytest.mark.slow
+def test_an_overrun_is_seen(module, tmp_path):
+    """Naive: the ordinary build may read beside its tensors and say nothing."""
+    pose = "from gsparc.ops import Pose\nPOSE = Pose.identity(torch.zeros(3))\n"
+    path = tmp_path / "test_overrun.py"
+    path.write_text(OVERRUN.replace("def test", pose + "def test", 1))
+    done = watched(module, str(path))
+    assert done.returncode != 0 and "AddressSanitizer" in done.stderr, done.stderr[-2000:]
