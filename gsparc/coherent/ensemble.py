@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 
 TURNING = 0.4  # share of a gain's variation that is not along its phase, before it is learned
 SHARPNESS = 4  # weight of a search = (left-out error)^-4: half the error again counts a fifth
+ENOUGH = 0.004  # left-out error of two searches below which no third is started: 24 dB
 LAST_START, ROUNDS_END = 0.6, 0.8  # of the budget: no search starts, no search adds sources after
 
 
@@ -68,6 +69,8 @@ def search_many(
 ) -> list[Member]:
     """One search on each of the drawn rows, best first; at least one, others while the budget lasts.
 
+    None is started any more once two have ended at the noise floor: they would say the same.
+
     Args:
         draw: rows of each search, unit mean power, about the middle of the scene.
         transmitter: (3,) float64 [m], in the same frame.
@@ -80,12 +83,16 @@ def search_many(
         stage: tells searches of one fit apart.
     """
     threads = torch.get_num_threads()
+    errors: list[float] = []
+    enough = max(ENOUGH, 2 * noise_floor)
 
     def search(number: int) -> Member | None:
         done = None if shelf is None else shelf.find(f"{stage} {number}")
         if done is not None:
             return done
         if number > 0 and budget.spent > LAST_START * budget.seconds:
+            return None
+        if sum(error < enough for error in errors) > 1:
             return None
         rows = draw[number]
         deadline = budget.started + ROUNDS_END * budget.seconds
@@ -105,6 +112,7 @@ def search_many(
             budget.spent, budget.seconds,
         )  # fmt: skip
         member = Member(phased, left_out)
+        errors.append(left_out)
         if shelf is not None:
             shelf.put(f"{stage} {number}", member)
         return member

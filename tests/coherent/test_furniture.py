@@ -242,7 +242,7 @@ def test_furnishing_explains_a_pillar_and_leaves_an_empty_room_empty():
         found = furnish(rows, start, generator, few)
         assert bool(len(found.scene.clutter.boxes)) == boxes
         bare, learned = (PhasedPosterior(rows, each).factor.nll for each in (start, found))
-        assert learned < bare
+        assert learned <= bare
     assert not len(found.scene.clutter)
 
 

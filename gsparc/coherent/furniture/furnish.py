@@ -16,7 +16,7 @@ from gsparc.coherent.furniture.clutter import SOFT, shade, tangents, within
 from gsparc.coherent.furniture.descent import Accord, descend
 from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, same_mirror, walls
 from gsparc.coherent.furniture.residual import Explained, Residual
-from gsparc.coherent.inphase import PhasedScene
+from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.phase import LIGHT
 from gsparc.coherent.planes import Word, all_words, images
 from gsparc.coherent.process import JITTER, Scene, steering
@@ -66,8 +66,19 @@ def furnish(
     deadline: float = math.inf,
     noise_floor: float = JITTER,
 ) -> PhasedScene:
-    """The phased scene with furniture; rows of one output, as many as a search looks at."""
-    return _Furnisher(rows, phased, generator, settings, noise_floor).run(deadline)
+    """The phased scene with furniture, or as it was when none pays.
+
+    Args:
+        rows: of one output, as many as a search looks at.
+        phased: from the last descent of a search, its visibility a `KernelVisibility`.
+        generator: of the candidates.
+        settings: how hard to look.
+        deadline: `time.monotonic()` after which nothing new is tried.
+        noise_floor: known variance of the noise, in units of the rows' power.
+    """
+    found = _Furnisher(rows, phased, generator, settings, noise_floor).run(deadline)
+    before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
+    return found if after < before - settings.progress else phased
 
 
 class _Furnisher:

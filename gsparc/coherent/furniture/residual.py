@@ -19,6 +19,7 @@ from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, View
 
 TRIED = 1.5  # factor between two noise variances tried
+LEAST_NOISE = 3e-4  # variance, in units of the rows' power; less is only found where a search is wrong
 CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # shares tried
 
 
@@ -71,7 +72,7 @@ class Residual:
                 while 0 <= at < len(CONSTANTS) and (new := cost(CONSTANTS[at], noise)) < best:
                     best, constant, at = new, CONSTANTS[at], at + direction
             for step in (-math.log(TRIED), math.log(TRIED)):
-                while (new := cost(constant, noise + step)) < best:
+                while noise + step > math.log(LEAST_NOISE) and (new := cost(constant, noise + step)) < best:
                     best, noise = new, noise + step
         scene = replace(phased.scene, visibility=replace(law, constant=constant), log_noise=noise)
         return replace(phased, scene=scene)
