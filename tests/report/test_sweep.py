@@ -1,0 +1,94 @@
+"""A sweep ends in one table and one figure; a failed job is said at once and takes none along."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from campaigns import brief, spectra
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.types import RunMode
+from omegaconf import OmegaConf
+
+from gsparc.report.sweep import FAILURE, SweepReport
+
+ROOT = Path(__file__).parents[2]
+
+
+def of_job(folder: Path, mode: RunMode = RunMode.MULTIRUN):
+    return OmegaConf.create({"hydra": {"mode": mode, "runtime": {"output_dir": str(folder)}}})
+
+
+def failed(error: Exception) -> JobReturn:
+    job = JobReturn()
+    job.return_value, job.status = error, JobStatus.FAILED
+    return job
+
+
+def test_a_failure_is_said_and_kept_and_the_sweep_goes_on(tmp_path, capsys):
+    job = failed(ValueError("no such file\nsecond line"))
+    SweepReport().on_job_end(of_job(tmp_path), job)
+    assert job.status == JobStatus.COMPLETED and job.return_value is None
+    assert (tmp_path / FAILURE).read_text() == "no such file\n"
+    said = capsys.readouterr().err
+    assert f"job {tmp_path.name} failed, the others go on: no such file" in said.replace("\n", " ")
+
+
+def test_a_single_run_and_a_good_job_are_left_alone(tmp_path):
+    single = failed(ValueError("x"))
+    SweepReport().on_job_end(of_job(tmp_path, RunMode.RUN), single)
+    assert single.status == JobStatus.FAILED
+    good = JobReturn()
+    good.return_value, good.status = 1.0, JobStatus.COMPLETED
+    SweepReport().on_job_end(of_job(tmp_path), good)
+    assert good.return_value == 1.0 and not list(tmp_path.iterdir())
+
+
+def of_sweep(folder: Path):
+    return OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}})
+
+
+def test_one_table_one_figure_and_a_page(three, tmp_path, capsys):
+    SweepReport(retime=False).on_multirun_end(of_sweep(tmp_path))
+    with (tmp_path / "sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["method and setting"] for row in rows] == [
+        "gsparc emission.hidden=8",
+        "gsparc emission.hidden=64",
+    ]
+    assert rows[0]["seeds"] == "2" and rows[0]["PSNR dB low"] == "28.0" and rows[0]["train s"] == "10.0"
+    assert (tmp_path / "sweep.png").stat().st_size > 20_000 and (tmp_path / "report.html").exists()
+    facts = json.loads((tmp_path / "summary.json").read_text())
+    assert facts["sweep/runs"] == 3 and facts["toy/random/gsparc emission.hidden=64/PSNR dB"] == 29.5
+    said = capsys.readouterr().out  # 80 columns may break an entry
+    assert "28.00 to" in said and "28.40" in said and "29.50" in said
+
+
+def test_a_sweep_with_a_failed_job_ends_with_status_1(three, tmp_path, capsys):
+    (tmp_path / "c0").mkdir()
+    (tmp_path / "c0" / FAILURE).write_text("it broke\n")
+    with pytest.raises(SystemExit) as end:
+        SweepReport(retime=False).on_multirun_end(of_sweep(tmp_path))
+    assert end.value.code == 1 and (tmp_path / "sweep.csv").exists()
+    assert "1 jobs failed: c0" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    settings = brief(file, "trainer.max_steps=4", "seed=0,1", "model.field.count=40,-1")
+    command = [sys.executable, "train.py", "-m", *[s for s in settings if s != "model.field.count=40"]]
+    sweep = tmp_path / "sweep"
+    done = subprocess.run(
+        [*command, f"hydra.sweep.dir={sweep}", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.count("failed, the others go on") == 2 and "2 jobs failed" in done.stdout
+    timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
+    assert len(timed) == 2 and all("count-40" in name for name in timed)
+    assert (sweep / "sweep.csv").read_text().count("\n") == 2
