@@ -32,6 +32,7 @@ METHODS = {
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "array": "gsparc.array.field.ArrayField",
     "array_mirrored": "gsparc.array.mirrored_field.MirroredField",
+    "bearings": "gsparc.bearings.field.BearingField",
     "gsparc": "gsparc.best.Gsparc",
     "committee": "gsparc.committee.Committee",
 }

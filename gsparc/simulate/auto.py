@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from scipy.stats import binom
 
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.effects import Effects
@@ -16,6 +17,7 @@ from gsparc.simulate.engine import Engine
 
 log = logging.getLogger(__name__)
 
+TIMED = 48  # probes that times are measured on
 TIMING_NOISE = 0.1  # a competing process moves a measured time by more than this
 
 
@@ -26,21 +28,24 @@ class AutoSettings:
     Attributes:
         deliverable: what must hold, in words (`attribution.Deliverable.parse`).
         quantile: share of receivers for which it must hold.
-        probes: receivers the decision is measured on, at least 16; it must hold at all of them, so that the
-            quantile is met with confidence 1 - quantile^probes.
+        probes: receivers the decision is measured on, at least 16, spread out.
+        confidence: with which the quantile must follow from them (`allowed_failures`).
         held_back: other receivers on which the promise is then verified.
         full: what "everything on" means.
     """
 
     deliverable: str = "coverage +-1 dB"
     quantile: float = 0.95
-    probes: int = 48
-    held_back: int = 96
+    probes: int = 128
+    confidence: float = 0.85
+    held_back: int = 128
     full: Effects = field(default_factory=lambda: Effects(depth=5))
 
     def __post_init__(self) -> None:
         if self.probes < 16 or self.held_back < 16:
             raise ValueError("effects.probes and effects.held_back: at least 16 receivers each, spread out")
+        if not 0 < self.confidence < 1:
+            raise ValueError(f"effects.confidence={self.confidence}: expected a share between 0 and 1")
         Deliverable.parse(self.deliverable, self.quantile)
 
 
@@ -97,7 +102,7 @@ class Choice:
         effects: to simulate.
         deliverable: what was promised, in words.
         table: one row per effect.
-        seconds_all, seconds_chosen: tracing the probes with everything and with the choice, both warm [s].
+        seconds_all, seconds_chosen: tracing `TIMED` probes with everything and with the choice, warm [s].
         seconds: what deciding cost in all [s].
         verdict: filled by `verify`.
     """
@@ -158,13 +163,17 @@ def decide(
         )
     dropped = removals(full)
     errors = {name: probe.errors(kept, deliverable)[heard] for name, kept in dropped.items()}
-    removable = tuple(name for name, error in errors.items() if error.max() <= deliverable.tolerance)
-    seconds_all = _timed(engine, receivers, full)
-    seconds = {name: _timed(engine, receivers, less) for name, less in dropped.items()}
+    failures = allowed_failures(int(heard.sum()), settings.quantile, settings.confidence)
+
+    def holds(error: np.ndarray) -> bool:
+        return bool((error > deliverable.tolerance).sum() <= failures)
+
+    removable = tuple(name for name, error in errors.items() if holds(error))
+    timed = receivers[:TIMED]
+    seconds_all = _timed(engine, timed, full)
+    seconds = {name: _timed(engine, timed, less) for name, less in dropped.items()}
     costs = {s: _estimate(s, full, seconds, seconds_all) for s in combinations(full, removable)}
-    chosen = _cheapest(
-        costs, lambda some: bool(probe.errors(some, deliverable)[heard].max() <= deliverable.tolerance), full
-    )
+    chosen = _cheapest(costs, lambda some: holds(probe.errors(some, deliverable)[heard]), full)
     why = explain(probe)
     table = []
     for name, less in dropped.items():
@@ -175,7 +184,7 @@ def decide(
             name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
             float(np.median(errors[name])), _p95(errors[name]), seconds[name], reason, kept,
         ))  # fmt: skip
-    seconds_chosen = seconds_all if chosen == full else _timed(engine, receivers, chosen)
+    seconds_chosen = seconds_all if chosen == full else _timed(engine, timed, chosen)
     return Choice(
         chosen, str(deliverable), tuple(table), seconds_all, seconds_chosen, time.perf_counter() - begin
     )
@@ -188,6 +197,15 @@ def verify(choice: Choice, settings: AutoSettings, held_back: Probe) -> Choice:
     met = float((errors <= deliverable.tolerance).mean())
     verdict = Verdict(len(errors), met, float(np.median(errors)), _p95(errors), met >= deliverable.quantile)
     return replace(choice, verdict=verdict)
+
+
+def allowed_failures(probes: int, quantile: float, confidence: float) -> int:
+    """Most probes that may break the tolerance while the promise still follows.
+
+    The largest c with P(Binomial(probes, 1 - quantile) <= c) <= 1 - confidence: were the promise broken, so
+    few failures would be that unlikely. 0 where even none proves nothing (too few probes).
+    """
+    return max(0, int(binom.ppf(1 - confidence, probes, 1 - quantile)) - 1)
 
 
 def _cheapest(costs: Mapping[Effects, float], holds: Callable[[Effects], bool], full: Effects) -> Effects:

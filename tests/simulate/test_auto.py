@@ -104,6 +104,27 @@ def test_what_is_dropped_together_is_judged_together():
     assert effects.refraction != effects.diffraction
 
 
+def test_few_failures_prove_the_quantile():
+    """One of 96 outside, when 5 % are, has a probability of 4.4 %; two have 13 %."""
+    assert auto.allowed_failures(96, 0.95, 0.9) == 1
+    assert auto.allowed_failures(128, 0.95, 0.85) == 3
+    assert auto.allowed_failures(48, 0.95, 0.9) == 0
+    assert auto.allowed_failures(16, 0.95, 0.9) == 0
+
+
+def test_one_odd_receiver_does_not_keep_everything():
+    """A single probe in a corner once kept every effect of a whole room."""
+    engine, count = Invented(RECORD), 128
+    whole = engine.trace(np.zeros((count, 3)), FULL)
+    odd = whole.gain.copy()
+    odd[4] *= 1e3  # receiver 0 hears almost only its diffuse path
+    engine.trace = lambda receivers, effects, seed=None: dataclasses.replace(whole, gain=odd)
+    probe = Probe(engine.trace(None, FULL), FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)),
+                  SpectrumSettings())  # fmt: skip
+    choice = auto.decide(engine, np.zeros((count, 3)), AutoSettings(full=FULL), probe, lambda p: {})
+    assert not choice.effects.diffuse and choice.effects.specular
+
+
 def test_a_broken_promise_is_said():
     choice = decided("coverage +-1 dB")
     other = Invented([(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]).trace(np.zeros((30, 3)), FULL)

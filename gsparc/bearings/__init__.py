@@ -1,0 +1,1 @@
+"""Spectra of a moving array: sources found where bearings cross, seen from wherever the receiver stands."""
