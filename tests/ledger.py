@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from statistics import median
 
 
 @dataclass
@@ -14,16 +15,33 @@ class Tally:
     """What one engine in one precision did for one case.
 
     Attributes:
-        examples: forward and backward passes.
-        seconds: their time in all [s].
+        times: seconds of each forward and backward pass.
         worst: part ("forward", "backward") -> largest error, relative to one plus the largest value wanted.
         share: part -> the same error as a share of what was allowed.
     """
 
-    examples: int = 0
-    seconds: float = 0.0
+    times: list[float] = field(default_factory=list)
     worst: dict[str, float] = field(default_factory=dict)
     share: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def examples(self) -> int:
+        """Number of passes."""
+        return len(self.times)
+
+    @property
+    def median_ms(self) -> float:
+        """Their median time [ms]."""
+        return 1e3 * median(self.times)
+
+
+@dataclass
+class Told:
+    """How the tests of one case ended, and their time [s]."""
+
+    passed: int = 0
+    failed: int = 0
+    seconds: float = 0.0
 
 
 class Ledger:
@@ -33,14 +51,13 @@ class Ledger:
         self.case = "other"
         self.engine: str | None = None  # who stands in for the CPU's kernels; None: nobody
         self.tallies: dict[tuple[str, str, str], Tally] = defaultdict(Tally)
+        self.tests: dict[str, Told] = defaultdict(Told)
         self.counts: dict[str, Counter[str]] = defaultdict(Counter)
         self.seeds: dict[str, list[tuple[float, float]]] = defaultdict(list)
 
     def rendered(self, engine: str, precision: str, seconds: float) -> None:
         """One forward and backward pass."""
-        tally = self.tallies[self.case, engine, precision]
-        tally.examples += 1
-        tally.seconds += seconds
+        self.tallies[self.case, engine, precision].times.append(seconds)
 
     def compared(self, engine: str, precision: str, part: str, error: float, allowed: float) -> None:
         """An error against the float64 reference, and what was allowed."""

@@ -1,4 +1,4 @@
-"""`python sanitized.py MODULE.so PYTEST_ARGUMENTS...`: tests on a build of the CPU kernels that is watched."""
+"""`python sanitized.py MODULE.so PYTEST_ARGUMENTS...`: tests on a build of the kernels that is watched."""
 
 from __future__ import annotations
 

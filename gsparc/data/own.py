@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, one_decibel_rms
+from gsparc.data.assemble import assemble, bad_positions, one_decibel_rms
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.own_checks import Checker
@@ -224,8 +224,10 @@ def _row_names(check: Checker, rows: int) -> list[str]:
 
 def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
     array = check.real("array_position", (antennas if antennas and antennas > 1 else None, 3))
-    if array is not None and not np.isfinite(array).all():
-        check.problems.add(check.where("array_position"), "not finite; expected coordinates in metres")
+    if array is not None and len(bad_positions(array)):
+        check.problems.add(
+            check.where("array_position"), "not finite, or not on Earth; expected coordinates in metres"
+        )
         return None
     return array
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from ledger import LEDGER
 from shim import serving
+from stability_table import write
 
 from gsparc.ops import cuda_library
 
@@ -28,5 +29,22 @@ def backend(request):
         LEDGER.engine = None
 
 
+def pytest_addoption(parser):
+    parser.addoption("--table", type=Path, help="write what was measured between the markers of this file")
+
+
 def pytest_runtest_setup(item):
     LEDGER.case = Path(item.path).stem.removeprefix("test_")
+
+
+def pytest_runtest_logreport(report):
+    told = LEDGER.tests[Path(report.fspath).stem.removeprefix("test_")]
+    told.seconds += report.duration
+    told.passed += report.when == "call" and report.passed
+    told.failed += report.failed
+
+
+def pytest_sessionfinish(session):
+    table = session.config.getoption("--table", None)
+    if table is not None:
+        write(table, LEDGER, Path(__file__).parent)

@@ -104,7 +104,7 @@ def test_a_parameter_that_would_overflow_stops_the_run_too(data, folds, tmp_path
 def test_a_run_that_is_poisoned_before_a_validation_leaves_the_evidence_too(data, folds, tmp_path):
     method = field(tmp_path / "own.npz", [SpoilAfterStep(9, "gaussians.means", 2)])
     method.training.settings = dataclasses.replace(method.training.settings, val_every=10)
-    with pytest.raises(NonFiniteLoss, match="Gaussian id 2, gaussians.means"):
+    with pytest.raises(NonFiniteLoss, match=r"Gaussian id 2, gaussians\.means"):
         method.fit(data, folds(len(data)).folds[0], tmp_path)
     assert (tmp_path / "nonfinite.pt").exists()
 

@@ -6,22 +6,31 @@ finite, untouched rows are bit-identical in everything, ids are permanent and un
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
+import lightning.pytorch as L
 import numpy as np
+import pytest
 import torch
+from campaigns import brief, compose, spectra
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ledger import LEDGER
 
 from gsparc.callbacks import Densify, OpacityReset
+from gsparc.data.load import load, split_for
 from gsparc.data.schema import Site
 from gsparc.emission import EmissionSettings
 from gsparc.encoding import EncodingSettings
 from gsparc.field import FieldSettings
 from gsparc.model import GaussianModel, ModelSettings
+from gsparc.module import NonFiniteLoss
 from gsparc.ops import Pose, SphereGrid
+from gsparc.registry import build
 from gsparc.schedule import OptimizerSettings, optimizer_for
 from gsparc.surgery import row_parameters
+from gsparc.trainer import TrainerSettings, Training
 
 SITE = Site(
     name="toy",
@@ -122,6 +131,65 @@ def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
                     assert place // 3 == opacity or torch.equal(a, b)
     learn(model, optimizer)
     assert all(p.isfinite().all() for p in model.parameters())
+
+
+NASTY = st.sampled_from([0.0, 1.0, -1.0, 1e-45, 1e38, -1e38, math.inf, -math.inf, math.nan])
+
+
+@settings(max_examples=40, deadline=None, derandomize=True, database=None)
+@given(count=st.integers(1, 12), draws=st.data())
+def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
+    """Gradients that overflowed or are NaN decide who is split; what comes out is finite all the same."""
+    LEDGER.count("examples of properties")
+    model, trainer = fresh(count)
+    learn(model, trainer.optimizers[0])
+    nasty = {
+        key: torch.tensor(draws.draw(st.lists(NASTY, min_size=count, max_size=count)))
+        for key in ("gradient", "seen", "radius")
+    }
+    densify = Densify(
+        0, 99, 1, 0.5, draws.draw(st.sampled_from([0.0, 1e9])), max_radius=5.0, max_gaussians=20
+    )
+    densify.statistics, trainer.global_step = nasty, 1
+    densify.on_train_batch_end(trainer, SimpleNamespace(model=model))
+    assert 1 <= len(model.gaussians) <= 20
+    assert all(p.isfinite().all() for p in model.parameters())
+    assert all(t.isfinite().all() for t in densify.statistics.values())
+    learn(model, trainer.optimizers[0])
+    assert all(p.isfinite().all() for p in model.parameters())
+
+
+class Fire(L.Callback):
+    """Gradients of the worst kinds instead of the right ones."""
+
+    def __init__(self, size: float, seed: int) -> None:
+        self.size, self.draw = size, torch.Generator().manual_seed(seed)
+
+    def on_before_optimizer_step(self, trainer, module, optimizer):
+        for parameter in module.parameters():
+            if parameter.grad is not None:
+                sign = torch.randn(parameter.shape, generator=self.draw).sign()
+                parameter.grad.copy_(self.size * sign if self.size else torch.zeros_like(sign))
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-38, 1.0, 1e18, 1e30, 3e38, math.inf, math.nan])
+def test_training_under_adversarial_gradients_ends_whole_or_stops_by_name(tmp_path, size):
+    """Densified, pruned and reset all the while; a run never goes on with a NaN."""
+    file = spectra(tmp_path / "own.npz")
+    data = load({"name": "own", "file": str(file)})
+    method = build(compose(*brief(file, "model.refit=false", "model.warm_start=false")).model)
+    densify = Densify(2, 30, 3, 0.0, 0.05, max_gaussians=80, min_gaussians=4, max_radius=50.0)
+    made = [Fire(size, 0), densify, OpacityReset(5, 30, 0.05)]
+    method.training = Training(TrainerSettings(max_steps=24, batch_size=8), callbacks=lambda: made)
+    try:
+        method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path)
+    except NonFiniteLoss as stopped:
+        assert "first offender: " in str(stopped) and (tmp_path / "nonfinite.pt").exists()
+        assert not math.isfinite(size) or size > 1e18
+        return
+    model = method.fitted()
+    assert all(p.isfinite().all() for p in model.parameters()) and 4 <= len(model.gaussians) <= 80
+    assert math.isfinite(size)
 
 
 def test_exchanging_the_parameter_alone_breaks():
