@@ -139,14 +139,13 @@ class _Furnisher:
     # ---- the loop ----
     def run(self, deadline: float) -> PhasedScene:
         s, start = self.settings, self.nll
-        self._descend(8)
+        best = start, self.phased
         for epoch in range(s.epochs):
             before = self.nll
             for move in (self._mirrors, self._patches, self._boxes, self._words):
                 if time.monotonic() < deadline:
                     move()
-            self._descend(16, s.soft[min(epoch, len(s.soft) - 1)])
-            self._descend(10)
+            self._loosen(s.soft[min(epoch, len(s.soft) - 1)])
             self._drop()
             self._weigh(self.phased)
             if time.monotonic() < deadline:
@@ -154,6 +153,8 @@ class _Furnisher:
                 self._descend(10)
                 self._drop()
                 self._weigh(self.phased)
+                self._drop_words()
+            best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, constant %.2f",
                 epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
@@ -161,7 +162,16 @@ class _Furnisher:
             )  # fmt: skip
             if time.monotonic() > deadline or self.nll > before - s.progress:
                 break
-        return self.phased
+        return best[1]
+
+    def _loosen(self, soft: float) -> None:
+        """Descend with softer edges, which feel what is farther away, then with those meant."""
+        before, nll = self.phased, self.nll
+        self._descend(16, soft)
+        self._descend(10)
+        if self.nll > nll:
+            self._stand(before)
+            self._descend(10)
 
     def _mirrors(self) -> None:
         s, scene = self.settings, self.scene
@@ -337,13 +347,18 @@ class _Furnisher:
                 if self.nll > nll + least:
                     self._stand(before)
                     number += 1
-        while len(self.scene.words) > 1:
-            gains = self.residual.gains_of_each(self.seen, self.scene.log_amplitude)[1:]
-            worst = int(gains.argmin()) + 1
-            if gains[worst - 1] > 0:
-                break
-            kept = [k for k in range(len(self.scene.words)) if k != worst]
-            self._stand(replace(self.phased, scene=self.scene.only(kept), phase=self.phased.phase[kept]))
+
+    def _drop_words(self) -> None:
+        """Take out the sources whose constant part does not pay, if what varies of them does not, either."""
+        gains = self.residual.gains_of_each(self.seen, self.scene.log_amplitude)
+        kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
+        dropped = len(gains) - len(kept)
+        if dropped:
+            residual, before, nll = self.residual, self.phased, self.nll
+            self._weigh(replace(before, scene=self.scene.only(kept), phase=before.phase[kept]))
+            if self.nll > nll + dropped * self.number:
+                self.residual = residual
+                self._stand(before)
 
 
 def _over(number: int, known: list[int]) -> list[Word]:
