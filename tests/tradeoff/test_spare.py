@@ -121,13 +121,15 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     assert 1 <= few.size() <= method.size() and torch.isfinite(answer(few, data, fold.test).mean).all()
 
 
-def test_a_gaussian_process_spares_components_and_pixels(field):
+def test_a_gaussian_process_spares_components_pixels_and_its_variance(field):
     data, fold = field.data, field.split.folds[0]
     method = GaussianProcess()
     method.fit(data, fold, Path())
-    whole = spare.reduced(method, {"keep": 1.0}, {})
-    assert away(method, whole, data, fold.test) < 1e-9
-    assert 0 < away(method, spare.reduced(method, {"keep": 0.2, "stride": 2}, {}), data, fold.test) < 0.3
+    whole = spare.reduced(method, {"confidence": False}, {})
+    assert away(method, whole, data, fold.test) < 1e-8 and answer(whole, data, fold.test).variance is None
+    assert spare.reduced(method, {"confidence": True}, {}) is method
+    few = spare.reduced(method, {"keep": 0.2, "stride": 2}, {})
+    assert few.size() < len(method.axes) and 0 < away(method, few, data, fold.test) < 0.3
 
 
 def test_a_committee_answers_with_some_of_its_members(field):
