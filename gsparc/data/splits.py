@@ -68,6 +68,7 @@ class SplitSettings:
         train_fraction: share of the rows that `sparse` trains on.
         train_count: thin each fold's training rows to this many (validation included); None keeps all.
         thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
+        spacing_m: keep only training rows at least this far apart, before the other two [m]; None keeps all.
     """
 
     name: str = "random"
@@ -82,6 +83,7 @@ class SplitSettings:
     train_fraction: float = 0.1
     train_count: int | None = None
     thin: float = 1.0
+    spacing_m: float | None = None
 
     def __post_init__(self) -> None:
         if self.name not in NAMES:
@@ -99,6 +101,8 @@ class SplitSettings:
             raise DataError(f"split.train_count={self.train_count}: expected at least 1 row")
         if self.folds < 2 or self.stretches_per_fold < 1:
             raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
+        if self.spacing_m is not None and not (np.isfinite(self.spacing_m) and self.spacing_m > 0):
+            raise DataError(f"split.spacing_m={self.spacing_m}: expected metres, above 0")
         if not (np.isfinite(self.buffer_m) and self.buffer_m >= 0):
             raise DataError(f"split.buffer_m={self.buffer_m}: expected metres, at least 0")
         if len(self.corner) != 2 or set(self.corner) - set("+-"):
@@ -161,6 +165,17 @@ def far_from(
     if len(candidates) == 0 or len(others) == 0:
         return candidates
     return candidates[cKDTree(positions[others]).query(positions[candidates])[0] > distance]
+
+
+def far_apart(positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int]) -> np.ndarray:
+    """A largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m]."""
+    tree, free = cKDTree(positions[rows]), np.ones(len(rows), dtype=bool)
+    kept = []
+    for i in np.random.default_rng(seed).permutation(len(rows)):
+        if free[i]:
+            kept.append(i)
+            free[tree.query_ball_point(positions[rows[i]], distance)] = False
+    return rows[np.sort(kept)]
 
 
 def indices_hash(folds: tuple[Fold, ...]) -> str:
@@ -254,6 +269,8 @@ def _block(positions: np.ndarray, settings: SplitSettings) -> tuple[np.ndarray, 
 
 def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarray, s: SplitSettings) -> Fold:
     """Thin the training rows, then set some of them aside for validation."""
+    if s.spacing_m is not None:
+        train = far_apart(positions, train, s.spacing_m, [s.seed, fold, 3])
     rng = np.random.default_rng([s.seed, fold, 1])
     keep = len(train) if s.train_count is None else s.train_count
     keep = max(min(keep, round(s.thin * len(train))), 1) if len(train) else 0

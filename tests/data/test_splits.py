@@ -182,3 +182,16 @@ def test_split_for_reads_the_config_group(rfid_folder, tmp_path):
 def test_grouped_on_the_real_path_keeps_most_training_rows(real_rfid):
     split = split_for({"name": "grouped"}, load_rfid(real_rfid))
     assert all(len(f.train) + len(f.val) > 100 for f in split.folds)
+
+
+def test_thinning_by_distance_leaves_the_test_rows_alone():
+    positions = np.random.default_rng(0).uniform(0, 10, (600, 3)) * [1, 1, 0]
+    dense, thin = (make_split(positions, SplitSettings(spacing_m=d)).folds[0] for d in (None, 0.8))
+    np.testing.assert_array_equal(dense.test, thin.test)
+    kept = np.concatenate([thin.train, thin.val])
+    apart = np.linalg.norm(positions[kept][:, None] - positions[kept][None], axis=-1)
+    assert apart[~np.eye(len(kept), dtype=bool)].min() >= 0.8
+    left = np.setdiff1d(np.concatenate([dense.train, dense.val]), kept)
+    assert np.linalg.norm(positions[left][:, None] - positions[kept][None], axis=-1).min(1).max() < 0.8
+    with pytest.raises(DataError, match="spacing_m"):
+        SplitSettings(spacing_m=0.0)
