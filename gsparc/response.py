@@ -141,6 +141,9 @@ class ArrayResponse(nn.Module):
         ValueError: the site's spectra have no array to go through.
     """
 
+    matrix: Tensor
+    pattern: Tensor | None
+
     def __init__(self, site: Site, pattern: float) -> None:
         super().__init__()
         problem = site_problem(site)

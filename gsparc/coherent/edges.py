@@ -128,8 +128,8 @@ def propose(
     rough = torch.cat(
         [_matched(rows, p, a, transmitter, factor) for p, a in zip(*_blocks(point, axis), strict=True)]
     )
-    best = rough.topk(min(search.polished, len(rough))).indices
-    point, axis = _polished(rows, point[best], axis[best], transmitter, factor, search)
+    top = rough.topk(min(search.polished, len(rough))).indices
+    point, axis = _polished(rows, point[top], axis[top], transmitter, factor, search)
     gained = _score(rows, point, axis, transmitter, factor)
     best = int(gained.argmax())
     # A free complex gain that explains nothing but noise is worth one nat.
