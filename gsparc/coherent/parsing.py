@@ -93,6 +93,66 @@ def vote(sources: Tensor, relative: float = 0.03, most: int = 10) -> Tensor | No
     return torch.stack(chosen) if chosen else None
 
 
+def upright(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor | None:
+    """The fewest planes (P, 4) along three perpendicular directions that spell most of a scene's sources.
+
+    Rooms are mostly boxes: two perpendicular walls tell the third direction, and a pair of sources that
+    differ along a direction only tells a plane. None when no two planes are perpendicular.
+
+    Args:
+        scene: sources that need not be spelled well.
+        most: planes.
+        near: how far a source may be from its spelling [m], and 1 % of its distance from the transmitter.
+    """
+    triad = _triad(scene)
+    if triad is None:
+        return None
+    sources = scene.sources
+    allowed = near + 0.01 * (sources - sources[0]).norm(dim=1)
+    first, second = torch.triu_indices(len(sources), len(sources), 1)
+    candidates = []
+    for direction in triad:
+        apart = sources[second] - sources[first]
+        along = apart @ direction
+        beside = (apart - along[:, None] * direction).norm(dim=1)
+        fits = (beside < torch.maximum(allowed[first], allowed[second])) & (along.abs() > 2 * WALL)
+        offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
+        candidates += [torch.cat([direction, offset[None]]) for offset in offsets]
+    chosen, spelled = torch.zeros(0, 4, dtype=sources.dtype), 1.0
+    for _ in range(most):
+        tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
+        gains = [_spelled(scene, planes, allowed) for planes in tried]
+        if not gains or max(gains) < spelled + 0.8:
+            break
+        best = gains.index(max(gains))
+        chosen, spelled = tried[best], gains[best]
+    return chosen if len(chosen) else None
+
+
+def _triad(scene: Scene) -> Tensor | None:
+    """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
+    used = [sum(i in word for word in scene.words) for i in range(len(scene.planes))]
+    normals = scene.planes[:, :3] / scene.planes[:, :3].norm(dim=1, keepdim=True)
+    best: tuple[int, Tensor] | None = None
+    for i in range(len(used)):
+        for j in range(i):
+            if (normals[i] @ normals[j]).abs() < 0.02 and (best is None or used[i] + used[j] > best[0]):
+                second = normals[j] - (normals[j] @ normals[i]) * normals[i]
+                second = second / second.norm()
+                third = torch.linalg.cross(normals[i], second)
+                best = used[i] + used[j], torch.stack([normals[i], second, third])
+    return None if best is None else best[1]
+
+
+def _spelled(scene: Scene, planes: Tensor, allowed: Tensor) -> float:
+    """How many sources have a word over planes, near ones counting more and long words less."""
+    words: list[Word] = [(), *all_words(list(range(len(planes))), 2)]
+    position = images(scene.transmitter, planes, words)
+    distance = torch.cdist(scene.sources, position) / allowed[:, None]
+    worth = (1 - 0.5 * distance.square()).clamp_min(0) * torch.tensor([0.95 ** len(word) for word in words])
+    return float(worth.amax(1).sum())
+
+
 def respell(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
     """All sources spelled anew over `walls`; what has no spelling gets a plane of its own."""
     sources = scene.sources

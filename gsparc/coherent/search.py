@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.coherent.backprojection import Effort, pick_apart, score, search_box
-from gsparc.coherent.parsing import prune, respell, vote, without_planes
+from gsparc.coherent.parsing import prune, respell, upright, vote, without_planes
 from gsparc.coherent.phase import LIGHT
 from gsparc.coherent.planes import Word, all_words, bisector, images, reflect
 from gsparc.coherent.process import Posterior, Scene, steering
@@ -128,6 +128,7 @@ class Search:
         s = self.settings
         self._refine(20)
         self._revote()
+        self._respell(upright(self.scene))
         self.scene = without_planes(self.rows, self.scene, 3 * self.wavelength)
         self._grow_words()
         self._refine(s.steps)
@@ -202,7 +203,10 @@ class Search:
         """Find the walls among all pairs of sources and spell every source over them, if that is shorter."""
         if len(self.scene.words) < 6:
             return
-        walls = vote(self.scene.sources)
+        self._respell(vote(self.scene.sources))
+
+    def _respell(self, walls: Tensor | None) -> None:
+        """Spell every source over these walls, if that is shorter."""
         if walls is None:
             return
         before = self.scene

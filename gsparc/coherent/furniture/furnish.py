@@ -24,7 +24,7 @@ from gsparc.coherent.rows import Rows
 
 log = logging.getLogger(__name__)
 
-BOX, PATCH, MIRROR = 6, 4, 5  # numbers of a box, a patch, a patch on a plane of its own
+BOX, PATCH, MIRROR, WALL = 6, 4, 5, 3  # numbers of a box, a patch, a patch on a new plane, a new plane
 SURE = 1.0  # concentration from which on phases of new sources are foretold
 SAME_FACE = 0.03  # [m]; a face that has moved less is not tried again
 NEAR_WALL = 0.25  # [m]; faces that close to the end of the room are not tried as mirrors
@@ -242,7 +242,16 @@ class _Furnisher:
     def _hang(self, mirror: SmallMirror) -> bool:
         """Try a small mirror with the words over it that pay."""
         trial, words = self._with_mirror(mirror)
+        if self._wide(mirror):  # rather a wall
+            endless = replace(trial, clutter=self.scene.clutter)
+            if self._add(endless, words, 1.5, WALL * self.number, len(words)):
+                return True
         return self._add(trial, words, 1.5, MIRROR * self.number, len(words))
+
+    def _wide(self, mirror: SmallMirror) -> bool:
+        """Whether a mirror reaches over most of the room."""
+        ends = self.room @ tangents(mirror.plane).T
+        return bool((mirror.patch[2:] - mirror.patch[:2] > 0.7 * (ends[1] - ends[0]).abs()).all())
 
     def _promises(
         self, scene: Scene, words: list[Word], explained: Explained

@@ -26,6 +26,7 @@ LEAST_SIDE = 0.05  # [m]
 PARALLEL = 0.999  # cosine of normals that are one
 CELL = 0.35  # [m] of the raster on which small mirrors are looked for
 STEP = 0.08  # of a wavelength, between planes tried
+BEHIND = 0.4  # [m], how far behind the receivers' box planes are tried
 LONGEST = 6  # cells along each side of a rectangle
 TINY = 4  # receivers that a small mirror must serve
 
@@ -144,7 +145,9 @@ def find_mirrors(
     scale = explained.root.square().sum(0).view(2, -1).mean(0)  # what a row knows, diagonal of K^-1
     for normal in directions(planes, numbers):
         ends = (room.double() @ normal).sort().values
-        offsets = torch.arange(float(ends[0]), float(ends[1]), STEP * wavelength, dtype=torch.float64)
+        offsets = torch.arange(
+            float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
+        )
         candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
         total, corners = _raster(rows, pulled, scale, transmitter, candidates, known, room)
         for number in total.topk(min(2 * most, len(total))).indices.tolist():
@@ -194,7 +197,9 @@ def _raster(
         served.append(_binned(inside.float(), index, cells))
     sums = [_integral(torch.stack(t)) for t in (matched[::2], matched[1::2], power, served)]
     total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
-    for wide, high_by in product(range(1, min(LONGEST, cells[0]) + 1), range(1, min(LONGEST, cells[1]) + 1)):
+    # a few cells, or all there are: a wall that was missed
+    sizes = [sorted({*range(1, min(LONGEST, count) + 1), count}) for count in cells]
+    for wide, high_by in product(*sizes):
         real, imag, energy, count = (
             s[..., wide:, high_by:] - s[..., :-wide, high_by:] - s[..., wide:, :-high_by]
             + s[..., :-wide, :-high_by]
