@@ -9,7 +9,7 @@ SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
 RFID ?= ../shared/data/rfid-s23-160
-.PHONY: browser results help setup sionna cuda demo test test-slow bench lint typecheck format clean
+.PHONY: browser results help setup sionna cuda demo test test-slow hard-cases bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -50,6 +50,9 @@ results: setup ## README's results table, measured anew (RFID=folder of the rele
 
 test-slow: setup sionna browser ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(RUN) -m pytest -m slow --durations=10
+
+hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
+	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md
 
 bench: setup ## timings of the kernels as ratios
 	$(RUN) -m gsparc.bench

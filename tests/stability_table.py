@@ -54,9 +54,9 @@ def _remedy(path: Path) -> str:
 def _kernels(ledger: Ledger) -> str:
     out = [
         "\n### Accuracy of the kernels, and its time\n\n"
-        "Worst difference to the float64 reference, relative to one plus the largest value; `of allowed` is\n"
-        "the largest share of the tolerance that any example used. Milliseconds are medians of one forward and\n"
-        "backward pass, `x truth` their ratio to those of the float64 reference in this run.\n\n"
+        "Worst difference to the float64 reference, relative to one plus the largest value;\n"
+        "`of allowed` is the largest share of the tolerance that any example used. `ms` is the median of\n"
+        "one forward and backward pass, `x truth` its ratio to the float64 reference's in this run.\n\n"
         "| case | backend | precision | examples | forward | backward | of allowed | ms | x truth |\n"
         "|---|---|---|---:|---:|---:|---:|---:|---:|\n"
     ]
