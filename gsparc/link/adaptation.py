@@ -66,7 +66,7 @@ class Adaptation:
             chosen.append(own)
             oracle_fails.append(self._fails(best, there))
             chosen_fails.append(self._fails(own, there))
-        best, own = (torch.cat(x).flatten().cpu().numpy().astype(int) for x in (oracle, chosen))
+        right, taken = (torch.cat(x).flatten().cpu().numpy().astype(int) for x in (oracle, chosen))
         lost_best, lost_own = (
             torch.cat(x).flatten().cpu().double().numpy() for x in (oracle_fails, chosen_fails)
         )
@@ -74,10 +74,10 @@ class Adaptation:
         snr = true.abs().square().mean(1) / noise
         return Rates(
             float(10 * snr.median().log10()),
-            best,
-            own,
-            full[best] * (1 - lost_best),
-            full[own] * (1 - lost_own),
+            right,
+            taken,
+            full[right] * (1 - lost_best),
+            full[taken] * (1 - lost_own),
             lost_best > OUTAGE,
             backoff_db,
         )

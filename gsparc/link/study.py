@@ -154,26 +154,28 @@ def _joined(first: Blocks, second: Blocks) -> Blocks:
 
 def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
     """Curves by name: each receiver on all and on accepted positions, prediction with fallback on all."""
+    taken = [accepted[b.position] for b in found]
     wanted: dict[str, Curve] = {}
     for name in RECEIVERS:
-        wanted[f"{name}"] = _curve(found, lambda b, n=name: (b.failed[n], b.bit_errors[n]))
+        failed, wrong = [b.failed[name] for b in found], [b.bit_errors[name] for b in found]
+        wanted[name] = _curve(found, failed, wrong)
         wanted[f"{name}@accepted"] = _curve(
             found,
-            lambda b, n=name: (b.failed[n][accepted[b.position]], b.bit_errors[n][accepted[b.position]]),
+            [f[t] for f, t in zip(failed, taken, strict=True)],
+            [w[t] for w, t in zip(wrong, taken, strict=True)],
         )
     wanted["fallback"] = _curve(
         found,
-        lambda b: (
-            np.where(accepted[b.position], b.failed["predicted"], b.failed[FALLBACK]),
-            np.where(accepted[b.position], b.bit_errors["predicted"], b.bit_errors[FALLBACK]),
-        ),
+        [np.where(t, b.failed["predicted"], b.failed[FALLBACK]) for b, t in zip(found, taken, strict=True)],
+        [
+            np.where(t, b.bit_errors["predicted"], b.bit_errors[FALLBACK])
+            for b, t in zip(found, taken, strict=True)
+        ],
     )
     return wanted
 
 
-def _curve(found: list[Blocks], pick: Callable[[Blocks], tuple[np.ndarray, np.ndarray]]) -> Curve:
-    picked = [pick(b) for b in found]
-    failed, wrong = [p[0] for p in picked], [p[1] for p in picked]
+def _curve(found: list[Blocks], failed: list[np.ndarray], wrong: list[np.ndarray]) -> Curve:
     return Curve(
         np.array([b.ebno_db for b in found]),
         np.array([f.mean() if len(f) else np.nan for f in failed]),

@@ -56,7 +56,7 @@ class Streets:
         """Whether points (S, 2) [m] lie outside every building: (S,) bool."""
         low, high = self.buildings[:, 0], self.buildings[:, 1]
         inside = (points[:, None] >= low) & (points[:, None] <= high)
-        return ~inside.all(axis=-1).any(axis=1)
+        return ~np.any(np.all(inside, axis=-1), axis=1)
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,8 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
         first = walls[sequence[0]]
         if first[4] * (base[first[0]] - first[1]) <= 0:  # the base looks at this wall's back
             continue
-        users, points, target = np.arange(len(flat)), [], flat
+        users, target = np.arange(len(flat)), flat
+        points: list[np.ndarray] = []
         for i, image in zip(reversed(sequence), reversed(images), strict=False):
             axis, coordinate, low, high, sign, _ = walls[i]
             front = sign * (target[:, axis] - coordinate) > 0
