@@ -1,4 +1,7 @@
-"""Accuracy against what it costs: seconds of training on the left, milliseconds of a query on the right."""
+"""Accuracy against what it costs: processor time of training on the left, a query's milliseconds on the right.
+
+Processor time, because a busy machine stretches the clock and not the work.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +24,8 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
     """A line of panels per dataset and split; a method keeps its colour, a line joins its budgets."""
     rooms = list(dict.fromkeys((r.dataset, r.split) for r in rows))
     names = list(dict.fromkeys(r.method for r in rows))
-    palette = matplotlib.colormaps["tab20"]
-    looks = {name: (palette(i % 20), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
+    palette = matplotlib.colormaps["tab10"]
+    looks = {name: (palette(i % 10), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
     figure = Figure(figsize=(11, 3.4 * len(rooms) + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(rooms), 2, squeeze=False, sharey="row")
@@ -32,7 +35,7 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
             colour, mark = looks[name]
             own = sorted((r for r in here if r.method == name), key=lambda r: r.budget_s or 0)
             style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 7, "capsize": 2}
-            for axis, horizontal in ((line[0], "train_s"), (line[1], "query_ms")):
+            for axis, horizontal in ((line[0], "train_cpu_s"), (line[1], "query_ms")):
                 points = [r for r in own if getattr(r, horizontal) is not None]
                 if points:
                     axis.errorbar(
@@ -44,7 +47,7 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
                     )
         line[0].set_ylabel(LABEL[here[0].figure])
         line[0].set_title(f"{dataset}, split {split}", loc="left", fontsize=10)
-        line[0].set_xlabel("training of one model [s]")
+        line[0].set_xlabel("training of one model, processor time [s]")
         line[1].set_xlabel("one query, median [ms]")
         for axis in line:
             axis.set_xscale("log")
