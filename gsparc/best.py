@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.effects import (
@@ -71,6 +72,11 @@ class Gsparc(LearnedField):
         chosen = self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
         return chosen + hybrid
 
+    @property
+    def answering(self) -> tuple[Method, Rest | None]:
+        """What computes the answers, itself when no effect is on, and what is added to them."""
+        return (self if self._chosen is None else self._models[self._chosen]), self._rest
+
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Decide, then train what was decided on; the probe's time is part of the bill."""
         self.site = data.site
@@ -84,11 +90,10 @@ class Gsparc(LearnedField):
         else:
             self._go_on(self._models[self._chosen])
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
-            budget_s = self.training.settings.budget_s
-            chosen = self._models[self._chosen]
-            if budget_s is not None and hasattr(chosen, "budget_s"):
+            chosen, budget_s = self._models[self._chosen], self.training.settings.budget_s
+            if isinstance(chosen, VirtualSourceGP) and budget_s is not None:
                 chosen.budget_s = budget_s - sum(d.seconds for d in self.decisions)
-            report = self._models[self._chosen].fit(data, fold, run_dir)
+            report = chosen.fit(data, fold, run_dir)
             decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data)
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)

@@ -22,6 +22,7 @@ WORDS = {
     "projection": lambda value: f"{value} projection",
     "frozen": lambda value: "frozen plan" if value else "live plan",
     "confidence": lambda value: "" if value else "no confidence",
+    "hybrid": lambda value: "" if value else "no rest",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
     "members": lambda value: "+".join(value),
 }

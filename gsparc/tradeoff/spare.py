@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from itertools import product
 from types import ModuleType
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
+from gsparc.best import Gsparc
 from gsparc.data.schema import Measurements
-from gsparc.method import Method
+from gsparc.hybrid import Rest
+from gsparc.method import Method, Prediction
+from gsparc.ops import Pose
 from gsparc.tradeoff.points import Settings
+from gsparc.tradeoff.view import View
 
 FAMILIES = {  # the most special class first
     "gsparc.committee.Committee": "gsparc.tradeoff.members",
@@ -22,14 +28,39 @@ FAMILIES = {  # the most special class first
     "gsparc.peers.gp.GaussianProcess": "gsparc.tradeoff.components",
     "gsparc.learned.LearnedField": "gsparc.tradeoff.splatted",
 }
-AS_TRAINED = {"keep": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True}  # else: None
+AS_TRAINED = {
+    "keep": 1.0,
+    "stride": 1,
+    "cutoff": 1,
+    "confidence": True,
+    "frozen": True,
+    "hybrid": True,
+}  # else: None
 Measured = dict[str, Tensor]
 
 
 def answering(method: Method) -> Method:
     """The method that computes the answers: what `model=gsparc` decided on, else itself."""
-    chosen = getattr(method, "_chosen", None)
-    return method if chosen is None else method._models[chosen]  # type: ignore[attr-defined]
+    return method.answering[0] if isinstance(method, Gsparc) else method
+
+
+def _rest(method: Method) -> Rest | None:
+    """What is added to its answers."""
+    return method.answering[1] if isinstance(method, Gsparc) else None
+
+
+class WithRest(View):
+    """Answers plus the process of what sources leave over."""
+
+    def __init__(self, inner: Method, rest: Rest) -> None:
+        super().__init__(inner)
+        self.rest = rest
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        said = self.inner.predict(tx, rx)
+        return replace(said, mean=said.mean + self.rest.at(rx.position.reshape(-1, 3).expand(len(tx), 3)))
 
 
 def family(method: Method) -> ModuleType | None:
@@ -44,7 +75,8 @@ def family(method: Method) -> ModuleType | None:
 def knobs(method: Method) -> tuple[str, ...]:
     """Names of the settings that mean something to a method."""
     known = family(method)
-    return () if known is None else known.knobs(answering(method))
+    own = () if known is None else known.knobs(answering(method))
+    return own if _rest(method) is None else (*own, "hybrid")
 
 
 def measure(method: Method, data: Measurements, rows: np.ndarray) -> Measured:
@@ -58,7 +90,9 @@ def reduced(method: Method, settings: Settings, measured: Measured) -> Method:
     known = family(method)
     if not settings or known is None:
         return method
-    return known.reduced(answering(method), settings, measured)
+    own = {knob: value for knob, value in settings.items() if knob != "hybrid"}
+    found, rest = known.reduced(answering(method), own, measured), _rest(method)
+    return WithRest(found, rest) if rest is not None and settings.get("hybrid", True) else found
 
 
 def combinations(

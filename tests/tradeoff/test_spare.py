@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -161,3 +163,17 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
     assert strongest.size() == weakest.size() == 20
     assert away(method, strongest, data, fold.test) < away(method, weakest, data, fold.test)
     assert away(method, spare.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
+
+
+def test_what_a_hybrid_adds_stays_unless_it_is_spared(field):
+    data, fold = field.data, field.split.folds[0]
+    method = copy.copy(field.methods[0])
+    measured = spare.measure(method, data, fold.train)
+    assert "hybrid" not in spare.knobs(method)
+    method._rest = SimpleNamespace(at=lambda places: 1.0)
+    assert "hybrid" in spare.knobs(method)
+    plain, added = (
+        answer(spare.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
+        for on in (False, True)
+    )
+    assert torch.equal(plain + 1, added)
