@@ -1,4 +1,4 @@
-"""Accuracy against what it costs: processor time of training on the left, a query's milliseconds on the right.
+"""Accuracy against what it costs: processor time of training on the left, one query on the right.
 
 Processor time, because a busy machine stretches the clock and not the work.
 """
