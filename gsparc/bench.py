@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from gsparc import cli
-from gsparc.benchmark import kernels, layers
+from gsparc.benchmark import kernels, layers, steps
 from gsparc.benchmark.case import Case
 from gsparc.benchmark.claims import claims
 from gsparc.benchmark.measure import Machine, Row, facts, measure
@@ -51,6 +51,8 @@ def cases(config: DictConfig) -> Iterator[Case]:
             yield layers.emission_backward(count, batch)
     for batch in config.batches:
         yield layers.loss(batch)
+    for projection in config.projections:
+        yield steps.step(projection)
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsparc.benchmark import kernels, layers
+from gsparc.benchmark import kernels, layers, steps
 from gsparc.benchmark.case import Call
 from gsparc.benchmark.measure import Machine, measure, undisturbed
 from gsparc.benchmark.scene import Scene, scene
@@ -60,6 +60,7 @@ def claims(
             *_frozen(middle, batch, clock),
             *_channels(middle, clock),
             *_growth(fields, clock),
+            *_learning(projection),
         ]
     finally:
         torch.set_num_threads(before)
@@ -93,6 +94,14 @@ def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
             *(batch * times["moving"] / times["many"], 10.0, True),
         ),
     ]
+
+
+def _learning(projection: Projection) -> list[Claim]:
+    """A step takes the same way in either, to 1e-4: what it costs less, a given accuracy costs less."""
+    case = steps.step(projection)
+    assert case.reference is not None
+    ratio = _ratio(case.reference, case.kernel, ClockSettings(rounds=3, least=2, warmup=1, budget_s=2.0))
+    return [Claim(f"training step, PyTorch / kernels at {case.count}", ratio, 2.0, True)]
 
 
 def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:

@@ -61,14 +61,16 @@ class Scene:
         )
 
 
-def scene(count: int, projection: Projection, emission: EmissionSettings = PAPER) -> Scene:
+def scene(
+    count: int, projection: Projection, emission: EmissionSettings = PAPER, backend: str | None = None
+) -> Scene:
     """A room of `count` Gaussians, half a spacing in size, of all shapes and opacities (seeded)."""
     with torch.random.fork_rng():
         torch.manual_seed(count)
         settings = ModelSettings(
             FieldSettings(count=count, init="uniform", margin=0.0),
             emission,
-            raster=RasterSettings(projection),
+            raster=RasterSettings(projection, backend=backend),
         )
         model = ComplexSpectra(settings, _site())
         _scatter(model.gaussians)

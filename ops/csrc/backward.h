@@ -10,17 +10,16 @@ namespace GSPARC_ISA {
 
 // A cell holds what one tile needs: transmittance, what is still to come, upstream gradient per channel.
 template <class S, bool kTangent, bool kHides, int kChannels>
-void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>& ranked, const TileTables<S>& grid, int task,
+void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch,
                               S* cells, S* sums_memory, S* moments, S* feature_slots) {
     constexpr int n = Lanes<S>::n;
     const CompositeArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.lens.height, task);
-    const int k_count = kChannels ? kChannels : ranked.width - 2, cell = (2 + k_count) * n;
-    const Vec<S> alpha_max = splat(a.lens.alpha_max);
-    const Lit<S> lit = {cells, cell, splat(a.lens.transmittance_min)};
+    const int k_count = kChannels ? kChannels : channels_of(a), cell = (2 + k_count) * n;
+    const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
     const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
-    fill(cells, int64_t(grid.tiles) * cell, S(0));
-    for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
+    fill(cells, int64_t(stage.tiles) * cell, S(0));
+    for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
     each_stretch<S>(strip, a.lens.width, [&](int tile, int lane, int64_t pixel, int count) {
         S *behind = cells + int64_t(tile) * cell + n + lane, *g = behind;
         for (int k = 0; k < k_count; ++k) {
@@ -32,37 +31,40 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Ranked<S>
         if (b.grad_transmittance)
             for (int j = 0; j < count; ++j) behind[j] += b.grad_transmittance[at + j] * a.transmittance[at + j];
     });
-    Vec<S> local[kChannels ? kChannels : 1];
-    for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-        if ((entry - strip.first) % 64 == 63 && !any_lit(cells, grid.tiles, cell, a.lens.transmittance_min)) break;
-        const S* row = ranked.of(a.plan, strip.pose, *entry);
-        const S opacity = row[0], extinction = row[1];
+    const Lights<S> lights = {cells, cell, floor};
+    const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        Vec<S> feature[kChannels ? kChannels : 1], local[kChannels ? kChannels : 1];
+        for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]), local[k] = splat(S(0));
+        if (!kChannels) fill(sums_memory, int64_t(k_count) * n, S(0));
         MomentSums<S, kTangent, kHides> sums;
-        if (kChannels)
-            for (int k = 0; k < kChannels; ++k) local[k] = splat(S(0));
-        else fill(sums_memory, int64_t(k_count) * n, S(0));
-        each_tile<S, kTangent, true>(strip, *entry, grid, a.lens, lit, [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> counts) __attribute__((always_inline)) {
-            S* mine = cells + int64_t(tile) * cell;
+        for (; hit < end; ++hit) {
+            S* mine = cells + int64_t(hit->tile) * cell;
+            typename Shape<S, kTangent>::Seen seen;
             const Vec<S> light = load(mine);
-            const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
-            const Vec<S> weight = light * layer.alpha, through = S(1) - layer.gamma;
+            const Mask<S> counts = shape.look(columns + hit->at, seen) & at_most(floor, light);
+            const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
+            const Vec<S> weight = light * layer.alpha;
             Vec<S> gain = splat(S(0));
             for (int k = 0; k < k_count; ++k) {
                 const Vec<S> g = load(mine + (2 + k) * n);
-                gain = fma(splat(row[2 + k]), g, gain);
+                gain = fma(kChannels ? feature[k] : splat(line[kFeatures + k]), g, gain);
                 if (kChannels) local[k] = fma(weight, g, local[k]);
                 else store(sums_memory + k * n, fma(weight, g, load(sums_memory + k * n)));
             }
             const Vec<S> behind = load(mine + n) - weight * gain;
             store(mine + n, behind);
-            store(mine, fma(-light, layer.gamma, light));
-            const Vec<S> d_gamma = -behind * reciprocal(through);
-            sums.add(layer, counts, kHides ? light * gain : fma(light, gain, d_gamma), d_gamma, t1, t2, form, alpha_max);
-        });
-        const int64_t slot = strip.slot(*entry);
-        sums.write(moments + slot * kMoments);
+            store(mine, layer.behind(light, weight));
+            const Vec<S> d_gamma = -behind * reciprocal(S(1) - layer.gamma);
+            Vec<S> t1, t2;
+            shape.slopes(seen, t1, t2);
+            sums.add(layer, counts, kHides ? light * gain : fma(light, gain, d_gamma), d_gamma, t1, t2, seen.form, alpha_max);
+        }
+        const int64_t slot = strip.slot(rank);
+        sums.write(moments + slot * kMoments, S(kOffset));
         for (int k = 0; k < k_count; ++k) feature_slots[slot * k_count + k] = sum<S>(kChannels ? local[k] : load(sums_memory + k * n));
-    }
+    };
+    sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
 }
 
 // Adds the slots of each Gaussian and chains them into its parameters; poses are added in order.
@@ -130,16 +132,17 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, 
 template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
     const CompositeArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
-    const TileTables<S> grid(a.lens);
-    const Ranked<S> ranked(plan, a.model, a.features, a.samples, a.channels, a.threads);
-    const int k_count = ranked.width - 2;
-    const int64_t area = int64_t(grid.tiles) * Lanes<S>::n * (2 + k_count), scratch = area + int64_t(k_count) * Lanes<S>::n;
+    const Rises<S> stage(a.lens);
+    const Lines<S> lines(plan, a.model, a.lens, a.features, a.samples, a.channels, a.threads);
+    const int k_count = channels_of(a);
+    const int64_t area = int64_t(stage.tiles) * Lanes<S>::n * (2 + k_count), scratch = area + int64_t(k_count) * Lanes<S>::n;
     const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
     Buffer<S> memory(scratch * a.threads), moments(entries * kMoments), feature_slots(entries * k_count);
     with_switches(a.lens.tangent, a.model.extinctions, k_count, [&](auto tangent, auto hides, auto channels) {
+        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             S* mine = memory.data + worker * scratch;
-            composite_backward_strip<S, tangent.value, hides.value, channels.value>(b, ranked, grid, task, mine, mine + area, moments.data, feature_slots.data);
+            composite_backward_strip<S, tangent.value, hides.value, channels.value>(b, lines, stage, task, batches[worker], mine, mine + area, moments.data, feature_slots.data);
         };
         parallel_for(plan.poses * plan.strips, a.threads, strip);
     });
@@ -164,55 +167,58 @@ template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
 }
 
 template <class S, bool kTangent, bool kHides>
-void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Ranked<S>& ranked, const TileTables<S>& grid, int task, S* cells,
+void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* cells,
                           S* moments) {
     constexpr int n = Lanes<S>::n;
     const WeightArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
-    fill(cells, int64_t(grid.tiles) * 2 * n, S(0));
+    fill(cells, int64_t(stage.tiles) * 2 * n, S(0));
     for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
-        for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
-        for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-            const S* row = ranked.of(a.plan, strip.pose, *entry);
-            const S opacity = row[0], extinction = row[1];
-            const Vec<S> per_seen = splat(row[2]), per_alpha = splat(row[3]);
+        for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
+        const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+            const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+            const Vec<S> per_seen = splat(line[kFeatures]), per_alpha = splat(line[kFeatures + 1]);
             MomentSums<S, kTangent, kHides> sums;
-            each_tile<S, kTangent, true>(strip, *entry, grid, a.lens, Always<S>(), [&](int tile, Vec<S> t1, Vec<S> t2, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
-                S* mine = cells + int64_t(tile) * 2 * n;
+            for (; hit < end; ++hit) {
+                S* mine = cells + int64_t(hit->tile) * 2 * n;
+                typename Shape<S, kTangent>::Seen seen;
                 const Vec<S> light = load(mine);
-                const Mask<S> lit = at_most(floor, light);
-                const Layer<S, kHides> layer(form, inside, opacity, extinction, alpha_max);
-                const Vec<S> gain = select(lit, per_seen, none), through = S(1) - layer.gamma;
-                const Vec<S> part = light * layer.alpha * gain;
-                store(mine, select(lit, fma(-light, layer.gamma, light), light));
+                const Mask<S> inside = shape.look(columns + hit->at, seen), lit = at_most(floor, light);
+                const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
+                const Vec<S> gain = select(lit, per_seen, none), weight = light * layer.alpha, part = weight * gain;
+                store(mine, select(lit, layer.behind(light, weight), light));
                 if (pass == 0) {
                     store(mine + n, load(mine + n) + part);
-                    return;
+                    continue;
                 }
                 const Vec<S> rest = load(mine + n) - part;
                 store(mine + n, rest);
-                const Vec<S> d_alpha = fma(light, gain, per_alpha), d_gamma = select(lit, -rest * reciprocal(through), none);
-                sums.add(layer, inside, kHides ? d_alpha : d_alpha + d_gamma, d_gamma, t1, t2, form, alpha_max);
-            });
-            if (pass == 1) sums.write(moments + strip.slot(*entry) * kMoments);
-        }
+                const Vec<S> d_alpha = fma(light, gain, per_alpha), d_gamma = select(lit, -rest * reciprocal(S(1) - layer.gamma), none);
+                Vec<S> t1, t2;
+                shape.slopes(seen, t1, t2);
+                sums.add(layer, inside, kHides ? d_alpha : d_alpha + d_gamma, d_gamma, t1, t2, seen.form, alpha_max);
+            }
+            if (pass == 1) sums.write(moments + strip.slot(rank) * kMoments, S(kOffset));
+        };
+        sweep<S, kTangent>(strip, a.plan, stage, lines, batch, AllLit(), visit);
     }
 }
 
 template <class S> void weights_backward(const WeightBackwardArgs<S>& b) {
     const WeightArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
-    const TileTables<S> grid(a.lens);
+    const Rises<S> stage(a.lens);
     const int64_t all = int64_t(plan.poses) * plan.count;
-    Buffer<S> upstream(2 * all);
+    Buffer<S> upstream(2 * all, false);
     for (int64_t i = 0; i < all; ++i) upstream[2 * i] = b.grad_visible_sum[i], upstream[2 * i + 1] = b.grad_total[i];
-    const Ranked<S> ranked(plan, a.model, upstream.data, 1, 2, a.threads);
-    const int64_t area = int64_t(grid.tiles) * 2 * Lanes<S>::n;
-    Buffer<S> memory(area * a.threads), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
+    const Lines<S> lines(plan, a.model, a.lens, upstream.data, 1, 2, a.threads);
+    const int64_t area = int64_t(stage.tiles) * 2 * Lanes<S>::n;
+    Buffer<S> memory(area * a.threads, false), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
     with_switches(a.lens.tangent, a.model.extinctions, 2, [&](auto tangent, auto hides, auto) {
+        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
-            weigh_backward_strip<S, tangent.value, hides.value>(b, ranked, grid, task, memory.data + area * worker, moments.data);
+            weigh_backward_strip<S, tangent.value, hides.value>(b, lines, stage, task, batches[worker], memory.data + area * worker, moments.data);
         };
         parallel_for(plan.poses * plan.strips, a.threads, strip);
     });

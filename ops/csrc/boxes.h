@@ -29,32 +29,6 @@ template <class S> GSPARC_HD Gaussian<S> gaussian(const Model<S>& model, int64_t
     return g;
 }
 
-// Pixels [low, high] (fractional) as whole columns of the circle; the full row where it is that wide.
-template <class S> GSPARC_HD void set_columns(S low, S high, const Lens<S>& lens, Box& box) {
-    const S turn = lens.periodic ? S(lens.width) : S(6.283185307179586) / lens.azimuth_step;
-    const S first = S(ceil(low)), last = S(floor(high));
-    box.column0 = 0, box.columns = lens.width;
-    if (!(last - first < turn - kLanes - 1)) return;
-    if (lens.periodic) {
-        box.columns = 0;
-        if (last < first) return;
-        S start = first - S(floor(first / turn)) * turn;
-        if (start >= turn) start = 0;
-        box.column0 = int32_t(start), box.columns = int32_t(last - first) + 1;
-        return;
-    }
-    int images = 0;
-    const S shift = S(floor(low / turn)) * turn;  // not a whole number of columns: round only after shifting
-    S from = 0, to = -1;
-    for (int k = 0; k < 2; ++k) {  // the first image starts inside [0, turn), the second one turn before
-        const S a = S(ceil(low - shift - k * turn)), b = S(floor(high - shift - k * turn));
-        if (b < a || b < 0 || a > lens.width - 1) continue;
-        ++images, from = a > 0 ? a : 0, to = b < lens.width - 1 ? b : S(lens.width - 1);
-    }
-    if (images == 2) return;
-    box.column0 = images ? int32_t(from) : 0, box.columns = images ? int32_t(to) - int32_t(from) + 1 : 0;
-}
-
 // Rows and columns (fractional) between which a footprint lies, with a margin: rounding may not cut a pixel off.
 template <class S> struct Frame {
     S bottom, top, left, right;
@@ -75,15 +49,48 @@ template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S column, 
     return {row - half - margin, row + half + margin, column - across - margin, column + across + margin};
 }
 
-template <class S> GSPARC_HD Box box_of(const Frame<S>& frame, const Lens<S>& lens) {
-    Box box;
-    const S limit = S(lens.height);
-    box.row0 = int32_t(clamped(S(ceil(frame.bottom)), S(0), limit));
-    box.row1 = int32_t(clamped(S(floor(frame.top)) + 1, S(0), limit));
-    if (box.row1 <= box.row0) return {0, 0, 0, 0};
-    set_columns(frame.left, frame.right, lens, box);
-    if (box.columns <= 0) box = {0, 0, 0, 0};
+// A box in whole numbers of type S, so that lanes of Gaussians are boxed together; all 0 where it holds no pixel.
+template <class S> struct Extents {
+    S row0, row1, column0, columns;
+};
+
+// Columns [low, high] (fractional) of the circle; the full row where they are nearly that many.
+template <class S> GSPARC_HD void set_columns(S low, S high, const Lens<S>& lens, S width, Extents<S>& box) {
+    const S turn = lens.periodic ? width : S(6.283185307179586) / lens.azimuth_step, none = S(0);
+    const S first = upward(low), last = downward(high);
+    const Truth<S> apart = last - first < turn - S(kLanes + 1);
+    if (lens.periodic) {
+        const S start = first - downward(first / turn) * turn;
+        box.column0 = pick(apart & (start < turn), start, none);
+        box.columns = pick(apart, pick(last < first, none, last - first + S(1)), width);
+        return;
+    }
+    const S shift = downward(low / turn) * turn, edge = width - S(1);  // not a whole number of columns: round only after shifting
+    S from = none, to = S(-1), images = none;
+    for (int k = 0; k < 2; ++k) {  // the first image starts inside [0, turn), the second one turn before
+        const S a = upward(low - shift - S(k) * turn), b = downward(high - shift - S(k) * turn);
+        const Truth<S> seen = !(b < a) & !(b < none) & !(a > edge);
+        images = pick(seen, images + S(1), images);
+        from = pick(seen, pick(a > none, a, none), from), to = pick(seen, pick(b < edge, b, edge), to);
+    }
+    const Truth<S> full = !apart | (images > S(1.5));
+    box.column0 = pick(full, none, from), box.columns = pick(full, width, to - from + S(1));
+}
+
+template <class S> GSPARC_HD Extents<S> extents_of(const Frame<S>& frame, const Lens<S>& lens) {
+    const S height = S(lens.height), none = S(0);
+    Extents<S> box;
+    box.row0 = clamped(upward(frame.bottom), none, height), box.row1 = clamped(downward(frame.top) + S(1), none, height);
+    set_columns(frame.left, frame.right, lens, S(lens.width), box);
+    const Truth<S> some = (box.row1 > box.row0) & (box.columns > none);
+    box.row0 = pick(some, box.row0, none), box.row1 = pick(some, box.row1, none);
+    box.column0 = pick(some, box.column0, none), box.columns = pick(some, box.columns, none);
     return box;
+}
+
+template <class S> GSPARC_HD Box box_of(const Frame<S>& frame, const Lens<S>& lens) {
+    const Extents<S> box = extents_of(frame, lens);
+    return {int32_t(box.row0), int32_t(box.row1), int32_t(box.column0), int32_t(box.columns)};
 }
 
 // What a plan needs of one Gaussian before one receiver.

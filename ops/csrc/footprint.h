@@ -42,6 +42,10 @@ GSPARC_HD float root(float x) { return sqrtf(x); }
 GSPARC_HD double root(double x) { return sqrt(x); }
 GSPARC_HD float logarithm(float x) { return logf(x); }
 GSPARC_HD double logarithm(double x) { return log(x); }
+GSPARC_HD float upward(float x) { return ceilf(x); }
+GSPARC_HD double upward(double x) { return ceil(x); }
+GSPARC_HD float downward(float x) { return floorf(x); }
+GSPARC_HD double downward(double x) { return floor(x); }
 GSPARC_HD float smallest(float) { return 1.17549435e-38f; }
 GSPARC_HD double smallest(double) { return 2.2250738585072014e-308; }
 

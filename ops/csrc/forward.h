@@ -1,7 +1,7 @@
 // Front-to-back blending: images, and each Gaussian's weights.
 #pragma once
 #include "layer.h"
-#include "strips.h"
+#include "sweep.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
@@ -24,84 +24,90 @@ template <class F> inline void with_switches(bool tangent, bool hides, int chann
 
 // A cell holds what one tile accumulates: transmittance, then the channels, Lanes<S>::n numbers each.
 template <class S, bool kTangent, bool kHides, int kChannels>
-void composite_strip(const CompositeArgs<S>& a, const Ranked<S>& ranked, const TileTables<S>& grid, int task, S* cells) {
+void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* cells) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
-    const int k_count = kChannels ? kChannels : ranked.width - 2, cell = (1 + k_count) * n;
-    const Vec<S> alpha_max = splat(a.lens.alpha_max);
-    const Lit<S> lit = {cells, cell, splat(a.lens.transmittance_min)};
-    fill(cells, int64_t(grid.tiles) * cell, S(0));
-    for (int tile = 0; tile < grid.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
-    for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-        if ((entry - strip.first) % 64 == 63 && !any_lit(cells, grid.tiles, cell, a.lens.transmittance_min)) break;
-        const S* row = ranked.of(a.plan, strip.pose, *entry);
-        const S opacity = row[0], extinction = row[1];
-        each_tile<S, kTangent, false>(strip, *entry, grid, a.lens, lit, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> counts) __attribute__((always_inline)) {
-            S* mine = cells + int64_t(tile) * cell;
+    const int k_count = kChannels ? kChannels : channels_of(a), cell = (1 + k_count) * n;
+    const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
+    fill(cells, int64_t(stage.tiles) * cell, S(0));
+    for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
+    const Lights<S> lights = {cells, cell, floor};
+    const auto visit = [&](const S* line, int, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        Vec<S> feature[kChannels ? kChannels : 1];
+        for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]);
+        for (; hit < end; ++hit) {
+            S* mine = cells + int64_t(hit->tile) * cell;
+            typename Shape<S, kTangent>::Seen seen;
             const Vec<S> light = load(mine);
-            const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
+            const Mask<S> counts = shape.look(columns + hit->at, seen) & at_most(floor, light);
+            const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha;
-            store(mine, fma(-light, layer.gamma, light));
+            store(mine, layer.behind(light, weight));
             for (int k = 0; k < k_count; ++k) {
                 mine += n;
-                store(mine, fma(splat(row[2 + k]), weight, load(mine)));
+                store(mine, fma(kChannels ? feature[k] : splat(line[kFeatures + k]), weight, load(mine)));
             }
-        });
-    }
+        }
+    };
+    sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
     const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
     S *image = a.image + strip.pose * k_count * pixels, *transmittance = a.transmittance + strip.pose * pixels;
     each_stretch<S>(strip, a.lens.width, [&](int tile, int lane, int64_t pixel, int count) {
         const S* mine = cells + int64_t(tile) * cell + lane;
-        memcpy(transmittance + pixel, mine, count * sizeof(S));
-        for (int k = 0; k < k_count; ++k) memcpy(image + k * pixels + pixel, mine + (1 + k) * n, count * sizeof(S));
+        copy_stretch(transmittance + pixel, mine, count);
+        for (int k = 0; k < k_count; ++k) copy_stretch(image + k * pixels + pixel, mine + (1 + k) * n, count);
     });
 }
 
 template <class S> void composite(const CompositeArgs<S>& a) {
-    const TileTables<S> grid(a.lens);
-    const Ranked<S> ranked(a.plan, a.model, a.features, a.samples, a.channels, a.threads);
-    const int64_t scratch = int64_t(grid.tiles) * Lanes<S>::n * (ranked.width - 1);
-    Buffer<S> memory(scratch * a.threads);
-    with_switches(a.lens.tangent, a.model.extinctions, ranked.width - 2, [&](auto tangent, auto hides, auto channels) {
+    const Rises<S> stage(a.lens);
+    const Lines<S> lines(a.plan, a.model, a.lens, a.features, a.samples, a.channels, a.threads);
+    const int64_t scratch = int64_t(stage.tiles) * Lanes<S>::n * (1 + channels_of(a));
+    with_switches(a.lens.tangent, a.model.extinctions, channels_of(a), [&](auto tangent, auto hides, auto channels) {
+        Buffer<S> memory(scratch * a.threads, false);
+        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
-            composite_strip<S, tangent.value, hides.value, channels.value>(a, ranked, grid, task, memory.data + worker * scratch);
+            composite_strip<S, tangent.value, hides.value, channels.value>(a, lines, stage, task, batches[worker], memory.data + worker * scratch);
         };
         parallel_for(a.plan.poses * a.plan.strips, a.threads, strip);
     });
 }
 
 template <class S, bool kTangent, bool kHides>
-void weigh_strip(const WeightArgs<S>& a, const Ranked<S>& ranked, const TileTables<S>& grid, int task, S* before, S* sums) {
+void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* before, S* sums) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
-    fill(before, int64_t(grid.tiles) * n, S(1));
-    for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-        const S* row = ranked.of(a.plan, strip.pose, *entry);
-        const S opacity = row[0], extinction = row[1];
-        Vec<S> seen = none, total = none;
-        each_tile<S, kTangent, false>(strip, *entry, grid, a.lens, Always<S>(), [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> inside) __attribute__((always_inline)) {
-            S* mine = before + tile * n;
+    fill(before, int64_t(stage.tiles) * n, S(1));
+    const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+        const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+        Vec<S> seen_sum = none, total = none;
+        for (; hit < end; ++hit) {
+            S* mine = before + int64_t(hit->tile) * n;
+            typename Shape<S, kTangent>::Seen seen;
             const Vec<S> light = load(mine);
-            const Mask<S> lit = at_most(floor, light);
-            const Layer<S, kHides> layer(form, inside, opacity, extinction, alpha_max);
-            total += layer.alpha;
-            seen += select(lit, light * layer.alpha, none);
-            store(mine, select(lit, fma(-light, layer.gamma, light), light));
-        });
-        S* slot = sums + 2 * strip.slot(*entry);
-        slot[0] = sum<S>(seen), slot[1] = sum<S>(total);
-    }
+            const Mask<S> inside = shape.look(columns + hit->at, seen), lit = at_most(floor, light);
+            const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
+            const Vec<S> weight = light * layer.alpha;
+            total += layer.alpha, seen_sum += select(lit, weight, none);
+            store(mine, select(lit, layer.behind(light, weight), light));
+        }
+        S* slot = sums + 2 * strip.slot(rank);
+        slot[0] = sum<S>(seen_sum), slot[1] = sum<S>(total);
+    };
+    sweep<S, kTangent>(strip, a.plan, stage, lines, batch, AllLit(), visit);
 }
 
 template <class S> void weights(const WeightArgs<S>& a) {
-    const TileTables<S> grid(a.lens);
-    const Ranked<S> ranked(a.plan, a.model, nullptr, 0, 0, a.threads);
-    const int64_t area = int64_t(grid.tiles) * Lanes<S>::n;
-    Buffer<S> memory(area * a.threads), sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
+    const Rises<S> stage(a.lens);
+    const Lines<S> lines(a.plan, a.model, a.lens, nullptr, 0, 0, a.threads);
+    const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
+    Buffer<S> memory(area * a.threads, false), sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
     with_switches(a.lens.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
+        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
-            weigh_strip<S, tangent.value, hides.value>(a, ranked, grid, task, memory.data + worker * area, sums.data);
+            weigh_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area, sums.data);
         };
         parallel_for(a.plan.poses * a.plan.strips, a.threads, strip);
     });

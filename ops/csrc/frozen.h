@@ -7,49 +7,54 @@ namespace GSPARC_ISA {
 
 // Counts the blocks of a strip (heads null) or writes them, tile by tile and front to back within a tile.
 template <class S, bool kTangent, bool kHides>
-void freeze_strip(const FreezeArgs<S>& a, const Ranked<S>& ranked, const TileTables<S>& grid, int task, S* before) {
+void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* before) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
-    const Vec<S> alpha_max = splat(a.lens.alpha_max);
-    const Lit<S> lit = {before, n, splat(a.lens.transmittance_min)};
-    Buffer<int64_t> next(grid.tiles);
+    const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
+    const Lights<S> lights = {before, n, floor};
+    Buffer<int64_t> next(stage.tiles);
     for (int pass = 0; pass < (a.heads ? 2 : 1); ++pass) {  // how many blocks each tile has, then the blocks
         if (pass == 1) {
             int64_t start = a.starts[task];
-            for (int tile = 0; tile < grid.tiles; ++tile) {
+            for (int tile = 0; tile < stage.tiles; ++tile) {
                 const int64_t count = next[tile];
                 next[tile] = start, start += count;
             }
         }
-        fill(before, int64_t(grid.tiles) * n, S(1));
-        for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-            const S* row = ranked.of(a.plan, strip.pose, *entry);
-            const S opacity = row[0], extinction = row[1];
-            each_tile<S, kTangent, false>(strip, *entry, grid, a.lens, lit, [&](int tile, Vec<S>, Vec<S>, Vec<S> form, Mask<S> counts) __attribute__((always_inline)) {
-                const Vec<S> light = load(before + tile * n);
-                const Layer<S, kHides> layer(form, counts, opacity, extinction, alpha_max);
-                store(before + tile * n, fma(-light, layer.gamma, light));
-                const int64_t block = next[tile]++;
-                if (pass == 0) return;
-                a.heads[2 * block] = *entry, a.heads[2 * block + 1] = tile;
-                store(a.weights + block * n, light * layer.alpha);
-            });
-        }
+        fill(before, int64_t(stage.tiles) * n, S(1));
+        const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+            const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
+            for (; hit < end; ++hit) {
+                typename Shape<S, kTangent>::Seen seen;
+                const Vec<S> light = load(before + hit->tile * n);
+                const Mask<S> counts = shape.look(columns + hit->at, seen) & at_most(floor, light);
+                if (!any(counts)) continue;
+                const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
+                const Vec<S> weight = light * layer.alpha;
+                store(before + hit->tile * n, layer.behind(light, weight));
+                const int64_t block = next[hit->tile]++;
+                if (pass == 0) continue;
+                a.heads[2 * block] = rank, a.heads[2 * block + 1] = hit->tile;
+                store(a.weights + block * n, weight);
+            }
+        };
+        sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
     }
     if (a.heads) return;
     int64_t total = 0;
-    for (int tile = 0; tile < grid.tiles; ++tile) total += next[tile];
+    for (int tile = 0; tile < stage.tiles; ++tile) total += next[tile];
     a.starts[task + 1] = total;
 }
 
 template <class S> int freeze(const FreezeArgs<S>& a) {
-    const TileTables<S> grid(a.lens);
-    const Ranked<S> ranked(a.plan, a.model, nullptr, 0, 0, a.threads);
-    const int64_t area = int64_t(grid.tiles) * Lanes<S>::n;
-    Buffer<S> memory(area * a.threads);
+    const Rises<S> stage(a.lens);
+    const Lines<S> lines(a.plan, a.model, a.lens, nullptr, 0, 0, a.threads);
+    const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
+    Buffer<S> memory(area * a.threads, false);
     with_switches(a.lens.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
+        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
-            freeze_strip<S, tangent.value, hides.value>(a, ranked, grid, task, memory.data + worker * area);
+            freeze_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area);
         };
         parallel_for(a.plan.strips, a.threads, strip);
     });
@@ -86,7 +91,7 @@ template <class S> void thaw_strip(const ThawArgs<S>& a, int task, S* cells) {
     const int64_t pixels = int64_t(a.height) * a.width;
     each_stretch<S>(strip, a.width, [&](int tile, int lane, int64_t pixel, int count) {
         const S* mine = cells + int64_t(tile) * cell + lane;
-        for (int k = 0; k < k_count; ++k) memcpy(a.image + k * pixels + pixel, mine + k * n, count * sizeof(S));
+        for (int k = 0; k < k_count; ++k) copy_stretch(a.image + k * pixels + pixel, mine + k * n, count);
     });
 }
 

@@ -23,6 +23,9 @@ template <class S> struct CompositeArgs {
     S *image, *transmittance;       // (B, C, H, W), (P, H, W)
 };
 
+// Channels of one pose: those of all samples where they share it.
+template <class S> inline int channels_of(const CompositeArgs<S>& a) { return a.plan.poses == 1 ? a.samples * a.channels : a.channels; }
+
 template <class S> struct CompositeBackwardArgs {
     CompositeArgs<S> forward;
     const S *grad_image, *grad_transmittance;    // as above; the second may be null

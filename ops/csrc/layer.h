@@ -10,14 +10,16 @@ namespace GSPARC_ISA {
 template <class S, bool kHides> struct Layer {
     Vec<S> shape, emits, hides, alpha, gamma;
 
-    GSPARC_INLINE Layer(Vec<S> form, Mask<S> counts, S opacity, S extinction, Vec<S> alpha_max) {
+    GSPARC_INLINE Layer(Vec<S> form, Mask<S> counts, Vec<S> opacity, Vec<S> extinction, Vec<S> alpha_max) {
         const Vec<S> none = splat(S(0));
         shape = bell<S>(form);
-        emits = splat(opacity) * shape;
+        emits = opacity * shape;
         alpha = select(counts, lesser<S>(emits, alpha_max), none);
-        hides = kHides ? splat(extinction) * shape : emits;
+        hides = kHides ? extinction * shape : emits;
         gamma = kHides ? select(counts, lesser<S>(hides, alpha_max), none) : alpha;
     }
+    // The light that passes; weight is the light emitted, light times alpha.
+    GSPARC_INLINE Vec<S> behind(Vec<S> light, Vec<S> weight) const { return kHides ? fma(-light, gamma, light) : light - weight; }
 };
 
 // The sums of Moments over blocks of lanes.
@@ -45,9 +47,11 @@ template <class S, bool kTangent, bool kHides> struct MomentSums {
             h1 = fma(form, e1, h1), h2 = fma(form, e2, h2);
         }
     }
-    GSPARC_INLINE void write(S* to) const {
+    // Offsets came in units of `unit`.
+    GSPARC_INLINE void write(S* to, S unit = 1) const {
         const Vec<S> all[kMoments] = {tau1, tau2, h1, h2, tau11, tau12, tau22, emits, hides};
-        for (int k = 0; k < kMoments; ++k) to[k] = sum<S>(all[k]);
+        const S square = unit * unit, units[kMoments] = {unit, unit, unit * square, unit * square, square, square, square, 1, 1};
+        for (int k = 0; k < kMoments; ++k) to[k] = units[k] * sum<S>(all[k]);
     }
 };
 

@@ -12,7 +12,7 @@ template <class S> struct Lens {
     S low_pass, near, alpha_min, transmittance_min, alpha_max, horizon_cosine;
 };
 
-constexpr int kRecord = 12;     // scalars of one footprint in depth order, see record.h
+constexpr int kRecord = 12;     // scalars of one footprint, see pixels.h
 constexpr int kMoments = 9;     // scalars of Moments
 constexpr int kLanes = 16;      // most pixels done at a time by any instruction set
 
@@ -29,8 +29,8 @@ struct Box {
 // N Gaussians for P poses, in depth order within each pose.
 template <class S> struct PlanView {
     int poses, count, strips;
-    const S* records;            // (P, N, kRecord)
-    const Box* boxes;            // (P, N)
+    const S* records;            // (P, N, kRecord) by Gaussian
+    const Box* boxes;            // (P, N) by rank
     const int32_t* order;        // (P, N) rank -> Gaussian
     const int32_t* shown;        // (P,) how many ranks are visible
     const int64_t* slots;        // (P, N + 1) first entry of each rank, over all poses

@@ -8,6 +8,7 @@ namespace GSPARC_ISA {
 template <class S> struct Which {
     Mask<S> lanes;
     friend GSPARC_INLINE Which operator&(Which a, Which b) { return {Mask<S>(a.lanes & b.lanes)}; }
+    friend GSPARC_INLINE Which operator|(Which a, Which b) { return {Mask<S>(a.lanes | b.lanes)}; }
     friend GSPARC_INLINE Which operator!(Which a) { return {Mask<S>(~a.lanes)}; }
 };
 
@@ -41,6 +42,20 @@ template <class S> GSPARC_INLINE Pack<S> each_lane(Pack<S> a, Pack<S> b, S (*f)(
     for (int k = 0; k < Pack<S>::n; ++k) out.v[k] = f(a.v[k], b.v[k]);
     return out;
 }
+
+#if defined(__AVX512F__)
+GSPARC_INLINE Pack<float> upward(Pack<float> x) { return (Vec<float>)_mm512_roundscale_ps((__m512)x.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
+GSPARC_INLINE Pack<double> upward(Pack<double> x) { return (Vec<double>)_mm512_roundscale_pd((__m512d)x.v, _MM_FROUND_TO_POS_INF | _MM_FROUND_NO_EXC); }
+#elif defined(__AVX2__)
+GSPARC_INLINE Pack<float> upward(Pack<float> x) { return (Vec<float>)_mm256_ceil_ps((__m256)x.v); }
+GSPARC_INLINE Pack<double> upward(Pack<double> x) { return (Vec<double>)_mm256_ceil_pd((__m256d)x.v); }
+#else
+template <class S> GSPARC_INLINE Pack<S> upward(Pack<S> x) {
+    for (int k = 0; k < Pack<S>::n; ++k) x.v[k] = S(__builtin_ceil(x.v[k]));
+    return x;
+}
+#endif
+template <class S> GSPARC_INLINE Pack<S> downward(Pack<S> x) { return -upward(-x); }
 
 #if defined(__AVX512F__)
 GSPARC_INLINE Pack<float> root(Pack<float> x) { return (Vec<float>)_mm512_sqrt_ps((__m512)x.v); }

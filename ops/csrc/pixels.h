@@ -44,18 +44,26 @@ template <class S> inline Tables<S> tables_at(const Lens<S>& lens, const S* numb
     return {numbers, numbers + padded, numbers + 2 * padded, numbers + 3 * padded, numbers + 3 * padded + lens.height, turn, 1 / turn};
 }
 
+// cos and sin of first + k step for k < count, to 1e-15: some by the library, those between by turning.
+template <class S> inline void fill_circle(double first, double step, int count, S* cosines, S* sines) {
+    const double c = cos(step), s = sin(step);
+    double x = 0, y = 0;
+    for (int k = 0; k < count; ++k) {
+        const double turned = x * c - y * s;
+        y = x * s + y * c, x = turned;
+        if (k % 8 == 0) x = cos(first + k * step), y = sin(first + k * step);
+        cosines[k] = S(x), sines[k] = S(y);
+    }
+}
+
 template <class S> inline void fill_tables(const Lens<S>& lens, S* numbers) {
     const int padded = lens.width + kLanes;
+    fill_circle(double(lens.first_azimuth), double(lens.azimuth_step), lens.width, numbers, numbers + padded);
     for (int j = 0; j < padded; ++j) {
-        const double azimuth = double(lens.first_azimuth) + j * double(lens.azimuth_step);
-        const bool real = j < lens.width;
-        numbers[j] = real ? S(cos(azimuth)) : S(NAN), numbers[padded + j] = real ? S(sin(azimuth)) : S(NAN);
-        numbers[2 * padded + j] = real ? S(j) : S(NAN);
+        if (j >= lens.width) numbers[j] = S(NAN), numbers[padded + j] = S(NAN);
+        numbers[2 * padded + j] = j < lens.width ? S(j) : S(NAN);
     }
-    for (int i = 0; i < lens.height; ++i) {
-        const double elevation = double(lens.first_elevation) + i * double(lens.elevation_step);
-        numbers[3 * padded + i] = S(cos(elevation)), numbers[3 * padded + lens.height + i] = S(sin(elevation));
-    }
+    fill_circle(double(lens.first_elevation), double(lens.elevation_step), lens.height, numbers + 3 * padded, numbers + 3 * padded + lens.height);
 }
 
 // Where a block of pixels lies: a lane each. NaN in a lane beyond the grid.

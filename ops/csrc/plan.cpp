@@ -3,43 +3,78 @@
 #include <algorithm>
 #include <array>
 #include <cstring>
-#include <memory>
 #include <type_traits>
 #include <utility>
 #include <vector>
 
 #include "pool.h"
+#include "workspace.h"
 
 namespace gsparc {
 namespace {
 
-// Stable radix sort of items by the bits of non-negative numbers, 11 bits at a time.
-template <class S> void sort_by_depth(const S* depths, std::vector<int32_t>& items) {
-    using Bits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
-    struct Item {
-        Bits key;
-        int32_t value;
-    };
-    constexpr int digit = 11, passes = (8 * sizeof(S) + digit - 1) / digit, buckets = 1 << digit;
-    std::vector<Item> from(items.size()), to(items.size());
-    std::vector<std::array<uint32_t, buckets>> counts(passes);
-    for (auto& count : counts) count.fill(0);
-    for (size_t k = 0; k < items.size(); ++k) {
-        from[k].value = items[k];
-        std::memcpy(&from[k].key, depths + items[k], sizeof(Bits));
-        for (int pass = 0; pass < passes; ++pass) ++counts[pass][from[k].key >> (digit * pass) & (buckets - 1)];
+template <class S> using Bits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
+
+// A visible Gaussian and the bits of its depth: those of non-negative numbers order as the numbers do.
+template <class S> struct Item {
+    Bits<S> key;
+    int32_t value;
+};
+
+// [begin, end) of part `k` of `parts` equal parts of `count`.
+struct Part {
+    int64_t begin, end;
+    Part(int64_t count, int k, int parts) : begin(count * k / parts), end(count * (k + 1) / parts) {}
+};
+
+// The visible ones by (depth, id), then the others by id; `by_id` is null where ids are row numbers. Returns how many
+// are visible. A radix sort in as many passes as the spread of the depths needs; each part of the items counts and
+// moves its own, so that the order does not depend on how many parts there are.
+template <class S> int arrange(const S* depths, const bool* visible, const int32_t* by_id, int64_t count, int threads, int32_t* order) {
+    constexpr int digit = 12, buckets = 1 << digit;
+    const Workspace<Item<S>> one(count + 1), two(count + 1);
+    Bits<S> base = ~Bits<S>(0), top = 0;
+    int64_t total = 0, hidden = 0;
+    for (int64_t at = 0; at < count; ++at) {
+        const int32_t i = by_id ? by_id[at] : int32_t(at);
+        const bool seen = visible[i];
+        Bits<S> key;
+        std::memcpy(&key, depths + i, sizeof key);
+        one[total] = {key, i}, order[hidden] = i;  // without a branch: what is not counted is written over
+        base = seen && key < base ? key : base, top = seen && key > top ? key : top;
+        total += seen, hidden += !seen;
     }
-    for (int pass = 0; pass < passes; ++pass) {
-        auto& count = counts[pass];
-        if (std::find(count.begin(), count.end(), items.size()) != count.end()) continue;  // one digit for all
+    std::memmove(order + total, order, hidden * sizeof *order);
+    if (total == 0) return 0;
+    const Bits<S> spread = top - base;
+    const int parts = total >= 8192 && threads > 1 ? std::min(threads, 8) : 1;
+    Item<S>*from = one.data, *to = two.data;
+    std::vector<uint32_t> counts(int64_t(parts) * buckets);
+    for (int shift = 0; shift < int(8 * sizeof(S)) && spread >> shift != 0; shift += digit) {
+        auto bucket = [&](const Item<S>& item) { return (item.key - base) >> shift & (buckets - 1); };
+        auto tally = [&](int k, int) {
+            const Part part(total, k, parts);
+            uint32_t* mine = counts.data() + int64_t(k) * buckets;
+            std::fill_n(mine, buckets, 0);
+            for (int64_t at = part.begin; at < part.end; ++at) ++mine[bucket(from[at])];
+        };
+        parallel_for(parts, threads, tally);
         uint32_t start = 0;
-        for (auto& c : count) start += std::exchange(c, start);
-        for (const Item& item : from) to[count[item.key >> (digit * pass) & (buckets - 1)]++] = item;
-        from.swap(to);
+        for (int b = 0; b < buckets; ++b)
+            for (int k = 0; k < parts; ++k) start += std::exchange(counts[int64_t(k) * buckets + b], start);
+        auto move = [&](int k, int) {
+            const Part part(total, k, parts);
+            uint32_t* mine = counts.data() + int64_t(k) * buckets;
+            for (int64_t at = part.begin; at < part.end; ++at) to[mine[bucket(from[at])]++] = from[at];
+        };
+        parallel_for(parts, threads, move);
+        std::swap(from, to);
     }
-    for (size_t k = 0; k < items.size(); ++k) items[k] = from[k].value;
+    for (int64_t at = 0; at < total; ++at) order[at] = from[at].value;
+    return int(total);
 }
 
+constexpr int kAhead = 16;    // boxes asked for that long before they are needed
 constexpr int kBinned = 1024;  // ranks that one task bins
 
 // Counts of footprints per strip, one row for each chunk of ranks.
@@ -50,21 +85,34 @@ struct Bins {
     int64_t of(int task) const { return int64_t(task) * strips; }
 };
 
+// Counts per strip of footprints noted by their first and last strip: without a loop, or its branch, for each.
+class Ends {
+public:
+    explicit Ends(int strips) : steps_(strips + 1) {}
+    void note(int first, int last) { ++steps_[first], --steps_[last + 1]; }
+    void add_to(int32_t* counts) const {
+        int32_t open = 0;
+        for (size_t strip = 0; strip + 1 < steps_.size(); ++strip) counts[strip] += open += steps_[strip];
+    }
+
+private:
+    std::vector<int32_t> steps_;
+};
+
 }  // namespace
 
 template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     const int64_t count = a.count;
-    // Not vectors: those would write zeros first.
-    const std::unique_ptr<S[]> records(new S[a.poses * count * kRecord]), depths(new S[a.poses * count]);
-    const std::unique_ptr<Box[]> boxes(new Box[a.poses * count]);
+    const Workspace<S> depths(a.poses * count);
+    const Workspace<Box> boxes(a.poses * count);
     constexpr int chunk = kBinned;
     const int chunks = int((count + chunk - 1) / chunk);
     std::vector<int64_t> wrong(std::max(chunks, 1), -1);
     auto project = [&](int task, int) {
         const int pose = task / chunks;
         const int64_t base = pose * count;
-        const ProjectArgs<S> one = {a.model, a.count, a.lens, records.get() + base * kRecord, depths.get() + base,
-                                    a.means2d + 2 * base, a.radii + base, boxes.get() + base, a.visible + base, pose};
+        const ProjectArgs<S> one = {a.model, a.count, a.lens, a.records + base * kRecord, depths.data + base,
+                                    a.means2d + 2 * base, a.radii + base, boxes.data + base, a.visible + base, pose};
         const int begin = task % chunks * chunk;
         const int64_t bad = kernels<S>().project(one, begin, std::min(begin + chunk, a.count));
         if (pose == 0) wrong[task] = bad;
@@ -73,47 +121,42 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     for (int64_t bad : wrong)
         if (bad >= 0) return bad;
 
-    std::vector<int32_t> by_id(count);
-    for (int64_t i = 0; i < count; ++i) by_id[i] = int32_t(i);
-    if (a.ids && !std::is_sorted(a.ids, a.ids + count))
+    std::vector<int32_t> by_id;
+    if (a.ids && !std::is_sorted(a.ids, a.ids + count)) {
+        by_id.resize(count);
+        for (int64_t i = 0; i < count; ++i) by_id[i] = int32_t(i);
         std::stable_sort(by_id.begin(), by_id.end(), [&](int32_t x, int32_t y) { return a.ids[x] < a.ids[y]; });
+    }
 
-    auto arrange = [&](int pose, int) {
+    auto order = [&](int pose, int) {
         const int64_t base = pose * count;
-        std::vector<int32_t> items, hidden;
-        items.reserve(count);
-        for (int32_t i : by_id) (a.visible[base + i] ? items : hidden).push_back(i);
-        a.shown[pose] = int32_t(items.size());
-        sort_by_depth(depths.get() + base, items);
-        std::copy(items.begin(), items.end(), a.order + base);
-        std::copy(hidden.begin(), hidden.end(), a.order + base + items.size());
+        a.shown[pose] = arrange(depths.data + base, a.visible + base, by_id.empty() ? nullptr : by_id.data(), count, a.poses > 1 ? 1 : a.threads, a.order + base);
     };
-    parallel_for(a.poses, a.threads, arrange);
+    if (a.poses == 1) order(0, 0);
+    else parallel_for(a.poses, a.threads, order);
     const Bins bins(a.poses, a.count, a.strips);
     std::vector<int32_t> per_bin(bins.size());
     std::vector<int64_t> per_chunk(a.poses * chunks);
     auto copy = [&](int task, int) {
         const int pose = task / chunks;
         const int64_t base = pose * count, begin = int64_t(task % chunks) * chunk, end = std::min(begin + chunk, count);
-        int32_t* in_strip = per_bin.data() + bins.of(task);
+        Ends ends(a.strips);
         int64_t* slots = a.slots + pose * (count + 1);
         int64_t total = 0;
         for (int64_t rank = begin; rank < end; ++rank) {
             slots[rank] = total;
-            const int64_t i = base + a.order[base + rank];
-            S* record = a.records + (base + rank) * kRecord;
             if (rank < a.shown[pose]) {
-                const Box box = a.boxes[base + rank] = boxes[i];
-                std::copy_n(records.get() + i * kRecord, kRecord, record);
+                if (rank + kAhead < end) __builtin_prefetch(boxes.data + base + a.order[base + rank + kAhead]);
+                const Box box = a.boxes[base + rank] = boxes.data[base + a.order[base + rank]];
                 const int first = box.row0 / kStripRows, last = (box.row1 - 1) / kStripRows;
-                for (int strip = first; strip <= last; ++strip) ++in_strip[strip];
+                ends.note(first, last);
                 total += last - first + 1;
             } else {
                 a.boxes[base + rank] = {0, 0, 0, 0};
-                std::fill_n(record, kRecord, S(0));
             }
         }
         per_chunk[task] = total;
+        ends.add_to(per_bin.data() + bins.of(task));
     };
     parallel_for(a.poses * chunks, a.threads, copy);
     int64_t before = 0;
@@ -144,12 +187,12 @@ template <class S> void fill_entries(const PlanView<S>& plan, int threads, int32
         const int64_t pose = task / bins.chunks, begin = int64_t(task % bins.chunks) * kBinned;
         const int64_t end = std::min<int64_t>(begin + kBinned, plan.shown[pose]);
         const Box* boxes = plan.boxes + pose * plan.count;
-        for (int64_t rank = begin; rank < end; ++rank)
-            for (int strip = boxes[rank].row0 / kStripRows; strip <= (boxes[rank].row1 - 1) / kStripRows; ++strip) visit(int32_t(rank), strip);
+        for (int64_t rank = begin; rank < end; ++rank) visit(int32_t(rank), boxes[rank].row0 / kStripRows, (boxes[rank].row1 - 1) / kStripRows);
     };
     auto count = [&](int task, int) {
-        int32_t* mine = counts.data() + bins.of(task);
-        each(task, [&](int32_t, int strip) { ++mine[strip]; });
+        Ends ends(plan.strips);
+        each(task, [&](int32_t, int first, int last) { ends.note(first, last); });
+        ends.add_to(counts.data() + bins.of(task));
     };
     parallel_for(plan.poses * bins.chunks, threads, count);
     for (int pose = 0; pose < plan.poses; ++pose)
@@ -160,7 +203,9 @@ template <class S> void fill_entries(const PlanView<S>& plan, int threads, int32
     auto write = [&](int task, int) {
         int32_t* next = counts.data() + bins.of(task);
         const int64_t* starts = plan.strip_starts + int64_t(task / bins.chunks) * plan.strips;
-        each(task, [&](int32_t rank, int strip) { entries[starts[strip] + next[strip]++] = rank; });
+        each(task, [&](int32_t rank, int first, int last) {
+            for (int strip = first; strip <= last; ++strip) entries[starts[strip] + next[strip]++] = rank;
+        });
     };
     parallel_for(plan.poses * bins.chunks, threads, write);
 }

@@ -36,7 +36,19 @@ template <class S> using Int = typename Lanes<S>::I;
 
 #define GSPARC_INLINE inline __attribute__((always_inline))
 
-template <class S> GSPARC_INLINE Vec<S> splat(S x) { return Vec<S>{} + x; }
+// Not `Vec{} + x`: adding 0 changes -0, so the compiler would really add.
+template <class S> GSPARC_INLINE Vec<S> splat(S x) {
+    Vec<S> v;
+    for (int i = 0; i < Lanes<S>::n; ++i) v[i] = x;
+    return v;
+}
+#if defined(__AVX512F__)
+template <> GSPARC_INLINE Vec<float> splat<float>(float x) { return (Vec<float>)_mm512_set1_ps(x); }
+template <> GSPARC_INLINE Vec<double> splat<double>(double x) { return (Vec<double>)_mm512_set1_pd(x); }
+#elif defined(__AVX2__)
+template <> GSPARC_INLINE Vec<float> splat<float>(float x) { return (Vec<float>)_mm256_set1_ps(x); }
+template <> GSPARC_INLINE Vec<double> splat<double>(double x) { return (Vec<double>)_mm256_set1_pd(x); }
+#endif
 template <class S> GSPARC_INLINE Vec<S> load(const S* p) {
     Vec<S> v;
     __builtin_memcpy(&v, p, sizeof v);
@@ -83,6 +95,21 @@ template <class V> GSPARC_INLINE V fma(V a, V b, V c) { return a * b + c; }
 #endif
 #endif
 
+// A mask as bits, lane 0 first.
+#if defined(__AVX512F__)
+template <class S> GSPARC_INLINE unsigned bits_of(Mask<S> m) { return m; }
+#else
+template <class S> GSPARC_INLINE unsigned bits_of(Mask<S> m) {
+    unsigned bits = 0;
+    for (int i = 0; i < Lanes<S>::n; ++i) bits |= unsigned(m[i] & 1) << i;
+    return bits;
+}
+#if defined(__AVX2__)
+template <> GSPARC_INLINE unsigned bits_of<float>(Mask<float> m) { return unsigned(_mm256_movemask_ps((__m256)m)); }
+template <> GSPARC_INLINE unsigned bits_of<double>(Mask<double> m) { return unsigned(_mm256_movemask_pd((__m256d)m)); }
+#endif
+#endif
+
 // The sum of all lanes, halves added to halves.
 template <class S> GSPARC_INLINE S sum(Vec<S> v) {
     S lanes[Lanes<S>::n];
@@ -119,9 +146,14 @@ template <class S> GSPARC_INLINE Vec<S> lesser(Vec<S> a, Vec<S> b) { return sele
 template <class S> GSPARC_INLINE Vec<S> greater(Vec<S> a, Vec<S> b) { return select(at_most(a, b), b, a); }
 #if defined(__AVX512F__)
 template <> GSPARC_INLINE Vec<float> lesser<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm512_min_ps((__m512)a, (__m512)b); }
+template <> GSPARC_INLINE Vec<float> greater<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm512_max_ps((__m512)a, (__m512)b); }
 #elif defined(__AVX2__)
 template <> GSPARC_INLINE Vec<float> lesser<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm256_min_ps((__m256)a, (__m256)b); }
+template <> GSPARC_INLINE Vec<float> greater<float>(Vec<float> a, Vec<float> b) { return (Vec<float>)_mm256_max_ps((__m256)a, (__m256)b); }
 #endif
+
+GSPARC_INLINE Vec<float> magnitude(Vec<float> x) { return (Vec<float>)((Int<float>)x & 0x7fffffff); }
+GSPARC_INLINE Vec<double> magnitude(Vec<double> x) { return (Vec<double>)((Int<double>)x & 0x7fffffffffffffff); }
 
 // Nearest integer, halves to even, for |x| < 2^22.
 GSPARC_INLINE Vec<float> nearest(Vec<float> x) { return (x + 12582912.0f) - 12582912.0f; }
@@ -152,20 +184,18 @@ GSPARC_INLINE Vec<double> exponential(Vec<double> x) {
     return (Vec<double>)((Int<double>)p + ((Int<double>)shifted << 52));
 }
 
-// exp(-form / 2): what lies beyond the cut-off may come out as anything.
-template <class S> GSPARC_INLINE Vec<S> bell(Vec<S> form) { return exponential(form * S(-0.5)); }
+// 2^-halvings: what lies beyond the cut-off may come out as anything.
+template <class S> GSPARC_INLINE Vec<S> bell(Vec<S> halvings) { return exponential(halvings * S(-0.6931471805599453)); }
 #if defined(__AVX512F__)
-template <> GSPARC_INLINE Vec<float> bell<float>(Vec<float> form) {  // 2^x by scaling, relative error below 2e-7
-    const Vec<float> x = form * -0.72134752f;
-    const __m512 whole = _mm512_roundscale_ps((__m512)x, _MM_FROUND_TO_NEAREST_INT | _MM_FROUND_NO_EXC);
-    const Vec<float> r = x - (Vec<float>)whole;
-    Vec<float> p = splat(0.00132764654699713f);
-    p = fma(p, r, splat(0.009675545617938042f));
-    p = fma(p, r, splat(0.05550713464617729f));
-    p = fma(p, r, splat(0.24022120237350464f));
-    p = fma(p, r, splat(0.6931469440460205f));
-    p = fma(p, r, splat(1.0000001192092896f));
-    return (Vec<float>)_mm512_scalef_ps((__m512)p, whole);
+template <> GSPARC_INLINE Vec<float> bell<float>(Vec<float> halvings) {  // relative error below 4e-6
+    const __m512 x = (__m512)-halvings;
+    const Vec<float> r = (Vec<float>)_mm512_reduce_ps(x, _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // x less its floor
+    Vec<float> p = splat(0.013534123077988625f);
+    p = fma(p, r, splat(0.052011482417583466f));
+    p = fma(p, r, splat(0.24144279956817627f));
+    p = fma(p, r, splat(0.6930038332939148f));
+    p = fma(p, r, splat(1.0000026226043701f));
+    return (Vec<float>)_mm512_scalef_ps((__m512)p, x);
 }
 #endif
 

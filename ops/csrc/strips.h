@@ -1,28 +1,22 @@
 // Walking a strip of rows: which blocks of pixels each footprint touches, front to back.
 #pragma once
 #include <math.h>
-#include <stdlib.h>
 #include <string.h>
 
 #include "kernels.h"
 #include "pixels.h"
 #include "pool.h"
+#include "workspace.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
 
-// Plain memory of zeros, freed at the end of the scope; std::vector would be compiled per instruction set under
-// one name. It starts on a cache line: a vector across two of them costs twice, and more when read back.
-template <class T> struct Buffer {
-    static constexpr uintptr_t line = 64;
-    void* const memory;
-    T* const data;
-    explicit Buffer(int64_t size)
-        : memory(calloc((size > 0 ? size : 1) * sizeof(T) + line, 1)),
-          data(reinterpret_cast<T*>((reinterpret_cast<uintptr_t>(memory) + line - 1) / line * line)) {}
-    ~Buffer() { free(memory); }
-    Buffer(const Buffer&) = delete;
-    T& operator[](int64_t i) { return data[i]; }
+// A scope's memory, of zeros unless told; not std::vector, which would be compiled per instruction set under one name.
+// It starts on a cache line: a vector across two of them costs twice, and more when read back.
+template <class T> struct Buffer : Workspace<T> {
+    explicit Buffer(int64_t size, bool zeros = true) : Workspace<T>(size) {
+        if (zeros) memset(this->data, 0, size * sizeof(T));
+    }
 };
 
 // A tile is a block of lanes: kStripRows rows of a strip by as many columns as there are lanes for.
@@ -68,6 +62,7 @@ template <class S> struct Strip {
     const int32_t *first, *last;
     const Box* boxes;
     const S* records;
+    const int32_t* order;
     const int64_t* slots;
 
     Strip() = default;
@@ -77,6 +72,7 @@ template <class S> struct Strip {
         row1 = row0 + kStripRows < height ? row0 + kStripRows : height;
         first = plan.entries + plan.strip_starts[task], last = plan.entries + plan.strip_starts[task + 1];
         boxes = plan.boxes + int64_t(pose) * plan.count, records = plan.records + int64_t(pose) * plan.count * kRecord;
+        order = plan.order + int64_t(pose) * plan.count;
         slots = plan.slots + int64_t(pose) * (plan.count + 1);
     }
     int64_t slot(int rank) const { return slots[rank] + index - boxes[rank].row0 / kStripRows; }
@@ -92,7 +88,7 @@ GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S
     const Runs runs = runs_of(strip.boxes[rank], lens.width);
     Place<S> at;
     grid.strip(strip.index, at);
-    const View view(strip.records + int64_t(rank) * kRecord, at, grid.tables, lens);
+    const View view(strip.records + int64_t(strip.order[rank]) * kRecord, at, grid.tables, lens);
     int hits[most];
     Mask<S> counts[most];
     alignas(64) S memory[most * kept];
@@ -124,14 +120,6 @@ template <class S> struct Always {
     GSPARC_INLINE Mask<S> operator()(int) const { return at_most(splat(S(0)), splat(S(0))); }
 };
 
-// For `wanted`: where light still arrives. The transmittances of a tile lie `step` apart.
-template <class S> struct Lit {
-    const S* before;
-    int step;
-    Vec<S> floor;
-    GSPARC_INLINE Mask<S> operator()(int tile) const { return at_most(floor, load(before + int64_t(tile) * step)); }
-};
-
 // Calls visit(tile, lane, pixel, count) for each row of each tile: `count` neighbours from lane and pixel on.
 template <class S, class Visit> inline void each_stretch(const Strip<S>& strip, int width, Visit&& visit) {
     constexpr int columns = kTileColumns<S>;
@@ -144,45 +132,10 @@ template <class S, class Visit> inline void each_stretch(const Strip<S>& strip, 
     }
 }
 
-// Opacity, extinction and features of each rank side by side: (P, N, 2 + K), K channels per pose.
-template <class S> struct Ranked {
-    int width;
-    Buffer<S> rows;
-
-    Ranked(const PlanView<S>& plan, const Model<S>& model, const S* features, int samples, int channels, int threads)
-        : width(2 + per_pose(plan, samples, channels)), rows(int64_t(plan.poses) * plan.count * width) {
-        constexpr int chunk = 512;
-        const int chunks = (plan.count + chunk - 1) / chunk;
-        auto fill = [&](int task, int) {
-            const int pose = task / chunks, begin = task % chunks * chunk;
-            const int end = begin + chunk < plan.shown[pose] ? begin + chunk : plan.shown[pose];
-            const int first = plan.poses == 1 ? 0 : pose, count = plan.poses == 1 ? samples : 1;
-            for (int rank = begin; rank < end; ++rank) {
-                const int64_t at = int64_t(pose) * plan.count + rank, i = plan.order[at];
-                S* row = rows.data + at * width;
-                const S gain = plan.records[at * kRecord + kGain];
-                row[0] = gain * model.opacities[i];
-                row[1] = model.extinctions ? gain * model.extinctions[i] : row[0];
-                for (int b = 0; b < count; ++b)
-                    for (int c = 0; c < channels; ++c)
-                        row[2 + b * channels + c] = features[(int64_t(first + b) * plan.count + i) * channels + c];
-            }
-        };
-        parallel_for(plan.poses * chunks, threads, fill);
-    }
-    static int per_pose(const PlanView<S>& plan, int samples, int channels) {
-        return plan.poses == 1 ? samples * channels : channels;
-    }
-    const S* of(const PlanView<S>& plan, int pose, int rank) const {
-        return rows.data + (int64_t(pose) * plan.count + rank) * width;
-    }
-};
-
-// Whether any pixel of the strip still sees through; `before` every `step` numbers.
-template <class S> inline bool any_lit(const S* before, int tiles, int step, S floor) {
-    for (int i = 0; i < tiles; ++i)
-        if (any(at_most(splat(floor), load(before + int64_t(i) * step)))) return true;
-    return false;
+// A stretch of pixels, mostly as many as a tile has columns: a size that the compiler knows.
+template <class S> GSPARC_INLINE void copy_stretch(S* to, const S* from, int count) {
+    if (count == kTileColumns<S>) memcpy(to, from, kTileColumns<S> * sizeof(S));
+    else memcpy(to, from, count * sizeof(S));
 }
 
 template <class S> inline void fill(S* to, int64_t size, S value) {
