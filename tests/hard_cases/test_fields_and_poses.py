@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from fields import Drawn, assert_within, condition, fields, layers, show
+from fields import CIRCLES, Drawn, assert_within, condition, fields, layers, show
 from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 from ledger import LEDGER
@@ -44,7 +44,7 @@ def holds(examples: int, *, property, **drawn) -> None:
     setting(given(**drawn)(counted))()
 
 
-@effort(25, 1200)
+@effort(25, 400)
 def test_finite(backend, examples):
     def finite(drawn: Drawn):
         got = show(drawn, backend)
@@ -53,7 +53,7 @@ def test_finite(backend, examples):
     holds(examples, property=finite, drawn=fields())
 
 
-@effort(10, 500)
+@effort(10, 300)
 def test_equals_float64_within_the_condition_of_the_input(backend, examples):
     def equal(drawn: Drawn):
         known = condition(drawn)
@@ -63,12 +63,12 @@ def test_equals_float64_within_the_condition_of_the_input(backend, examples):
     holds(examples, property=equal, drawn=fields())
 
 
-@effort(6, 300)
+@effort(6, 150)
 def test_turning_about_the_boresight_rolls_the_image(backend, examples):
     def rolls(drawn: Drawn, columns: int):
-        assume(drawn.grid.periodic)
         columns = columns % drawn.grid.width
-        noise = torch.randn(2, 1, drawn.grid.height, drawn.grid.width, dtype=torch.float64)
+        draw = torch.Generator().manual_seed(1)
+        noise = torch.randn(2, 1, drawn.grid.height, drawn.grid.width, generator=draw, dtype=torch.float64)
         known = condition(drawn, upstream=noise, behind=False)
         c, s = (f(columns * drawn.grid.azimuth_step) for f in (math.cos, math.sin))
         turn = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]], dtype=torch.float64)
@@ -79,10 +79,10 @@ def test_turning_about_the_boresight_rolls_the_image(backend, examples):
             got[name] = got[name].roll(-columns, -1)
         assert_within(got, known, FACTOR)
 
-    holds(examples, property=rolls, drawn=fields(), columns=st.integers(1, 40))
+    holds(examples, property=rolls, drawn=fields(grids=CIRCLES), columns=st.integers(1, 40))
 
 
-@effort(15, 800)
+@effort(15, 300)
 def test_permuting_rows_with_their_ids_changes_nothing(backend, examples):
     if backend == "reference":
         pytest.skip("the reference adds in the order of the rows: equal within rounding only (test_ties.py)")
@@ -99,7 +99,7 @@ def test_permuting_rows_with_their_ids_changes_nothing(backend, examples):
     holds(examples, property=unchanged, drawn=fields(), seed=st.integers(0, 99))
 
 
-@effort(15, 800)
+@effort(15, 300)
 def test_no_more_energy_comes_than_was_there(backend, examples):
     """With features of 1, what is seen and what is left behind add up to 1."""
 
@@ -115,7 +115,7 @@ def test_no_more_energy_comes_than_was_there(backend, examples):
     holds(examples, property=conserved, drawn=fields(hides=False))
 
 
-@effort(8, 400)
+@effort(8, 200)
 def test_gradient_is_exactly_zero_where_nothing_is_seen(backend, examples):
     """Behind the stopping rule, below the cut-off, inside the near cut, off the grid: 0, nothing small."""
 
@@ -133,7 +133,7 @@ def test_gradient_is_exactly_zero_where_nothing_is_seen(backend, examples):
     holds(examples, property=zero, drawn=fields())
 
 
-@effort(10, 500)
+@effort(10, 200)
 def test_weights_and_frozen_views_say_the_same(backend, examples):
     def same(drawn: Drawn):
         scene, optics = drawn.scene.to(drawn.dtype), drawn.optics
@@ -152,7 +152,7 @@ def test_weights_and_frozen_views_say_the_same(backend, examples):
     holds(examples, property=same, drawn=fields())
 
 
-@effort(25, 1200)
+@effort(25, 500)
 def test_any_number_is_refused_by_name_or_harmless(backend, examples):
     """NaN, infinities, denormals, 1e38 in one place of one Gaussian."""
 
