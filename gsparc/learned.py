@@ -84,6 +84,7 @@ class LearnedField(Method):
         self._ends: dict[str, Tensor] = {}
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
+        self._billed_s = 0.0  # for reusable work, by the stages so far
         self._frozen: FrozenView | FrozenArray | None = None
 
     # -- learning ----------------------------------------------------------------------------------
@@ -103,7 +104,7 @@ class LearnedField(Method):
             log.info("%s", reason)
         resumed = None if training.resume is None else checkpoint.read(training.resume)
         stage = "train" if resumed is None else str(resumed.extra.get("stage", "train"))
-        seconds, confidence = 0.0, None
+        seconds, confidence, self._billed_s = 0.0, None, 0.0
         if resumed is not None:
             seconds = float(resumed.extra.get("earlier_s", 0.0))
         if stage == "train":
@@ -142,7 +143,9 @@ class LearnedField(Method):
             self._prior = start.prior
             self.model = self._new_model(data.site, start.sources)
             start.solve(self.model)
-            spent = start.stored_s
+            # What an earlier run has paid for is billed; what an earlier stage has, is not again.
+            spent = start.billed_s - start.waited_s - self._billed_s
+            self._billed_s = start.billed_s
         else:
             self.restore(data.site, checkpoint.read(resume).state)
             spent = 0.0

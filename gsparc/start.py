@@ -35,13 +35,14 @@ class Start:
         prior: features of the emission; None when they need none.
         sources: (N, 3) [m] where the Gaussians stand; None when the field places them.
         solve: sets a fresh model's weights.
-        stored_s: seconds of the bill that were spent by an earlier run [s].
+        billed_s, waited_s: seconds that reusable work cost when it was done, and now [s].
     """
 
     prior: Prior | None
     sources: Tensor | None
     solve: Callable[[GaussianModel], None]
-    stored_s: float = 0.0
+    billed_s: float = 0.0
+    waited_s: float = 0.0
 
 
 def prepare(
@@ -78,7 +79,7 @@ def prepare(
         assert receiver is not None
         found = through_array.settled_vectors(data, rows, anchors, seed, run_dir)
         begin = partial(through_array.start, data=data, found=found, receiver=receiver)
-        return Start(found.prior, None, begin, found.billed_s - found.waited_s)
+        return Start(found.prior, None, begin, found.billed_s, found.waited_s)
     kernel = "kernel" in (choices.encoding, settings.confidence.encoding.kind)
     prior = learn_prior(data, rows, anchors, seed) if kernel else None
     if not choices.warm_start:
