@@ -15,13 +15,17 @@ from rich.table import Table
 
 from gsparc import cli
 from gsparc.calibration.curves import bounded, perfect_area, rank_correlation, risk_coverage
-from gsparc.calibration.evidence import Evidence, gather, joined
+from gsparc.calibration.evidence import CHUNK, Evidence, gather, joined
 from gsparc.calibration.pictures import draw
 from gsparc.calibration.threshold import Promise
 from gsparc.calibration.trial import Trial, trials
 from gsparc.clock import machine_facts
+from gsparc.data.argos import peers_figures, peers_normalisation
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.evaluate import open_files
 from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.method import Method
 from gsparc.scoring import rows_of
 from gsparc.summary import provenance, write_summary
 
@@ -41,9 +45,22 @@ def collect(
             parts.append(gather(run.methods[0], run.data, fold, rows))
         seen = np.concatenate([seen, rows])
         facts = facts or {
+            **_published(run.methods[0], run.data, fold),
             **dataset_facts(run.data), **split_facts(run.split), "model/name": run.methods[0].name
         }  # fmt: skip
     return joined(parts), facts
+
+
+def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:
+    """`peers/*` and `denormalised/*` of Argos data: the figures under both normalisations, all test rows."""
+    if data.uplink is None:
+        return {}
+    batches = (data.batch(fold.test[i : i + CHUNK]) for i in range(0, len(fold.test), CHUNK))
+    predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
+    target = data.target[fold.test]
+    both = {"peers": peers_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
+    found = {room: peers_figures(predicted, target, *removed) for room, removed in both.items()}
+    return {f"{room}/{name}": value for room, one in found.items() for name, value in one.items()}
 
 
 def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[str, Any]:

@@ -129,6 +129,25 @@ def peers_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex,
     return mean, float(np.sqrt((np.abs(chosen - mean) ** 2).mean()))
 
 
+def peers_figures(
+    predicted: np.ndarray, target: np.ndarray, mean: complex, spread: float
+) -> dict[str, float]:
+    """NMSE and mean SNR of all tones and of the first one, as published figures are taken.
+
+    Args:
+        predicted, target: (n, A, K), denormalised.
+        mean, spread: what is removed from both; 0 and 1 for the denormalised figures.
+    """
+    guess, truth = (predicted - mean) / spread, (target - mean) / spread
+    figures = {}
+    for name, tones in (("", slice(None)), ("_first_tone", slice(0, 1))):
+        error = (np.abs(guess[..., tones] - truth[..., tones]) ** 2).sum((1, 2))
+        power = (np.abs(truth[..., tones]) ** 2).sum((1, 2))
+        figures[f"nmse{name}"] = float(error.sum() / power.sum())
+        figures[f"snr_db{name}"] = float(np.mean(10 * np.log10(power / error)))
+    return figures
+
+
 def _description(root: Path) -> Mapping[str, Any]:
     path = root / "base-station.yml"
     try:
