@@ -18,17 +18,19 @@ import torch
 from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
+from gsparc.bearings.compress import components
 from gsparc.bearings.lags import BLOCK, Lags
 from gsparc.bearings.sources import SearchSettings, bearings, find_sources, mixed, powers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.method import FitReport, Prediction
 from gsparc.peers.encoding import to_real
-from gsparc.peers.gp import Kernel, choose_kernel, principal_components
+from gsparc.peers.gp import Kernel, choose_kernel
 from gsparc.peers.interpolation import Interpolator
 
 log = logging.getLogger(__name__)
 
+CHOOSING = 128  # components that kernels are chosen with
 POOR = 0.02  # share of the energy that lags may leave of a spectrum that the array really measured
 
 
@@ -149,9 +151,9 @@ class BearingField(Interpolator):
             kernel = Kernel(length * diagonal, self.trend.noise)
             self._learn_trend(kernel, positions[rows], power[rows])
             left = self._residuals(space, positions[rows], power[rows], targets[rows])
-            parts = principal_components(left.reshape(len(left), *space.image), "spectrum", 128)
-            rest = choose_kernel(positions[rows], parts.scores, left.shape[1])
-            error = _left_out(rest, positions[rows], parts.scores) + parts.lost * left.shape[1]
+            parts = components(left, CHOOSING)
+            rest = choose_kernel(positions[rows], parts.scores, len(parts.mean))
+            error = _left_out(rest, positions[rows], parts.scores) + parts.lost * len(parts.mean)
             if error < best:
                 best, self.smooth, self.rest = error, kernel, rest
         self._learn_trend(self.smooth, positions, power)
@@ -166,25 +168,22 @@ class BearingField(Interpolator):
     def _residuals(
         self, space: Lags, positions: np.ndarray, power: np.ndarray, targets: np.ndarray
     ) -> np.ndarray:
-        """What the trend leaves of each image when it has not seen that image (n, D) float32."""
-        left = np.empty((len(targets), int(np.prod(space.image))), dtype=np.float32)
+        """What the trend leaves of each image when it has not seen that image (n, H, W) float32."""
+        left = np.empty((len(targets), *space.image), dtype=np.float32)
         for start in range(0, len(targets), BLOCK):
             rows = slice(start, start + BLOCK)
             said = self._draw(space, torch.from_numpy(positions[rows]).float(), self._left_out_powers[rows])
-            left[rows] = (self._images(targets[rows]) - said).reshape(len(said), -1).numpy()
+            left[rows] = (self._images(targets[rows]) - said).numpy()
         return left
 
     def _learn_rest(self, left: np.ndarray) -> None:
-        assert self.site is not None and self.site.grid is not None
         self._factor = cho_factor(self.rest.gram(self.positions), lower=True)
         if self.components == 0:
-            self.axes, self.mean = torch.zeros(0, left.shape[1]), torch.from_numpy(left.mean(0))
+            self.mean = torch.from_numpy(left.mean(0).ravel())
+            self.axes = torch.zeros(0, len(self.mean))
             self.weights, self.lost = torch.zeros(len(left), 0, dtype=torch.float64), float(left.var())
         else:
-            grid = self.site.grid
-            parts = principal_components(
-                left.reshape(-1, grid.height, grid.width), "spectrum", self.components
-            )
+            parts = components(left, self.components)
             self.weights = torch.from_numpy(cho_solve(self._factor, parts.scores))
             self.axes, self.mean = torch.from_numpy(parts.axes), torch.from_numpy(parts.mean)
             self.lost = parts.lost

@@ -1,0 +1,194 @@
+"""The ray tracer for real; slow; skipped with its remedy where Sionna is not installed (`make sionna`)."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import h5py
+import numpy as np
+import pytest
+
+from gsparc.data.load import load
+from gsparc.simulate import llvm, raytracer
+from gsparc.simulate.auto import AutoSettings
+from gsparc.simulate.campaign import simulate
+from gsparc.simulate.effects import BITS, Effects
+from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.scenes.build import SceneSettings, build
+from gsparc.simulate.scenes.conference import SIZE, conference_room
+from gsparc.simulate.scenes.placement import clear_of, place
+from gsparc.simulate.settings import Campaign
+
+pytestmark = pytest.mark.slow
+
+TRANSMITTER = np.array([3.1, 6.2, 3.7])
+QUICK = Sampling(samples=20_000, batch=100)
+PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
+CONFERENCE = SceneSettings(
+    name="conference_room", builder="conference_room", transmitter_m=tuple(TRANSMITTER),
+    area_m=((0.3, 0.3), (13.7, 9.7)), height_m=(1.1, 1.5), num_receivers=40,
+    carrier_hz=2.44e9, bandwidth_hz=80e6, subcarriers=8,
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sionna():
+    try:
+        llvm.prepare()
+    except llvm.SimulatorMissing as missing:
+        pytest.skip(str(missing))
+
+
+@pytest.fixture(scope="module")
+def room():
+    return RayTracer(conference_room(), TRANSMITTER, CONFERENCE.carrier_hz, QUICK)
+
+
+@pytest.fixture(scope="module")
+def places():
+    return place(60, np.array(CONFERENCE.area_m), CONFERENCE.height_m, clear_of(conference_room()), seed=0)
+
+
+def test_line_of_sight_is_friis(room, places):
+    paths = room.trace(places, Effects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0}))
+    seen = np.diff(paths.offsets)
+    assert set(seen) == {0, 1} and seen.mean() > 0.5
+    distance = np.linalg.norm(places - TRANSMITTER, axis=1)[seen == 1]
+    np.testing.assert_allclose(np.sqrt(paths.power), room.wavelength / (4 * np.pi * distance), rtol=1e-3)
+    np.testing.assert_allclose(paths.delay, distance / 299_792_458.0, rtol=1e-5)
+    towards = (TRANSMITTER - places)[seen == 1] / distance[:, None]
+    np.testing.assert_allclose(paths.direction, towards, atol=1e-4)
+
+
+def test_our_channels_are_the_solvers_own(room, places):
+    """Carrier phase and all: `paths.cfr` with absolute delays."""
+    import mitsuba as mi
+
+    paths = room.trace(places[:6], PLAIN)
+    tones = CONFERENCE.frequency_hz
+    ours = paths.responses(tones, np.zeros((1, 3)), room.wavelength)[:, 0]
+    import sionna.rt as rt
+
+    found = rt.PathSolver()(
+        room._scene, max_depth=2, samples_per_src=QUICK.samples, max_num_paths_per_src=120_000,
+        diffuse_reflection=False, seed=QUICK.seed,
+    )  # fmt: skip
+    real, imaginary = found.cfr(frequencies=mi.Float(tones - tones.mean()), normalize_delays=False)
+    theirs = (real.numpy() + 1j * imaginary.numpy()).reshape(6, -1)
+    # float32 phases of the solver
+    np.testing.assert_allclose(ours, theirs, atol=2e-2 * np.abs(theirs).max())
+
+
+def test_attribution_equals_a_run_without(room, places):
+    """What remains of a full run under fewer effects is what a run with fewer effects finds, in power."""
+    full = replace(PLAIN, depth=3)
+    whole = room.trace(places, full)
+    for less in (replace(full, depth=1), full.without("refraction")):
+        kept, alone = whole.under(less).received_power(), room.trace(places, less).received_power()
+        strong = alone > 0.01 * alone.max()
+        assert np.median(np.abs(10 * np.log10(kept[strong] / alone[strong]))) < 0.1
+    assert set(np.unique(whole.mechanisms)) <= {0, BITS["specular"], BITS["refraction"], 5}
+
+
+def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
+    """The solver shares its limit among receivers and drops the rest without a word."""
+    enough = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK).trace(places[:20], PLAIN)
+    monkeypatch.setattr(raytracer, "CANDIDATES_PER_RECEIVER", 4)
+    starved = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK)
+    again = starved.trace(places[:20], PLAIN)
+    assert starved.retried > 0 and len(again) == 20
+    near = 10 * np.log10(again.received_power() / enough.received_power())
+    assert np.median(np.abs(near)) < 0.2
+
+
+def test_polarisation_edges_and_scattering_are_recorded(room, places):
+    paths = room.trace(places[:10], Effects(depth=2))
+    assert paths.gain.shape[1] == 2 and np.abs(paths.gain[:, 1]).max() > 0
+    for name, bit in BITS.items():
+        assert ((paths.mechanisms & bit) > 0).any(), name
+    assert (paths.order[paths.mechanisms == 0] == 0).all() and paths.order.max() == 2
+
+
+def test_receivers_keep_out_of_things():
+    solids = conference_room()
+    places = place(2000, np.array(CONFERENCE.area_m), (0.1, 2.0), clear_of(solids), seed=1)
+    for solid in solids:
+        if solid.keep_out is not None:
+            low, high = solid.keep_out
+            assert not np.all((places > low) & (places < high), axis=1).any(), solid.name
+    assert (places > 0).all() and (places < SIZE).all()
+
+
+def test_built_in_materials_are_completed_and_receivers_are_outdoors():
+    canyon = SceneSettings(
+        name="canyon", builtin="simple_street_canyon", transmitter_m=(-33, 0, 12), height_m=(1.2, 1.8),
+        area_m=((-60, -45), (60, 45)), num_receivers=30, carrier_hz=3.5e9, bandwidth_hz=100e6, subcarriers=4,
+        open_sky=True,
+    )  # fmt: skip
+    engine, receivers = build(canyon, QUICK)
+    assert all(m["scattering"] > 0 for m in engine.materials().values())
+    assert engine.under_open_sky(receivers).all()
+    inside = np.array([[45.0, 20.0, 1.5]])  # a building of the scene
+    assert not engine.under_open_sky(inside).any()
+    with pytest.raises(ValueError, match=r"there are .*munich"):
+        build(replace(canyon, builtin="muenchen"), QUICK)
+
+
+def test_a_scene_of_ones_own_by_path(tmp_path):
+    import sionna.rt as rt
+
+    own = replace(CONFERENCE, builder=None, xml=str(rt.scene.floor_wall), area_m=((-3, -3), (3, 3)),
+                  transmitter_m=(-2.0, 0.0, 3.0), num_receivers=20)  # fmt: skip
+    engine, receivers = build(own, QUICK)
+    assert engine.trace(receivers, PLAIN).received_power().min() > 0
+    with pytest.raises(ValueError, match="no such file"):
+        build(replace(own, xml=str(tmp_path / "none.xml")), QUICK)
+    (tmp_path / "bad.xml").write_text("<scene version='2.1.0'><oops/></scene>")
+    with pytest.raises(ValueError, match="cannot read it"):
+        build(replace(own, xml=str(tmp_path / "bad.xml")), QUICK)
+
+
+def test_auto_in_the_conference_room(tmp_path):
+    asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
+    plan = Campaign(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
+    outcome = simulate(plan, tmp_path / "room.h5")
+    assert outcome.choice is not None and outcome.choice.verdict is not None
+    assert outcome.effects.line_of_sight and outcome.effects.specular
+    assert outcome.convergence is not None and 0 < outcome.convergence.nmse < 0.5
+    with h5py.File(tmp_path / "room.h5") as file:
+        table = json.loads(file.attrs["auto"])["table"]
+        assert {row["effect"] for row in table} >= {"diffuse", "refraction", "depth > 1", "polarisation"}
+        assert all(np.isfinite(row["seconds"]) for row in table)
+        assert "itu-glass" in json.loads(file.attrs["materials"])
+    spectra = load({"name": "sionna", "file": str(tmp_path / "room.h5")})
+    assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)
+
+
+def test_killed_by_the_system_and_resumed(tmp_path):
+    """SIGKILL between shards: nothing finished is lost or made twice."""
+    out = tmp_path / "room.h5"
+    command = [
+        sys.executable, "-m", "gsparc.simulate", "scene=conference_room", "scene.num_receivers=60",
+        "sampling.samples=5000", "shard=10", "check=0", "spectrum.height=18", "spectrum.width=36",
+        f"out={out}", f"hydra.run.dir={tmp_path / 'run'}",
+    ]  # fmt: skip
+    running = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    parts, limit = tmp_path / "room.h5.parts", time.monotonic() + 240
+    while len(list(parts.glob("shard_*.npz"))) < 3:
+        assert running.poll() is None and time.monotonic() < limit
+        time.sleep(0.01)
+    os.kill(running.pid, signal.SIGKILL)
+    running.wait()
+    assert not out.exists()
+    before = {p.name: (p.stat().st_mtime_ns, p.stat().st_ino) for p in parts.glob("shard_*.npz")}
+    again = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
+    assert f"{len(before)} of 6 shards are there already" in again.stdout + again.stderr or len(before) == 6
+    with h5py.File(out) as file:
+        rows = file["rx_position"][()]
+        assert len(np.unique(rows, axis=0)) == 60 and len(file["spectrum"]) == 60
+    facts = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert facts["dataset/receivers"] == 60
