@@ -46,17 +46,16 @@ def task(config: DictConfig) -> dict[str, Any]:
     threads = _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
-    choose_on = config.choose_on if len(getattr(fold, config.choose_on)) else "train"
     rivals = _rivals(config, run)
     rows = getattr(fold, config.eval_on)
     clocks = {name: asker(rival, data, rows) for name, (rival, _) in rivals.items()}
     points, other_ms = sweep(
-        candidates, data, fold, eval_on=config.eval_on, choose_on=choose_on,
+        candidates, data, fold, eval_on=config.eval_on,
         pace=Pace(rounds=config.rounds, budget_s=config.budget_s), others={COPY: reference_copy(), **clocks},
     )  # fmt: skip
     figure = FIGURES[data.site.kind]
     shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
-    chosen = front([p.p50 for p in points], [p.chosen_by for p in points])
+    chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         stored.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
@@ -76,7 +75,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         "ckpt": str(config.ckpt),
         "seed": run.stored[0].configuration.get("seed"),
         "time/includes": "one query end to end: world position in, physical units out; warm",
-        "tradeoff/chosen_on": choose_on,
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
@@ -132,6 +130,7 @@ def _columns(
         **{figure: [p.figures[figure] for p in rows] for figure in points[0].figures},
         "difference_to_full": [p.difference[0] for p in rows],
         "difference_se": [p.difference[1] for p in rows],
+        "closeness_db": [p.closeness_db for p in rows],
         "front": [int(i in shown) for i in order],
         "kept_with_model": [int(i in chosen) for i in order],
         "threads": [p.threads for p in rows],

@@ -37,7 +37,7 @@ class Point:
         settings: what is spared.
         threads: CPU threads.
         figures: on the evaluated rows, as in `summary.json`.
-        chosen_by: the deciding figure on the rows that choose; no test row among them.
+        closeness_db: how near its answers are to the full model's [dB]; decides which points are kept.
         ms: (n,) wall times of single queries end to end [ms].
         size: Gaussians, sources or stored samples that answer.
         difference: mean paired difference of the figure per sample to the full model, and its standard error.
@@ -47,7 +47,7 @@ class Point:
     settings: Settings
     threads: int
     figures: Mapping[str, float | None]
-    chosen_by: float
+    closeness_db: float
     ms: np.ndarray
     size: int = 0
     difference: tuple[float | None, float | None] = field(default=(None, None))

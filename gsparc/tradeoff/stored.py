@@ -22,7 +22,7 @@ class Operating:
         label: in words.
         settings: what is spared.
         threads: CPU threads.
-        score: larger is better; on the rows that choose, comparable within one model.
+        score: larger is better: how near its answers are to the full model's [dB].
         figure: name and value of the accuracy that was shown with it.
         p50_ms: median latency where it was measured [ms]; this machine times anew.
     """
@@ -42,7 +42,7 @@ def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -
             "label": p.label,
             "settings": dict(p.settings),
             "threads": p.threads,
-            "score": p.chosen_by,
+            "score": p.closeness_db,
             "figure": [figure, p.value(figure)],
             "p50_ms": p.p50,
         }

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import paired_differences
 from gsparc.method import Method
 from gsparc.predictor import Predictor
-from gsparc.scoring import Scores, rows_of, score
-from gsparc.tradeoff.points import FIGURES, Point, Settings, score_of, worded
+from gsparc.scoring import CHUNK, Scores, rows_of, score
+from gsparc.tradeoff.points import FIGURES, Point, Settings, worded
 from gsparc.tradeoff.timing import Pace, in_turns
 
 log = logging.getLogger(__name__)
 
+CLOSEST_DB = 100.0  # float32 tells no more
 PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
 
 
@@ -59,7 +63,6 @@ def sweep(
     fold: Fold,
     *,
     eval_on: str,
-    choose_on: str,
     pace: Pace,
     others: Mapping[str, Callable[[int], object]],
 ) -> tuple[list[Point], dict[str, np.ndarray]]:
@@ -69,7 +72,6 @@ def sweep(
         candidates: to be measured.
         data, fold: as the model was trained with.
         eval_on: rows whose figures are shown.
-        choose_on: rows that decide which points are worth keeping with the model.
         pace: of the clock.
         others: further contenders for the clock alone (a copy of memory), by name.
 
@@ -79,17 +81,17 @@ def sweep(
     figure = FIGURES[data.site.kind]
     split = Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
+    rows = rows_of(fold, eval_on)
+    whole = said(candidates[0].method, data, rows)
     for number, candidate in enumerate(candidates):
         there = score([candidate.method], data, split, eval_on)
-        deciding = score([candidate.method], data, split, choose_on).figures()[figure]
-        scored.append((there, score_of(figure, float("inf") if deciding is None else deciding)))
+        scored.append((there, closeness(said(candidate.method, data, rows), whole)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Callable[[int], object]] = {
         name: call for name, call in others.items()
     }
     threads: dict[tuple[int, int] | str, int] = dict.fromkeys(others, 1)
-    rows = rows_of(fold, eval_on)
     for index, candidate in enumerate(candidates):
         ask = asker(candidate.method, data, rows)
         for count in candidate.threads:
@@ -100,15 +102,27 @@ def sweep(
         if isinstance(key, str):
             continue
         index, count = key
-        candidate, (scores, deciding) = candidates[index], scored[index]
-        said = f"{candidate.label}, {count} thread{'s' if count > 1 else ''}"
+        candidate, (scores, close) = candidates[index], scored[index]
+        label = f"{candidate.label}, {count} thread{'s' if count > 1 else ''}"
         points.append(
             Point(
-                said, candidate.settings, count, scores.figures(), deciding, ms,
+                label, candidate.settings, count, scores.figures(), close, ms,
                 candidate.method.size(), _difference(scores, scored[0][0], figure),
             )
         )  # fmt: skip
     return points, {name: times[name] for name in others}
+
+
+def said(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
+    """Predictions at the places of `rows`, whose targets are not looked at."""
+    parts = [data.batch(rows[i : i + CHUNK]) for i in range(0, len(rows), CHUNK)]
+    return torch.cat([method.predict(batch.tx, batch.rx).mean for batch in parts])
+
+
+def closeness(answers: Tensor, whole: Tensor) -> float:
+    """How near answers are to those of the full model [dB]: what decides without a single measurement."""
+    apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
+    return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 
 
 def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None, float | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import shutil
 
@@ -18,6 +19,7 @@ from gsparc.clock import COPY
 from gsparc.tradeoff import choose, stored
 from gsparc.tradeoff.__main__ import task
 from gsparc.tradeoff.points import Point
+from gsparc.tradeoff.sweep import closeness, said
 from gsparc.tradeoff.timing import Pace, in_turns
 
 
@@ -65,6 +67,19 @@ def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
     place = field.data.site.origin + 0.1
     same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
     assert np.array_equal(*same)
+
+
+def test_what_is_kept_is_decided_without_a_measurement(swept, field):
+    _, folder, _ = swept
+    with (folder / "tradeoff.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["kept_with_model"] == "1"]
+    close = [float(row["closeness_db"]) for row in rows]
+    assert close == sorted(close) and close[-1] == 100.0  # the last is as near as the full model itself
+    data, rows = field.data, field.split.folds[0].test
+    blind = dataclasses.replace(data, target=np.zeros_like(data.target))
+    answers = said(field.methods[0], blind, rows)
+    assert torch.equal(answers, said(field.methods[0], data, rows)) and closeness(answers, answers) == 100.0
+    assert closeness(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
 
 
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
