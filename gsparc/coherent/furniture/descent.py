@@ -1,4 +1,8 @@
-"""Boxes, patches, planes, phases and amplitudes moved together, what varies from place to place held."""
+"""Boxes, patches and amplitudes moved together, what varies from place to place held.
+
+Planes and phases move only where they are new: of the others the part that varies is held where it was, and
+would go on explaining what the constant part has left.
+"""
 
 from __future__ import annotations
 
@@ -109,6 +113,10 @@ def descend(
             break
         optimizer.zero_grad()
         cost.backward()
+        held = residual.phased.scene
+        for value, count in ((planes, len(held.planes)), (phase, len(held.words))):
+            if value.grad is not None:
+                value.grad[:count] = 0
         optimizer.step()
         for group in optimizer.param_groups:
             group["lr"] *= SLOWER

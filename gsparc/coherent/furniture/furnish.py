@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from gsparc.coherent import settle
 from gsparc.coherent.backprojection import pick_apart
 from gsparc.coherent.furniture.boxes import find_box, inside_out
 from gsparc.coherent.furniture.clutter import SOFT, shade, tangents, within
@@ -21,10 +22,12 @@ from gsparc.coherent.phase import LIGHT
 from gsparc.coherent.planes import Word, all_words, images
 from gsparc.coherent.process import JITTER, Scene, steering
 from gsparc.coherent.rows import Rows
+from gsparc.coherent.visibility import KernelVisibility
 
 log = logging.getLogger(__name__)
 
 BOX, PATCH, MIRROR, WALL = 6, 4, 5, 3  # numbers of a box, a patch, a patch on a new plane, a new plane
+FRESH, TURNING = KernelVisibility(0.9, 0.6, 1.5), 0.15  # of gains behind furniture, before they are learned
 SURE = 1.0  # concentration from which on phases of new sources are foretold
 SAME_FACE = 0.03  # [m]; a face that has moved less is not tried again
 NEAR_WALL = 0.25  # [m]; faces that close to the end of the room are not tried as mirrors
@@ -45,6 +48,7 @@ class Furnishing:
         boxes, mirrors, words: most new ones in an epoch.
         beyond: how far outside the receivers' box furniture may reach [m].
         soft: width of edges in each epoch [m], the last for all that follow.
+        steps: of the descent of everything but the furniture, at the end of each epoch.
     """
 
     epochs: int = 3
@@ -56,6 +60,7 @@ class Furnishing:
     words: int = 6
     beyond: float = 0.15
     soft: tuple[float, ...] = (0.08, 0.05, 0.03)
+    steps: int = 8
 
 
 def furnish(
@@ -76,7 +81,11 @@ def furnish(
         deadline: `time.monotonic()` after which nothing new is tried.
         noise_floor: known variance of the noise, in units of the rows' power.
     """
-    found = _Furnisher(rows, phased, generator, settings, noise_floor).run(deadline)
+    # The law learned without furniture stands for it: forget it
+    fresh = replace(
+        phased, scene=replace(phased.scene, visibility=FRESH), turning=min(phased.turning, TURNING)
+    )
+    found = _Furnisher(rows, fresh, generator, settings, noise_floor).run(deadline)
     before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
     return found if after < before - settings.progress else phased
 
@@ -120,15 +129,23 @@ class _Furnisher:
     def _explained(self) -> Explained:
         return self.residual.explained(self.seen, self.scene.log_amplitude)
 
-    def _try(self, scene: Scene, least: float, phase: Tensor | None = None, steps: int = 6) -> bool:
-        """Stay with a scene, a little descended, when it gains at least `least` nats."""
-        before, nll = self.phased, self.nll
+    def _try(self, scene: Scene, least: float, phase: Tensor | None = None, exact: bool = False) -> bool:
+        """Stay with a scene, a little descended, when it gains at least `least` nats.
+
+        What varies and the noise are those of the scene last weighed; with `exact` they are the new scene's
+        own, lest the old ones go on explaining what the new scene hides.
+        """
+        residual, before, nll = self.residual, self.phased, self.nll
         self._stand(replace(before, scene=scene, phase=before.phase if phase is None else phase))
-        self._descend(steps)
-        if self.nll > nll - least:
-            self._stand(before)
-            return False
-        return True
+        self._descend(6)
+        if self.nll < nll - least:
+            if exact:
+                self._weigh(self.phased)
+            if self.nll < nll - least:
+                return True
+        self.residual = residual
+        self._stand(before)
+        return False
 
     def _descend(self, steps: int, soft: float = SOFT) -> None:
         found = descend(self.residual, self.phased, self.paths, steps, soft, accord=self.accord)
@@ -154,6 +171,7 @@ class _Furnisher:
                 self._drop()
                 self._weigh(self.phased)
                 self._drop_words()
+                self._weigh(settle.refine(self.rows, self.phased, s.steps, self.noise_floor))
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, constant %.2f",
@@ -298,7 +316,9 @@ class _Furnisher:
             louder = self.scene.log_amplitude.clone()
             louder[mine] = louder[mine].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
-            self._try(replace(self.scene, log_amplitude=louder, clutter=clutter), PATCH * self.number)
+            self._try(
+                replace(self.scene, log_amplitude=louder, clutter=clutter), PATCH * self.number, exact=True
+            )
 
     def _boxes(self) -> None:
         for _ in range(self.settings.boxes):

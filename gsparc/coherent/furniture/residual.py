@@ -30,12 +30,16 @@ class Residual:
         rows: R = 1.
         phased: its clutter shades what varies; the constant part is shaded by whoever asks.
         noise_floor: known variance of the noise, in units of the rows' power.
+
+    Attributes:
+        phased: as given, constant share and noise chosen by likelihood.
     """
 
     def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
         self.rows, self.noise_floor = rows, noise_floor
         self.target = stacked(rows.target)[0][:, 0]
         self.waves = phased.unshaded(rows)
+        self._cached = self._parts(phased)
         self.phased = self._tuned(phased)
         self._factor(self.phased)
 
@@ -55,7 +59,6 @@ class Residual:
 
     def _tuned(self, phased: PhasedScene) -> PhasedScene:
         """Constant share and noise of the likelihood's choice, one after the other on a grid."""
-        self._cached = self._parts(phased)
         columns = stacked(phased.waves(self.rows) * phased.scene.log_amplitude.exp())[0]
         law, noise = _law(phased), phased.scene.log_noise
         constant = min(CONSTANTS, key=lambda c: abs(c - float(law.constant)))
