@@ -3,8 +3,9 @@ import itertools
 import pytest
 import torch
 
-from gsparc.coherent.parsing import vote
+from gsparc.coherent.parsing import respell, upright, vote
 from gsparc.coherent.planes import all_words, bisector, images, reflect
+from gsparc.coherent.process import Scene
 
 WALLS = torch.tensor(
     [[1.0, 0, 0, 0], [2.0, 0, 0, 4.0], [0, 1, 0, 0], [0, 1, 0, 3.0]], dtype=torch.float64
@@ -50,3 +51,25 @@ def test_walls_are_voted_for_by_the_sources_they_explain():
 
 def test_two_sources_make_no_wall():
     assert vote(torch.stack([TX, reflect(TX, WALLS[0])])) is None
+
+
+def test_walls_of_a_box_are_told_from_sources_spelled_badly():
+    walls = torch.tensor([[1.0, 0, 0, 4], [0, 1, 0, 0], [0, 1, 0, 3], [0, 0, 1, 2.5]], dtype=torch.float64)
+    transmitter = torch.tensor([0.0, 0.8, 1.9], dtype=torch.float64)
+    words = ((), (0,), (1,), (2,), (3,), (0, 3), (1, 3), (0, 1))
+    good = Scene(transmitter, walls, words, torch.zeros(len(words)), 0.0)
+    # the far wall's images hang on tilted planes of their own
+    tilted = bisector(good.sources[3].expand(2, 3), good.sources[[1, 5]])
+    planes = torch.cat([walls[1:], tilted])
+    bad = Scene(transmitter, planes, ((), (0,), (1,), (2,), (1, 3), (1, 4), (0, 2)), torch.zeros(7), 0.0)
+    found = upright(bad)
+    assert found is not None
+    told = {(int(p[:3].abs().argmax()), round(float((p[3] * p[:3].sum()).abs()), 2)) for p in found}
+    assert told == {(0, 4.0), (1, 0.0), (1, 3.0), (2, 2.5)}
+    assert len(respell(bad, found).planes) == 4
+
+
+def test_without_perpendicular_planes_there_is_no_box():
+    plane = torch.tensor([[1.0, 0, 0, 4]], dtype=torch.float64)
+    scene = Scene(torch.zeros(3, dtype=torch.float64), plane, ((), (0,)), torch.zeros(2), 0.0)
+    assert upright(scene) is None
