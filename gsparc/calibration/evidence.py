@@ -1,4 +1,4 @@
-"""How wrong a method was where, and what three confidences said about it beforehand."""
+"""How wrong a method was where, and what several confidences said about it beforehand."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsparc.method import Method
 from gsparc.peers.encoding import training_targets
 from gsparc.peers.gp import choose_kernel, principal_components
 
-KINDS = ("learned", "distance", "gp_variance")
+KINDS = ("learned", "expected", "distance", "gp_variance")
 CHUNK = 64
 KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
 
@@ -46,8 +46,12 @@ class Evidence:
 
 
 def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
-    """Ask `method` about `rows`, and the rivals too; a method without a confidence has no `learned`."""
-    errors, learned = [], []
+    """Ask `method` about `rows`, and the rivals too.
+
+    `learned` is the method's own confidence, `expected` minus its error variance over the power it predicts
+    (in a fade the same variance is a larger relative error); a method without them has no such kind.
+    """
+    errors, learned, expected = [], [], []
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
         found = method.answer(batch)
@@ -55,11 +59,13 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
         power = batch.target.abs().square().flatten(1).sum(1)
         errors.append((miss / power.clamp_min(1e-30)).double().numpy())
         sure = found.confidence
-        learned.append(np.full(len(batch), np.nan) if sure is None else sure.double().numpy())
-    scores = {"learned": np.concatenate(learned), **rivals(data, fold, rows)}
-    if np.isnan(scores["learned"]).any():
-        del scores["learned"]
-    return Evidence(rows, data.moving[rows], np.concatenate(errors), scores)
+        none = np.full(len(batch), np.nan)
+        learned.append(none if sure is None else sure.double().numpy())
+        loud = found.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
+        expected.append(none if found.variance is None else -(found.variance / loud).double().numpy())
+    own = {"learned": np.concatenate(learned), "expected": np.concatenate(expected)}
+    scores = {kind: score for kind, score in own.items() if not np.isnan(score).any()}
+    return Evidence(rows, data.moving[rows], np.concatenate(errors), scores | rivals(data, fold, rows))
 
 
 def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:

@@ -11,7 +11,12 @@ from gsparc.calibration.curves import bounded, risk_coverage
 from gsparc.calibration.evidence import Evidence
 from gsparc.calibration.trial import Trial
 
-NAMES = {"learned": "learned", "distance": "distance to the nearest", "gp_variance": "GP variance"}
+NAMES = {
+    "learned": "learned",
+    "expected": "expected error",
+    "distance": "distance to the nearest",
+    "gp_variance": "GP variance",
+}
 
 
 def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> None:

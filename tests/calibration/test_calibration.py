@@ -109,7 +109,7 @@ def test_evidence_of_a_method(campaign, folds) -> None:
 
     data, split = campaign("csi", rows=60, static_end="tx"), folds(60)
     fold = split.folds[0]
-    for make, kinds in ((GaussianProcess, {"learned", "distance", "gp_variance"}),
+    for make, kinds in ((GaussianProcess, {"learned", "expected", "distance", "gp_variance"}),
                         (Mean, {"distance", "gp_variance"})):  # fmt: skip
         method = make()
         method.fit(data, fold, None)
