@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.coherent import settle
 from gsparc.coherent.backprojection import pick_apart
 from gsparc.coherent.furniture.boxes import find_box, inside_out
-from gsparc.coherent.furniture.clutter import SOFT, shade, tangents, within
+from gsparc.coherent.furniture.clutter import SOFT, Clutter, shade, tangents, within
 from gsparc.coherent.furniture.descent import Accord, descend
 from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, same_mirror, walls
 from gsparc.coherent.furniture.residual import Explained, Residual
@@ -174,9 +174,9 @@ class _Furnisher:
                 self._weigh(settle.refine(self.rows, self.phased, s.steps, self.noise_floor))
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
-                "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, constant %.2f",
+                "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
                 epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
-                self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility.constant,
+                self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility,
             )  # fmt: skip
             if time.monotonic() > deadline or self.nll > before - s.progress:
                 break
@@ -359,7 +359,7 @@ class _Furnisher:
             if self.nll > nll - 0.5:
                 self._stand(before)
 
-    def _with(self, clutter) -> PhasedScene:
+    def _with(self, clutter: Clutter) -> PhasedScene:
         return replace(self.phased, scene=replace(self.scene, clutter=clutter))
 
     def _drop(self) -> None:

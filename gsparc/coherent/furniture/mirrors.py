@@ -185,7 +185,9 @@ def _raster(
     ends = room @ along.T
     low, high = ends.amin(0), ends.amax(0)
     cells = ((high - low) / CELL).ceil().long().clamp_min(1).tolist()
-    matched, power, served = [], [], []
+    matched: list[Tensor] = []
+    power: list[Tensor] = []
+    served: list[Tensor] = []
     for wave, met in _sources(rows, transmitter, candidates, known):
         cell = ((met @ along.T - low) / CELL).floor().long()
         inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
