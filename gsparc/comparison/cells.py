@@ -81,7 +81,9 @@ def contenders(config: Mapping[str, Any]) -> dict[str, Contender]:
     found = {}
     for name, entry in config.items():
         try:
-            lists = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()}
+            lists: dict[str, Any] = {
+                k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()
+            }
             found[str(name)] = Contender(str(name), **lists)
         except TypeError as error:
             raise ValueError(f"methods.{name}: {str(error).partition('() ')[2]}") from None

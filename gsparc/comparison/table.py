@@ -128,7 +128,7 @@ def blocks(found: Sequence[Row]) -> list[Block]:
     for (dataset, split), group in groupby(found, lambda r: (r.dataset, r.split)):
         here = list(group)
         free = [r for r in here if r.budget_s is None]
-        budgets = sorted({r.budget_s for r in here if r.budget_s is not None})
+        budgets: list[float | None] = [*sorted({r.budget_s for r in here if r.budget_s is not None})]
         for budget in budgets or [None]:
             members = free + [r for r in here if budget is not None and r.budget_s == budget]
             result.append(Block(dataset, split, budget, tuple(sorted(members, key=lambda r: -r.score_db))))

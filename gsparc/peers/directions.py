@@ -35,7 +35,7 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
             for p, q in zip(a, b, strict=True):
                 meetings[i][p].append(float(along[p, q]))
     for i, found in enumerate(meetings):
-        for p, values in enumerate(found):
+        for p, values in enumerate(found):  # type: ignore[assignment]
             if values:
                 distances[i][p] = np.median(values)
     points = [
