@@ -17,7 +17,7 @@ from gsparc.benchmark import kernels, layers, steps
 from gsparc.benchmark.case import Case
 from gsparc.benchmark.claims import claims
 from gsparc.benchmark.measure import Machine, Row, facts, measure
-from gsparc.benchmark.report import claims_table, rows_table
+from gsparc.benchmark.report import claims_table, markdown, rows_table
 from gsparc.benchmark.scene import DEFAULT, scene
 from gsparc.clock import ClockSettings, machine_facts, peak_memory
 from gsparc.ops.native import instruction_set
@@ -64,6 +64,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         )
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
     machine, console = Machine(), Console()
+    before = machine_facts()["machine/load"]
     rows: list[Row] = []
     gc.collect()
     gc.freeze()  # what the imports left behind is not searched again in the middle of a call
@@ -85,7 +86,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     for where, claim in promises:
         stem = f"claim/{claim.name}/{where}".replace(",", "").replace(" ", "_")
         found |= {f"{stem}/ratio": claim.ratio, f"{stem}/promised": claim.bound, f"{stem}/met": claim.met}
-    write_summary(Path(HydraConfig.get().runtime.output_dir) / "summary.json", found)
+    found["machine/load_before"] = before
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    write_summary(run_dir / "summary.json", found)
+    (run_dir / "bench.md").write_text(markdown(found, rows, promises), encoding="utf-8")
     console.print(rows_table(rows, f"{found['machine/cpu']}, {found['machine/instruction_set']}"))
     console.print(claims_table(promises, "Promises"))
     return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from gsparc.benchmark.case import Call, Case, Work
 from gsparc.benchmark.scene import GRID, places, receiver, scene
@@ -33,12 +34,14 @@ def _learning(model: GaussianModel, batch: int) -> Call:
     target = torch.rand((batch, GRID.height, GRID.width), generator=draw)
     tx, rx = places(batch) + 1, Pose.identity(places(batch))
 
-    def call() -> None:
+    def call() -> Tensor:
         with torch.enable_grad():
             optimizer.zero_grad(set_to_none=True)
             values = model.features(tx, rx)[..., :1]
             image = composite(model.plan(receiver()), *model._geometry(), values).image
-            spectrum_loss(image.squeeze(1), target).mean().backward()
+            loss = spectrum_loss(image.squeeze(1), target).mean()
+            loss.backward()
             optimizer.step()
+        return loss.detach()
 
     return call

@@ -7,10 +7,11 @@ import sys
 import pytest
 import torch
 
-from gsparc.benchmark import kernels
+from gsparc.benchmark import kernels, steps
 from gsparc.benchmark.case import Case, Work
 from gsparc.benchmark.claims import Claim
 from gsparc.benchmark.measure import Machine, measure
+from gsparc.benchmark.report import markdown
 from gsparc.benchmark.scene import receiver, scene
 from gsparc.clock import ClockSettings
 from gsparc.ops import composite, make_plan, marks
@@ -58,3 +59,23 @@ def test_every_row_of_the_rasterizer_renders_the_same_scene():
     assert moving.work.pairs > 1000 and static.work.pairs > 1000
     assert moving.kernel().shape == static.kernel().shape == (1, 2, 90, 360)
     assert torch.allclose(static.kernel(), kernels.frozen(field, 1).kernel(), atol=1e-5)
+
+
+def test_a_step_learns_with_either_backend():
+    """Both contenders of the promise lower the same loss by the same steps."""
+    case = steps.step("tangent", count=5, batch=2)
+    assert case.reference is not None
+    for call in (case.kernel, case.reference):
+        losses = [call() for _ in range(6)]
+        assert losses[-1] < losses[0]
+    first = [
+        float(call()) for call in (steps.step("tangent", 5, 2).kernel, steps.step("tangent", 5, 2).reference)
+    ]
+    assert first[0] == pytest.approx(first[1], abs=1e-4)
+
+
+def test_the_page_names_every_promise():
+    facts = {"machine/cpu": "x", "machine/instruction_set": "y", "machine/cores": 2, "git": "abc"}
+    facts |= {"machine/load": 0.5, "machine/load_before": 0.1}
+    page = markdown(facts, [], [("tangent", Claim("forward / limit", 4.0, 3.0))])
+    assert "| forward / limit | tangent | 4.00 | at most 3 | no |" in page and "abc" in page
