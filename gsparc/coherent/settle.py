@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -43,15 +44,28 @@ def settle(
     return phased
 
 
-def refine(rows: Rows, phased: PhasedScene, steps: int, noise_floor: float = JITTER) -> PhasedScene:
-    """The best phased scene met in `steps` steps."""
+def refine(
+    rows: Rows,
+    phased: PhasedScene,
+    steps: int,
+    noise_floor: float = JITTER,
+    prior: Callable[[Tensor], Tensor] | None = None,
+) -> PhasedScene:
+    """The best phased scene met in `steps` steps; `prior` is a cost of phases (K,) beside the likelihood's."""
     scene, seen = phased.scene, torch.empty(0)
 
     def slopes(step: int, values: list[Tensor]) -> tuple[float, list[Tensor]]:
         nonlocal seen
         if step % REFRESH == 0:
             seen = correlations(rows, images(values[0], values[1], scene.words), scene.visibility)
-        return _likelihood(rows, phased, values, seen, noise_floor)
+        nll, gradient = _likelihood(rows, phased, values, seen, noise_floor)
+        if prior is not None:
+            with torch.enable_grad():
+                phase = values[4].detach().requires_grad_()
+                cost = prior(phase)
+                gradient[4] = gradient[4] + torch.autograd.grad(cost, phase)[0]
+            nll += cost.item()
+        return nll, gradient
 
     start = [
         scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), phased.phase,

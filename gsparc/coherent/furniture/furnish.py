@@ -171,7 +171,7 @@ class _Furnisher:
                 self._drop()
                 self._weigh(self.phased)
                 self._drop_words()
-                self._weigh(settle.refine(self.rows, self.phased, s.steps, self.noise_floor))
+                self._weigh(settle.refine(self.rows, self.phased, s.steps, self.noise_floor, self._foretold))
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
@@ -181,6 +181,10 @@ class _Furnisher:
             if time.monotonic() > deadline or self.nll > before - s.progress:
                 break
         return best[1]
+
+    def _foretold(self, phase: Tensor) -> Tensor:
+        """Cost of phases (K,) that are not what mirrors give here."""
+        return self.accord.cost(phase, self.scene.words)
 
     def _loosen(self, soft: float) -> None:
         """Descend with softer edges, which feel what is farther away, then with those meant."""
