@@ -51,7 +51,7 @@ def refine(
     noise_floor: float = JITTER,
     prior: Callable[[Tensor], Tensor] | None = None,
 ) -> PhasedScene:
-    """The best phased scene met in `steps` steps; `prior` is a cost of phases (K,) beside the likelihood's."""
+    """The best phased scene met in `steps` steps; `prior` is a cost of phases (K,) beside the likelihood."""
     scene, seen = phased.scene, torch.empty(0)
 
     def slopes(step: int, values: list[Tensor]) -> tuple[float, list[Tensor]]:
