@@ -36,7 +36,7 @@ from gsparc.ops import Pose
 log = logging.getLogger(__name__)
 
 SECONDS = 0.02  # times measurements^1.5: a conference room of 350 gets 130 s, 700 get 370
-LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 420.0
+LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 400.0
 AGAIN = 0.2  # of the budget, at least, for searching again beside edges
 ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
 ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
@@ -67,7 +67,7 @@ class VirtualSourceGP(Method):
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
-        budget_s: what all searches may take, about; None: 120 to 420 s, growing with the
+        budget_s: what all searches may take, about; None: 120 to 400 s, growing with the
             measurements.
         search_rows: receivers times tones that a search looks at.
         rows: receivers times tones that the final process holds.
