@@ -46,7 +46,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         panel.set_aspect("equal")
         panel.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
-    panels[0].legend(loc="upper right", fontsize="small")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", fontsize="small")
     figure.suptitle(
         f"{outcome.made.data.site.name}: {len(places)} receivers, {outcome.effects}", fontsize="medium"
     )
@@ -67,14 +67,14 @@ def worth(choice: Choice, path: Path) -> None:
     figure = Figure(figsize=(9, 0.36 * len(rows) + 1.6), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, sharey=True)
-    colours = ["tab:blue" if row.kept else "lightgrey" for row in rows]
+    colours = ["tab:blue" if row.kept else "grey" for row in rows]
     for axes, middle, far, label in (
         (left, [r.share * 100 for r in rows], [r.share_p95 * 100 for r in rows], "share of power [%]"),
         (right, [r.nmse for r in rows], [r.nmse_p95 for r in rows], "channel NMSE if left out"),
     ):
         axes.barh(names, far, color=colours, alpha=0.5, height=0.75)
         axes.barh(names, middle, color=colours, height=0.45)
-        axes.set_xlabel(f"{label}: typical (thick), 95 % (thin)")
+        axes.set_xlabel(f"{label}: typical (dark), 95 % (light)")
         axes.grid(axis="x", alpha=0.3)
     right.set_xscale("log")
     figure.suptitle(f"blue: simulated; grey: left out. {choice.deliverable}", fontsize="medium")
