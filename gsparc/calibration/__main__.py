@@ -36,7 +36,8 @@ def collect(
     paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
 ) -> tuple[Evidence, dict[str, Any]]:
     """Evidence of every checkpoint's own test rows, and the facts that name them; no row twice."""
-    parts, seen, facts = [], np.zeros(0, np.int64), {}
+    parts, seen = [], np.zeros(0, np.int64)
+    facts: dict[str, Any] = {}
     for path in paths:
         run = open_files([path], dataset, split)
         fold = run.split.folds[0]

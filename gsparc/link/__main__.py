@@ -25,7 +25,7 @@ from gsparc.evaluation import dataset_facts, split_facts
 from gsparc.link.channels import channels
 from gsparc.link.grid import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.link.pictures import draw_acceptance, draw_errors, draw_rates
-from gsparc.link.pusch import Pusch, frequency_correlation
+from gsparc.link.pusch import RECEIVERS, Pusch, frequency_correlation
 from gsparc.link.study import (
     acceptance,
     adapt,
@@ -106,11 +106,16 @@ def task(config: DictConfig) -> dict[str, Any]:
         adapting = bar.add_task("rate adaptation", total=len(levels), now="")
         sure = aside[evidence.scores[kind][aside] >= threshold.value]
         other = channels(method, data, fold.test[sure if len(sure) else aside], data.site.subcarriers_hz)
-        pairs = [(one.true[:, antenna], one.predicted[:, antenna]) for one in (own, other)]
-        rates = adapt(*pairs, levels, settings["mcs"], lambda: bar.advance(adapting))
+        here, there = ((one.true[:, antenna], one.predicted[:, antenna]) for one in (own, other))
+        rates = adapt(here, there, levels, settings["mcs"], lambda: bar.advance(adapting))
         facts |= rate_facts(rates, accepted, score) | {"time/mcs_s": time.perf_counter() - started}
         draw_rates(rates, score, title, run_dir / "mcs.png")
+        write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
         shape = settings["pusch"]
+        receivers = list(shape["receivers"])
+        missing = {"perfect", "lmmse", "predicted"} - set(receivers)
+        if missing or set(receivers) - set(RECEIVERS):
+            raise ValueError(f"pusch.receivers={receivers}: expected perfect, lmmse and predicted at least")
         wanted = {name: values for name, values in shape["ebno_db"].items() if values}
         sending = bar.add_task("PUSCH", total=sum(map(len, wanted.values())), now="")
         count, spacing = SUBCARRIERS_PER_BLOCK * shape["blocks"], 1e3 * shape["spacing_khz"]
@@ -121,7 +126,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         drawn, trades = {}, {}
         for modulation, points in wanted.items():
             begun = time.perf_counter()
-            pusch = Pusch(modulation, shape["blocks"], shape["spacing_khz"], known, shape["iterations"])
+            pusch = Pusch(
+                modulation, shape["blocks"], shape["spacing_khz"], known, shape["iterations"], receivers
+            )
 
             def tick(now: str, modulation: str = modulation) -> None:
                 bar.update(sending, now=f"{modulation} {now}")
@@ -134,6 +141,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             drawn[modulation] = curves(found, accepted)
             trades[modulation] = acceptance(found, score, SHARES)
             facts |= pusch_facts(modulation, drawn[modulation])
+            write_summary(run_dir / "summary.json", facts)
             for name in ("perfect", "predicted"):
                 for share, rate in zip(SHARES, trades[modulation][name], strict=True):
                     facts[f"tradeoff/{modulation}/{name}/{share:.0%}"] = float(rate)

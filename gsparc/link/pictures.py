@@ -24,6 +24,7 @@ STYLES = {
     "predicted": ("predicted, all", "tab:red", ":"),
     "fallback": ("predicted, else LMMSE pilots, all", "tab:orange", "--"),
 }
+SHORT = {"perfect": "k-o", "lmmse": "g-o", "predicted": "b-o", "predicted_variance": "m--o"}
 LEAST_RATE = 3e-4
 
 
@@ -34,6 +35,8 @@ def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path
     axes = figure.subplots(2, len(drawn), squeeze=False)
     for column, (modulation, curves) in enumerate(drawn.items()):
         for name, (label, colour, line) in STYLES.items():
+            if name not in curves:
+                continue
             curve = curves[name]
             shown = np.maximum(curve.bler, LEAST_RATE)
             bounds = [interval(int(e), int(n)) for e, n in zip(curve.errors, curve.blocks, strict=True)]
@@ -84,9 +87,9 @@ def draw_acceptance(
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, len(found), squeeze=False)[0]
     for axis, (modulation, trade) in zip(axes, found.items(), strict=True):
-        axis.plot(trade["share"], trade["perfect"], "k-o", label="perfect")
-        axis.plot(trade["share"], trade["predicted"], "b-o", label="predicted")
-        axis.plot(trade["share"], trade["predicted_variance"], "m--o", label="predicted with its variance")
+        for name, rates in trade.items():
+            if name in SHORT:
+                axis.plot(trade["share"], rates, SHORT[name], label=name.replace("_", " with its "))
         axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {float(trade['ebno_db']):g} dB")

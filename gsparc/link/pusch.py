@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,10 +41,17 @@ class Pusch:
         correlation: frequency correlation at multiples of the subcarrier spacing (12 blocks,) complex, from
             training channels; the LMMSE estimator's knowledge.
         iterations: of the LDPC decoder.
+        receivers: some of `RECEIVERS`.
     """
 
     def __init__(
-        self, modulation: str, blocks: int, spacing_khz: int, correlation: np.ndarray, iterations: int = 20
+        self,
+        modulation: str,
+        blocks: int,
+        spacing_khz: int,
+        correlation: np.ndarray,
+        iterations: int = 20,
+        receivers: Sequence[str] = RECEIVERS,
     ) -> None:
         from sionna.phy.nr import (
             PUSCHConfig,
@@ -84,7 +91,7 @@ class Pusch:
                 tb_decoder=decoder,
                 return_tb_crc_status=True,
             )
-            for name in RECEIVERS
+            for name in receivers
         }
 
     @property
@@ -111,8 +118,8 @@ class Pusch:
 
         no = ebnodb2no(ebno_db, self.bits, self.rate, self.grid)
         apply = ApplyOFDMChannel(add_awgn=True)
-        failed: dict[str, list[np.ndarray]] = {name: [] for name in RECEIVERS}
-        wrong: dict[str, list[np.ndarray]] = {name: [] for name in RECEIVERS}
+        failed: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
+        wrong: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
         for start in range(0, len(position), batch):
             at = torch.from_numpy(position[start : start + batch])
             scale = true[at].abs().square().mean(1).sqrt()[:, None]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gsparc.link.adaptation import Adaptation, Rates
 from gsparc.link.beams import gain, loss_db
-from gsparc.link.pusch import RECEIVERS, Blocks, Pusch
+from gsparc.link.pusch import Blocks, Pusch
 from gsparc.link.statistics import crossing, interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
@@ -156,7 +156,7 @@ def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
     """Curves by name: each receiver on all and on accepted positions, prediction with fallback on all."""
     taken = [accepted[b.position] for b in found]
     wanted: dict[str, Curve] = {}
-    for name in RECEIVERS:
+    for name in found[0].failed:
         failed, wrong = [b.failed[name] for b in found], [b.bit_errors[name] for b in found]
         wanted[name] = _curve(found, failed, wrong)
         wanted[f"{name}@accepted"] = _curve(
@@ -214,7 +214,7 @@ def acceptance(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> di
     """Block error rates of the surest shares at the Eb/N0 where perfect knowledge fails in about a tenth."""
     rates = np.array([b.failed["perfect"].mean() for b in found])
     at = found[int(np.argmin(np.abs(np.log(np.maximum(rates, 1e-3) / 0.1))))]
-    curves = {name: np.full(len(shares), np.nan) for name in ("perfect", "predicted", "predicted_variance")}
+    curves = {name: np.full(len(shares), np.nan) for name in at.failed}
     for i, share in enumerate(shares):
         taken = score[at.position] >= np.quantile(score, 1 - share)
         for name in curves:

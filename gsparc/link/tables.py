@@ -39,6 +39,8 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
             errors.add_column("behind", justify="right")
         for name, (label, _, _) in STYLES.items():
             cells = []
+            if f"pusch/{modulations[0]}/{name}/behind_perfect_db" not in facts:
+                continue
             for modulation in modulations:
                 room = f"pusch/{modulation}/{name}"
                 cells += [

@@ -83,7 +83,8 @@ class Fire(UplinkMethod):
         generator = torch.Generator().manual_seed(self.seed)
         with torch.random.fork_rng():
             torch.manual_seed(self.seed)
-            self.network = Network(x.shape[1], y.shape[1], self.hidden, self.code)
+            self._sizes = [x.shape[1], y.shape[1], self.hidden, self.code]
+            self.network = Network(*self._sizes)
         optimizer = torch.optim.Adam(self.network.parameters(), lr=self.rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, self.steps)
         for _ in range(self.steps):
@@ -116,14 +117,13 @@ class Fire(UplinkMethod):
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        first, last = self.network.encoder[0], self.network.decoder[-1]
-        sizes = [first.in_features // 2, last.out_features // 2, self.hidden, self.code]
-        return {"sizes": sizes, "network": dict(self.network.state_dict())}
+        return {"sizes": self._sizes, "network": dict(self.network.state_dict())}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site = site
-        self.network = Network(*state["sizes"])
+        self._sizes = list(state["sizes"])
+        self.network = Network(*self._sizes)
         self.network.load_state_dict(state["network"])
         self.network.eval().requires_grad_(False)
 
