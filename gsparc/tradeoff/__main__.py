@@ -26,7 +26,7 @@ from gsparc.method import Method
 from gsparc.scoring import score
 from gsparc.summary import provenance, write_samples, write_summary
 from gsparc.tradeoff import stored
-from gsparc.tradeoff.picture import Rival, draw
+from gsparc.tradeoff.picture import Rival, beaten_by, draw
 from gsparc.tradeoff.points import FIGURES, Point, cost_of_halving, front, score_of
 from gsparc.tradeoff.spare import combinations, measure, reduced
 from gsparc.tradeoff.sweep import asker, candidate, sweep
@@ -79,6 +79,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
     _show(best, figure, facts, title, run_dir)
+    for p in best:
+        rival = beaten_by(p, beside, figure)
+        if rival is not None:
+            log.warning("%s: %s is as fast and better", p.label, rival)
     return facts
 
 
@@ -154,6 +158,7 @@ def _facts(
         "tradeoff/span": best[-1].p50 / best[0].p50,
         "tradeoff/per_halving": cost_of_halving([p.p50 for p in best], scores),
         "tradeoff/figure": figure,
+        "tradeoff/front_beaten_by_others": sum(beaten_by(p, rivals, figure) is not None for p in best),
         "time/copy_ms": copy_ms,
         "time/render_ms_p50": full.p50,
         "time/render_ms_p95": full.p95,

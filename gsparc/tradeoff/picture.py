@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from gsparc.tradeoff.points import LOWER_IS_BETTER, Point
+from gsparc.tradeoff.points import LOWER_IS_BETTER, Point, score_of
 
 NAMES = {
     "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"
@@ -24,6 +24,14 @@ class Rival:
     value: float
     p50: float
     p95: float
+
+
+def beaten_by(point: Point, rivals: Mapping[str, Rival], figure_name: str) -> str | None:
+    """The most accurate rival that is neither slower nor worse than a point; None when there is none."""
+    own = score_of(figure_name, point.value(figure_name))
+    better = {n: score_of(figure_name, r.value) for n, r in rivals.items() if r.p50 <= point.p50}
+    best = max(better, key=lambda name: better[name], default=None)
+    return best if best is not None and better[best] >= own else None
 
 
 def draw(
@@ -50,6 +58,7 @@ def draw(
     value = [p.value(figure_name) for p in points]
     inside = [i for i in range(len(points)) if i not in on_front]
     axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
+
     x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]
     reach = [[0.0] * len(x), [points[i].p95 - points[i].p50 for i in on_front]]
     axes.errorbar(
@@ -82,8 +91,10 @@ def draw(
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
+    winner = {i: beaten_by(points[i], rivals, figure_name) for i in on_front}
     lines = [
         f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
+        + (f" ({winner[i]} is better)" if winner[i] else "")
         for number, i in enumerate(on_front, 1)
     ]
     legend.axis("off")

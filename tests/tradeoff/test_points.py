@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsparc.tradeoff.points import cost_of_halving, front, score_of, worded
+from gsparc.tradeoff.picture import Rival, beaten_by
+from gsparc.tradeoff.points import Point, cost_of_halving, front, score_of, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 
@@ -45,3 +46,10 @@ def test_settings_are_said_in_words():
         worded({"keep": 0.25, "stride": 3, "confidence": False})
         == "25% kept, 1 of 3 x 3 pixels, no confidence"
     )
+
+
+def test_a_point_that_another_method_beats_is_said():
+    point = Point("p", {}, 1, {"psnr_db": 20.0}, 0.0, np.full(3, 1.0))
+    rivals = {"nearest": Rival(26.0, 0.5, 0.6), "gp": Rival(29.0, 2.0, 3.0), "mean": Rival(15.0, 0.1, 0.1)}
+    assert beaten_by(point, rivals, "psnr_db") == "nearest"
+    assert beaten_by(point, {"gp": rivals["gp"], "mean": rivals["mean"]}, "psnr_db") is None
