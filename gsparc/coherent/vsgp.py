@@ -37,6 +37,7 @@ log = logging.getLogger(__name__)
 
 SECONDS = 0.02  # times measurements^1.5: a conference room of 350 gets 130 s, 700 get 370
 LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 400.0
+CLEARLY = 0.8  # left-out error beside edges over that without, for edges to stay
 AGAIN = 0.2  # of the budget, at least, for searching again beside edges
 ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
 ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
@@ -203,7 +204,8 @@ class VirtualSourceGP(Method):
             self.furniture, shelf, "beside edges",
         )  # fmt: skip
         power = float(draw[0].target.abs().square().mean())  # left-out errors are shares of it
-        if again[0].left_out * power > found[0].left_out:
+        # the edges' own gains saw every row: only a clear gain counts
+        if again[0].left_out * power > CLEARLY * found[0].left_out:
             return found, held
         scene = again[0].phased.scene
         self.edges = with_gains(held, edges.point, edges.axis, scene, self.noise_floor)
