@@ -51,7 +51,7 @@ class Furnishing:
         steps: of the descent of everything but the furniture, at the end of each epoch.
     """
 
-    epochs: int = 3
+    epochs: int = 6
     progress: float = 10.0
     look: float = 12.0
     face: float = 8.0
