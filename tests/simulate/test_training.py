@@ -1,0 +1,56 @@
+"""`dataset=sionna` through the same door as every other: training, baselines, evaluation, a stored model."""
+
+import json
+
+import numpy as np
+import pytest
+from campaigns import compose
+
+import gsparc
+from gsparc.data.load import load
+from gsparc.simulate.campaign import simulate
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.scenes.build import SceneSettings
+from gsparc.simulate.settings import Campaign
+from gsparc.simulate.spectrum import SpectrumSettings
+from gsparc.training import train
+
+SCENE = SceneSettings(
+    name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
+    num_receivers=70, carrier_hz=2.4e9, bandwidth_hz=80e6, subcarriers=4,
+    room={"size_m": [6, 5, 3], "reflection": -0.5},
+)  # fmt: skip
+MIRROR = Effects(
+    refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
+)
+SEARCH = [
+    "model.search.sources=9",
+    "model.search.rows=30",
+    "model.search.candidates=1000",
+    "model.search.steps=5",
+]
+ROAD = {"spectrum": ["experiment=sionna", *SEARCH], "csi": ["dataset=sionna", "model=complex_gp"]}
+
+
+@pytest.fixture(scope="module")
+def box(tmp_path_factory):
+    path = tmp_path_factory.mktemp("simulated") / "box.h5"
+    simulate(Campaign(SCENE, MIRROR, spectrum=SpectrumSettings(height=18, width=36, rows=4, columns=4)), path)
+    return path
+
+
+@pytest.mark.parametrize("kind", ROAD)
+def test_a_simulated_dataset_is_trained_and_compared_like_any_other(kind, box, tmp_path):
+    settings = [*ROAD[kind], f"dataset.file={box}", f"dataset.target={kind}", "threads=1", "logger=none"]
+    facts, objects = train(compose(*settings), tmp_path / "run")
+    stored = json.loads((tmp_path / "run" / "summary.json").read_text())
+    for name in ("zero", "mean", "nearest", "idw", "gp"):
+        assert np.isfinite(stored[f"baseline/{name}/skill"])
+    assert stored["dataset/name"] == "box" and stored["time/train_s"] > 0
+    assert facts["test/skill"] > stored["baseline/mean/skill"]
+    data = load({"name": "sionna", "file": str(box), "target": kind})
+    predictor = gsparc.load(objects.checkpoints[0])
+    ask = predictor.spectrum if kind == "spectrum" else predictor.csi
+    rows = data.release_split[1][:3]
+    said = ask(rx=data.rx_position[rows] + data.site.origin)
+    assert np.shape(said)[0] == 3 and np.isfinite(np.asarray(said)).all()
