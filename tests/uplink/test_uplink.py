@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from cities import city, deaf, fold
+from cities import city, deaf, fold, folder
 
 from gsparc import checkpoint
+from gsparc.data.argos import load_argos
 from gsparc.peers.fire import Fire
 from gsparc.peers.ridge import Ridge
 from gsparc.uplink.atoms import Aperture, Sources
@@ -126,3 +127,18 @@ def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
         method.predict(batch.tx, batch.rx)
     with pytest.raises(ValueError, match="fit or restore"):
         UplinkField().answer(batch)
+
+
+def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:
+    """The release's own layout: a line has one direction cosine, and noise is read off empty delays."""
+    for name in ("csidata.npy", "base-station.yml"):
+        (tmp_path / name).write_bytes((folder() / name).read_bytes())
+    text = (tmp_path / "base-station.yml").read_text()
+    kept = [line for line in text.splitlines() if not line.startswith("noise_power")]
+    (tmp_path / "base-station.yml").write_text("\n".join(kept))
+    data = load_argos(tmp_path, lambda uplink, rows: np.abs(uplink[:, 0, :3]).astype(float))
+    assert data.noise_variance is None and data.uplink.shape[1] == 8
+    method = UplinkField(SearchSettings(rounds=3, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), None)
+    assert method.search.shape[1] == 1
+    assert _share(method, data, fold().test) < 0.3
