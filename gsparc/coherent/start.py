@@ -49,8 +49,10 @@ class Sources:
 
 
 def searched(data: Measurements, known: np.ndarray, offsets: str, seed: int) -> Sources:
-    """One search of the virtual-source process on the given rows."""
-    method = VirtualSourceGP(searches=1, rows=ROWS, offsets=offsets, seed=seed)  # type: ignore[arg-type]
+    """One search of the virtual-source process on the given rows; only fixed points become Gaussians."""
+    method = VirtualSourceGP(
+        searches=1, rows=ROWS, offsets=offsets, furniture=False, edges=False, seed=seed,  # type: ignore[arg-type]
+    )  # fmt: skip
     method.fit(data, Fold(known, known[:0], known[:0]), Path())
     member, frame = method.members[0], method.frame
     scene = member.scene
