@@ -174,12 +174,11 @@ def test_a_pillar_hides_sources_and_it_is_seen_which(tmp_path):
     method = VirtualSourceGP(searches=2)
     method.fit(data, fold, tmp_path)
     predicted = _predicted(method, data, fold.test).mean.numpy()
-    assert nmse(predicted, data.targets(fold.test).numpy()) <= 0.05
+    assert nmse(predicted, data.targets(fold.test).numpy()) <= 0.02
     learned, true, names = learned_and_true_visibility(method, told, data, fold.test)
     picture = plot_visibility(tmp_path / "visibility.png", told.rx[fold.test], learned, true, names)
     assert picture.stat().st_size > 10_000
-    # The line of sight is cut sharply; a smooth law can only follow.
-    assert np.corrcoef(learned[:, 0], true[:, 0])[0, 1] > 0.7
+    assert np.corrcoef(learned[:, 0], true[:, 0])[0, 1] > 0.9
 
 
 @pytest.mark.slow
