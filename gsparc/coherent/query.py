@@ -75,7 +75,7 @@ class Query:
         variance_rows: of the process whose variance is given: fewer rows know less, so it errs high.
     """
 
-    def __init__(self, members: list[PhasedPosterior], variance_rows: int = 700) -> None:
+    def __init__(self, members: list[PhasedPosterior], variance_rows: int = 350) -> None:
         rows, scenes = members[0].rows, [member.scene for member in members]
         places, self.place_of = torch.unique(rows.position, dim=0, return_inverse=True)
         self.pack = Pack.of(scenes, places)
