@@ -15,7 +15,7 @@ QUARTERS = 4
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("tones", "width_hz"), [(26, 20e6), (256, 100e6)])
-def test_the_whole_band_from_its_lowest_quarter(tones, width_hz, tmp_path, record_property):
+def test_the_whole_band_from_its_lowest_quarter(tones, width_hz, tmp_path):
     """Receivers and tones that nobody measured, in a room with a pillar; NMSE of each quarter of the band."""
     frequency = 2.4e9 + np.linspace(0, width_hz, tones)
     _, data, fold = shoebox(450, pillar=True, frequency_hz=frequency)
@@ -27,7 +27,6 @@ def test_the_whole_band_from_its_lowest_quarter(tones, width_hz, tmp_path, recor
     said, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
     parts = np.array_split(np.arange(tones), QUARTERS)
     errors = [nmse(said[..., part], true[..., part]) for part in parts]
-    record_property("nmse", errors)
-    record_property("train_s", report.seconds)
+    print(f"{tones} tones: NMSE {errors} by quarter, {report.seconds:.0f} s")  # pytest -rP shows it
     assert max(errors) < 0.06
     assert max(errors) < 1.3 * errors[0]  # as good where nothing was measured
