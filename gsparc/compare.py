@@ -154,7 +154,9 @@ def report(
     """Write `compare.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
     rows = table.rows(filled, timed)
     blocks = table.blocks(rows)
-    page = table.markdown(blocks, ours, timed)
+    unscored = {one.cell.method for one in filled if not one.scored()}
+    only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
+    page = table.markdown(blocks, ours, only_timed)
     table.write_csv(rows, run_dir / "compare.csv")
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
     figure.draw(rows, run_dir / "compare.png", ours)
