@@ -2,7 +2,7 @@
 
 Remedy: all of them together. Bound of every comparison: FACTOR rounding errors of the input, carried to the
 output as the float64 reference carries them: `fields.condition` measures how far, by nudging every number of
-the input by one unit of float32's rounding. Thousands of examples stayed below 4 such errors. Pixels so near
+the input by one unit of float32's rounding. Thousands of examples stayed below 9 such errors. Pixels so near
 a threshold that one such unit crosses it are left out of the comparison and of the gradients; all are finite.
 """
 

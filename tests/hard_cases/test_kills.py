@@ -82,12 +82,15 @@ def trained(tmp_path_factory):
 
 @pytest.mark.parametrize("chain", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(1, 7))])
 def test_training_killed_again_and_again(trained, tmp_path, chain):
-    """Four kills in a row, each of a run that goes on from what the one before it left."""
+    """Kills in a row, each of a run that goes on from what the one before it left."""
     whole, settings, seconds = trained
-    for moment in moments(4, seconds, seed=chain):
+    kills = 0
+    for moment in moments(5, seconds, seed=chain):
         if not killed(training, str(tmp_path), [*settings, *last_checkpoint(tmp_path)], after_s=moment):
             break
+        kills += 1
         assert_whole(tmp_path)
+    assert kills, "every run had ended before it was killed"
     code, _ = run(training, str(tmp_path), [*settings, *last_checkpoint(tmp_path)])
     assert code == 0, (tmp_path / "error.txt").read_text()
     one, two = (checkpoint.read(folder / "model.ckpt").state for folder in (whole, tmp_path))
@@ -109,10 +112,13 @@ def simulated(tmp_path_factory):
 def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
     whole, seconds = simulated
     out = tmp_path / "box.h5"
+    kills = 0
     for moment in moments(5, seconds, seed=100 + chain):
         if not killed(simulation, str(out), ROWS, after_s=moment):
             break
+        kills += 1
         assert_whole(tmp_path)
+    assert kills, "every run had ended before it was killed"
     if not out.exists():
         code, _ = run(simulation, str(out), ROWS)
         assert code == 0, out.with_suffix(".txt").read_text()
