@@ -64,7 +64,16 @@ def watched(module: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
         "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
         "OMP_NUM_THREADS": "2",
     }
-    command = [sys.executable, "tests/sanitized.py", str(module), "-q", "-p", "no:cacheprovider", *arguments]
+    command = [
+        sys.executable,
+        "tests/sanitized.py",
+        str(module),
+        "-q",
+        "-s",
+        "-p",
+        "no:cacheprovider",
+        *arguments,
+    ]
     return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
 
 
