@@ -132,7 +132,9 @@ class Choice:
             Effects(**stored["effects"]),
             stored["deliverable"],
             tuple(Worth(**row) for row in stored["table"]),
-            *(float(stored[k]) for k in ("seconds_all", "seconds_chosen", "seconds")),
+            float(stored["seconds_all"]),
+            float(stored["seconds_chosen"]),
+            float(stored["seconds"]),
             None if verdict is None else Verdict(**verdict),
         )
 

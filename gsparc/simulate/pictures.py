@@ -41,7 +41,8 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         _map(panels[2], places[changed.rows][known], changed.errors[known], label, 40.0, robust=False)
     for panel in panels:
         if (~heard).any():
-            panel.scatter(*places[~heard, :2].T, s=size, c="lightgrey", label="nothing arrives")
+            x, y = places[~heard, 0], places[~heard, 1]
+            panel.scatter(x, y, s=size, c="lightgrey", label="nothing arrives")
         panel.plot(*outcome.transmitter[:2], "r^", markersize=9, label="transmitter")
         panel.set_aspect("equal")
         panel.set_xlabel("x [m]")
@@ -55,7 +56,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
 
 def _map(axes: Axes, places: np.ndarray, values: np.ndarray, label: str, size: float, robust: bool) -> None:
     low, high = np.quantile(values, [0.01, 0.99]) if robust else (values.min(), values.max())
-    drawn = axes.scatter(*places[:, :2].T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    drawn = axes.scatter(places[:, 0], places[:, 1], c=values, s=size, vmin=low, vmax=high, linewidths=0)
     assert axes.figure is not None
     axes.figure.colorbar(drawn, ax=axes, location="bottom", label=label, shrink=0.8)
 
