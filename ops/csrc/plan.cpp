@@ -44,7 +44,7 @@ template <class S> int arrange(const S* depths, const bool* visible, const int32
         base = seen && key < base ? key : base, top = seen && key > top ? key : top;
         total += seen, hidden += !seen;
     }
-    std::memmove(order + total, order, hidden * sizeof *order);
+    if (hidden) std::memmove(order + total, order, hidden * sizeof *order);
     if (total == 0) return 0;
     const Bits<S> spread = top - base;
     const int parts = total >= 8192 && threads > 1 ? std::min(threads, 8) : 1;
