@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from campaigns import compose
-from conftest import invent
+from invented import invent
 from rooms import nmse, rough, shoebox
 
 from gsparc.coherent.vsgp import VirtualSourceGP

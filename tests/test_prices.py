@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 import pytest
-from conftest import invent
+from invented import invent
 
 from gsparc.clock import ClockSettings
 from gsparc.data.splits import Fold

@@ -10,7 +10,7 @@ import pytest
 import torch
 from campaigns import channels as channel_file
 from campaigns import compose
-from conftest import invent
+from invented import invent
 from known_arrays import array_site
 from rooms import nmse, shoebox
 from torch import Tensor

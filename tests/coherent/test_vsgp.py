@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from conftest import invent
+from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
 
 from gsparc.coherent.pictures import plot_visibility
