@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from invented import invent
+from invented import divide, invent
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split

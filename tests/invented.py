@@ -1,10 +1,11 @@
-"""A small invented dataset of any kind."""
+"""A small invented dataset of any kind, and its split."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.ops import SphereGrid
 
 
