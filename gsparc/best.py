@@ -38,7 +38,8 @@ class Gsparc(LearnedField):
         effects: switches; `auto` decides from the site and a probe on training data.
         phase_model: what predicts where `phase` is on.
         phase_probe: the same with a small budget, for the probe.
-        array_model: what predicts where `array` is on.
+        array_model: what predicts where `array` is on and the receiver is static.
+        bearing_model: what predicts where `array` is on and the receiver moves.
         **field: see `LearnedField`.
     """
 
@@ -48,6 +49,7 @@ class Gsparc(LearnedField):
         phase_model: Method,
         phase_probe: Method,
         array_model: Method,
+        bearing_model: Method,
         **field: Any,
     ) -> None:
         response = replace(
@@ -57,7 +59,7 @@ class Gsparc(LearnedField):
         )
         super().__init__(response=response, **field)
         self.switches = effects
-        self._models = {"phase": phase_model, "array": array_model}
+        self._models = {"phase": phase_model, "array": array_model, "bearings": bearing_model}
         self._probe = phase_probe
         self._chosen: str | None = None
         self._rest: Rest | None = None
@@ -85,6 +87,8 @@ class Gsparc(LearnedField):
             log.info("%s", decision)
         others = (d.effect for d in self.decisions if d.on and getattr(self.switches, d.effect) != SPLAT)
         self._chosen = next(others, None)
+        if self._chosen == "array" and data.site.static_end == "tx":
+            self._chosen = "bearings"
         if self._chosen is None:
             report = super().fit(data, fold, run_dir)
         else:

@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 from scipy.spatial import cKDTree
 
 from gsparc.array.recovery import recover
+from gsparc.bearings.field import POOR, beyond, site_problem
+from gsparc.bearings.lags import Lags
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.method import Method
+from gsparc.peers.encoding import to_real
 
 Switch = bool | Literal["auto", "splat"]
 SPLAT = "splat"
@@ -29,7 +33,8 @@ class EffectSettings:
 
     Attributes:
         phase: carrier phase from source positions (channels of a moving receiver).
-        array: array response (spectra of a static receiver with a declared array).
+        array: array response (spectra with a declared array: the array's vectors where it is static, bearings
+            of sources where it moves).
         hybrid: a process for what the sources of `phase` leave over; never `splat`.
     """
 
@@ -96,8 +101,8 @@ def decide_array(switch: Switch, site: Site, splatting: str | None) -> Decision:
     obstacle = None
     if site.kind != "spectrum":
         obstacle = f"the target is {site.kind}, not a spectrum"
-    elif site.static_end != "rx":
-        obstacle = "the receiver moves; array response is modelled for a static array"
+    elif site.static_end != "rx" and switch == SPLAT:
+        obstacle = "the receiver moves; splat then A is modelled for a static array"
     elif site.array is None or len(site.array) < 2 or site.wavelength is None:
         obstacle = "the dataset declares no array or no carrier"
     elif switch == "auto" and splatting is not None:
@@ -161,9 +166,22 @@ def probe_array(data: Measurements, fold: Fold, seed: int) -> Decision:
     started = time.perf_counter()
     spread = np.linspace(0, len(fold.train) - 1, min(PROBE_IMAGES, len(fold.train))).astype(int)
     rows = np.unique(fold.train[spread])
+    if data.site.static_end == "tx":
+        return _probe_moving_array(data, rows, started)
     found = recover(data.site, data.target[rows], data.moving[rows], seed=seed)
     share = 1 - float(found.suspect.mean())
     assert data.site.array is not None
     elements = len(data.site.array)
     reason = f"{share:.0%} of {len(rows)} probed images are explained by {elements} complex numbers each"
     return Decision("array", share >= ARRAY_SHARE, reason, time.perf_counter() - started)
+
+
+def _probe_moving_array(data: Measurements, rows: np.ndarray, started: float) -> Decision:
+    problem, site = site_problem(data), data.site
+    if problem is not None:
+        return Decision("array", False, problem, time.perf_counter() - started)
+    assert site.array is not None and site.grid is not None and site.wavelength is not None
+    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
+    _, left = beyond(Lags(site.array, site.grid, site.wavelength), images)
+    reason = f"{left:.1%} of the energy of {len(rows)} probed images is beyond the moving array"
+    return Decision("array", left <= POOR, reason, time.perf_counter() - started)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from boxes import room_of_spectra
 
 from gsparc.data.rfid import load_rfid
 from gsparc.data.schema import Site
@@ -67,3 +68,18 @@ def test_spacing_is_in_wavelengths(spectra) -> None:
     rows = np.arange(40)
     doubled = replace(spectra, tx=spectra.tx * 2)
     assert spacing_in_wavelengths(doubled, rows) == pytest.approx(2 * spacing_in_wavelengths(spectra, rows))
+
+
+def test_a_moving_array_is_answered_by_bearings() -> None:
+    data = room_of_spectra()
+    assert decide_array("auto", data.site, None).on
+    with pytest.raises(ValueError, match="splat then A"):
+        decide_array("splat", data.site, None)
+    rows = np.arange(len(data))
+    fold = Fold(rows[:-8], rows[:0], rows[-8:])
+    assert probe_array(data, fold, seed=0).on
+    turned = replace(data, rx_rotation=data.rx_rotation.copy())
+    turned.rx_rotation[0] = np.diag([-1.0, -1.0, 1.0])
+    assert not probe_array(turned, fold, seed=0).on
+    noise = np.random.default_rng(0).integers(0, 255, data.target.shape).astype(data.target.dtype)
+    assert not probe_array(replace(data, target=noise), fold, seed=0).on

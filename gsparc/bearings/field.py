@@ -125,17 +125,11 @@ class BearingField(Interpolator):
         Raises:
             ValueError: neither is a spectrum of the declared array.
         """
-        some = self._images(targets[_spread(len(targets), 16)])
-        left = {}
-        for exponent in (2, 1):
-            power = some**exponent
-            again = space.spectrum(space.of(power))
-            left[exponent] = float((again - power).square().sum() / power.square().sum().clamp_min(1e-12))
-        exponent = min(left, key=lambda e: left[e])
-        if left[exponent] > POOR:
+        exponent, left = beyond(space, self._images(targets[_spread(len(targets), 16)]))
+        if left > POOR:
             raise ValueError(
                 f"{self.name}: the declared array cannot have measured these spectra "
-                f"({left[exponent]:.0%} of their energy is beyond it)"
+                f"({left:.0%} of their energy is beyond it)"
             )
         parts = [
             space.of(self._images(targets[i : i + BLOCK]) ** exponent) for i in range(0, len(targets), BLOCK)
@@ -256,6 +250,17 @@ class BearingField(Interpolator):
         self.positions, self.lost = state["positions"].numpy(), float(state["lost"])
         self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
         self._factor = cho_factor(self.rest.gram(self.positions), lower=True)
+
+
+def beyond(space: Lags, images: Tensor) -> tuple[int, float]:
+    """Whether images (n, H, W) are amplitude (2) or power (1), and the share of energy no lags can make."""
+    left = {}
+    for exponent in (2, 1):
+        power = images**exponent
+        again = space.spectrum(space.of(power))
+        left[exponent] = float((again - power).square().sum() / power.square().sum().clamp_min(1e-12))
+    exponent = min(left, key=lambda e: left[e])
+    return exponent, left[exponent]
 
 
 def site_problem(data: Measurements) -> str | None:

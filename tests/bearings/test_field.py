@@ -5,43 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from boxes import ROOM, TRANSMITTER, room_of_spectra
 
 from gsparc.bearings.field import BearingField
 from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import SearchSettings, find_sources
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
 from gsparc.peers.gp import GaussianProcess
 from gsparc.scoring import score
-from gsparc.simulate.effects import Effects
-from gsparc.simulate.mirrors import Mirrors
-from gsparc.simulate.shoebox import Room, images, scatter
-from gsparc.simulate.spectrum import SpectrumSettings, spectra
+from gsparc.simulate.shoebox import images
 
-ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))
-TRANSMITTER = np.array([1.0, 1.5, 2.6])
-SETTINGS = SpectrumSettings(height=30, width=120)
-TONES = 2.4e9 + np.linspace(-100e6, 100e6, 16)
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
-
-
-def room_of_spectra(count=160, **changes):
-    engine = Mirrors(ROOM, TRANSMITTER, 2.4e9)
-    receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
-    paths = engine.trace(receivers, engine.able(Effects(depth=2)))
-    settings = dataclasses.replace(SETTINGS, **changes)
-    pictures, _ = spectra(paths, settings, TONES, engine.wavelength)
-    return from_arrays(
-        {
-            "rx_position": receivers,
-            "tx_position": TRANSMITTER,
-            "spectrum": np.round(pictures * 255).astype(np.uint8),
-            "array_position": settings.elements(engine.wavelength),
-            "carrier_hz": np.array(2.4e9),
-        },
-        {"name": "box", "normalisation": "max"},
-    )
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,38 @@
+"""Spectra that a moving array measures in an exact box, with their truth."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.mirrors import Mirrors
+from gsparc.simulate.shoebox import Room, scatter
+from gsparc.simulate.spectrum import SpectrumSettings, spectra
+
+ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))
+TRANSMITTER = np.array([1.0, 1.5, 2.6])
+SETTINGS = SpectrumSettings(height=30, width=120)
+TONES = 2.4e9 + np.linspace(-100e6, 100e6, 16)
+
+
+def room_of_spectra(count: int = 160, **changes: float) -> Measurements:
+    """`count` receivers over the floor; `changes` are of `SpectrumSettings`."""
+    engine = Mirrors(ROOM, TRANSMITTER, 2.4e9)
+    receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
+    paths = engine.trace(receivers, engine.able(Effects(depth=2)))
+    settings = dataclasses.replace(SETTINGS, **changes)
+    pictures, _ = spectra(paths, settings, TONES, engine.wavelength)
+    return from_arrays(
+        {
+            "rx_position": receivers,
+            "tx_position": TRANSMITTER,
+            "spectrum": np.round(pictures * 255).astype(np.uint8),
+            "array_position": settings.elements(engine.wavelength),
+            "carrier_hz": np.array(2.4e9),
+        },
+        {"name": "box", "normalisation": "max"},
+    )
