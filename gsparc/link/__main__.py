@@ -123,6 +123,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         grid = channels(method, data, rows, centred(float(tones.mean()), spacing, count))
         known = frequency_correlation(data.targets(fold.train)[:, antenna], tones, spacing, count)
         facts["pusch/truth"] = grid.source
+        if "predicted_variance" in receivers and not grid.variance.isfinite().all():
+            log.warning("%s states no error variance: receiver predicted_variance is left out", method.name)
+            receivers.remove("predicted_variance")
         drawn, trades = {}, {}
         for modulation, points in wanted.items():
             begun = time.perf_counter()

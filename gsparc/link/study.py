@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsparc.link.adaptation import Adaptation, Rates
@@ -123,7 +122,6 @@ def transmit(
     """
     coarse, fine, batch = sizes
     order = np.arange(max(coarse, fine)) % len(true)
-    variance = torch.nan_to_num(variance, nan=0.0)
     found = []
     for level in levels:
         tick(f"{level:g} dB")
