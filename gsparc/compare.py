@@ -20,7 +20,7 @@ from rich.markdown import Markdown
 from gsparc import cli
 from gsparc.baselines import platform_cache
 from gsparc.comparison import figure, table
-from gsparc.comparison.cells import Cell, contenders, plan
+from gsparc.comparison.cells import Budget, Cell, contenders, plan
 from gsparc.comparison.fitting import Filled, Prepared, Room, fill, kept_in, open_rooms, prepare
 from gsparc.comparison.latency import Latency, latencies
 from gsparc.summary import provenance, write_summary
@@ -38,7 +38,10 @@ def task(config: DictConfig) -> list[table.Row]:
     settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     methods = contenders(settings["methods"])
     rooms = _rooms(settings)
-    budgets = [(float(b["seconds"]), [int(s) for s in b["seeds"]]) for b in settings["budgets"]]
+    budgets = [
+        Budget(float(b["seconds"]), tuple(int(s) for s in b["seeds"]), tuple(b.get("splits") or ()))
+        for b in settings["budgets"]
+    ]
     wanted = plan([(r.dataset, r.split, r.data.site.kind) for r in rooms], methods, budgets, settings["only"])
     by_name = {(r.dataset, r.split): r for r in rooms}
     kept = kept_in(settings["cells"], platform_cache())
@@ -133,18 +136,24 @@ def _timed(
     found: dict[str, dict[str, Latency]] = {}
     for dataset in dict.fromkeys(one.cell.dataset for one in filled):
         here = [one for one in filled if one.cell.dataset == dataset]
-        split = here[0].cell.split
-        file = kept / f"latency-{dataset}.json"
-        if measure:
+        split, file = here[0].cell.split, kept / f"latency-{dataset}.json"
+        first = [one for one in here if one.cell.split == split]
+        present = [one for one in first if one.checkpoint.exists()]
+        absent = {o.cell.method for o in first} - {o.cell.method for o in present}
+        stored = json.loads(file.read_text()) if file.exists() else {}
+        if measure and absent and stored:
+            log.warning(
+                "%s: timings are kept ones; models of %s are not here (cells=EMPTY_FOLDER trains all)",
+                dataset, ", ".join(sorted(absent)),
+            )  # fmt: skip
+        elif measure and present:
             log.info("%s: timing single queries of every method in turns", dataset)
-            first = [one for one in here if one.cell.split == split]
-            found[dataset] = latencies(first, rooms[dataset, split])
+            found[dataset] = latencies(present, rooms[dataset, split])
             file.parent.mkdir(parents=True, exist_ok=True)
             rows = {name: asdict(one) for name, one in found[dataset].items()}
             file.write_text(json.dumps(rows, indent=2))
-        elif file.exists():
-            stored = json.loads(file.read_text())
-            found[dataset] = {name: Latency(**values) for name, values in stored.items()}
+            continue
+        found[dataset] = {name: Latency(**values) for name, values in stored.items()}
     return found
 
 

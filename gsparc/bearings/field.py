@@ -87,7 +87,7 @@ class BearingField(Interpolator):
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         begin = time.perf_counter()
-        space = self._space()
+        space = self.lags()
         receivers = torch.from_numpy(positions).float()
         self.exponent, lags = self._lags(space, targets)
         rows = _spread(len(targets), self.search.rows)
@@ -98,7 +98,7 @@ class BearingField(Interpolator):
             lags[rows],
             receivers[rows],
             first,
-            self._rotation(),
+            self.rotation(),
             space,
             self.site.grid,
             self.search,
@@ -183,8 +183,7 @@ class BearingField(Interpolator):
             self.lost = parts.lost
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        space = self._space()
-        power = self.level + self.smooth.cross(queries, self.positions) @ self.trend_weights
+        space, power = self.lags(), self.powers_at(queries)
         said = self._draw(space, torch.from_numpy(queries).float(), power).reshape(len(queries), -1)
         cross = self.rest.cross(queries, self.positions)
         scores = (torch.from_numpy(cross) @ self.weights).float()
@@ -208,16 +207,22 @@ class BearingField(Interpolator):
         return image.sqrt_() if self.exponent == 2 else image
 
     def _atoms(self, space: Lags, receivers: Tensor) -> Tensor:
-        return space.atoms(bearings(self.sources, receivers, self._rotation()))
+        return space.atoms(bearings(self.sources, receivers, self.rotation()))
 
     def _images(self, targets: np.ndarray) -> Tensor:
         return torch.from_numpy(to_real(targets, "spectrum")).reshape(len(targets), *targets.shape[1:])
 
-    def _rotation(self) -> Tensor:
+    def powers_at(self, places: np.ndarray) -> np.ndarray:
+        """Power (n, K) of every source as its trend says, at places (n, 3) [m]."""
+        return self.level + self.smooth.cross(places, self.positions) @ self.trend_weights
+
+    def rotation(self) -> Tensor:
+        """(3, 3) of the array, receiver to world."""
         assert self.site is not None and self.site.rx_rotation is not None
         return torch.from_numpy(np.asarray(self.site.rx_rotation)).float()
 
-    def _space(self) -> Lags:
+    def lags(self) -> Lags:
+        """The array's, made once."""
         site = self.site
         assert site is not None and site.array is not None and site.grid is not None
         assert site.wavelength is not None

@@ -90,36 +90,57 @@ def contenders(config: Mapping[str, Any]) -> dict[str, Contender]:
     return found
 
 
+@dataclass(frozen=True)
+class Budget:
+    """Seconds of training for every method that takes a budget.
+
+    Attributes:
+        seconds: per model [s]; a split of five folds trains five.
+        seeds: one training each.
+        splits: where it is given; empty for all.
+    """
+
+    seconds: float
+    seeds: tuple[int, ...]
+    splits: tuple[str, ...] = ()
+
+    def given(self, split: str) -> bool:
+        """Whether methods get it under this split."""
+        return not self.splits or split in self.splits
+
+
 def plan(
     rooms: Sequence[tuple[str, str, str]],
     methods: Mapping[str, Contender],
-    budgets: Sequence[tuple[float, Sequence[int]]],
+    budgets: Sequence[Budget],
     only: Sequence[str] = (),
 ) -> list[Cell]:
-    """All cells, the most useful first: a whole table before further seeds and longer budgets.
+    """All cells, the most useful first: every room's table before further seeds and longer budgets.
 
     Args:
         rooms: (dataset, split, kind of data), the most wanted first.
         methods: who takes part.
-        budgets: seconds and their seeds.
+        budgets: the most wanted first.
         only: patterns of `str(cell)`; empty for all.
 
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    longest = max((seconds for seconds, _ in budgets), default=0.0)
-    cells = []
-    for dataset, split, kind in rooms:
-        able = [m for m in methods.values() if m.serves(kind)]
-        cells += [Cell(dataset, split, m.name, None, None) for m in able if not m.budget]
-        for seconds, seeds in budgets:
-            timed = [m for m in able if m.budget and (seconds == longest or not m.only_longest)]
-            cells += [
-                Cell(dataset, split, m.name, seconds, s)
-                for s in seeds
-                for m in timed
-                if not (m.only_longest and s != seeds[0])
-            ]
+    able = {(d, s): [m for m in methods.values() if m.serves(kind)] for d, s, kind in rooms}
+    cells = [Cell(*room, m.name, None, None) for room, those in able.items() for m in those if not m.budget]
+    turns = max((len(b.seeds) for b in budgets), default=0)
+    for turn in range(turns):  # first seeds of all budgets before second ones
+        for budget in (b for b in budgets if turn < len(b.seeds)):
+            for room, those in able.items():
+                here = [b for b in budgets if b.given(room[1])]
+                longest = max((b.seconds for b in here), default=0.0)
+                cells += [
+                    Cell(*room, m.name, budget.seconds, budget.seeds[turn])
+                    for m in those
+                    if m.budget
+                    and budget in here
+                    and not (m.only_longest and (turn > 0 or budget.seconds < longest))
+                ]
     for pattern in only:
         if not any(fnmatchcase(str(cell), pattern) for cell in cells):
             raise ValueError(

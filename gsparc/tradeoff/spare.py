@@ -24,6 +24,7 @@ from gsparc.tradeoff.view import View
 FAMILIES = {  # the most special class first
     "gsparc.committee.Committee": "gsparc.tradeoff.members",
     "gsparc.array.field.ArrayField": "gsparc.tradeoff.packets",
+    "gsparc.bearings.field.BearingField": "gsparc.tradeoff.crossings",
     "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.tradeoff.sources",
     "gsparc.peers.gp.GaussianProcess": "gsparc.tradeoff.components",
     "gsparc.learned.LearnedField": "gsparc.tradeoff.splatted",

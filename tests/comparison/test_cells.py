@@ -8,7 +8,7 @@ import pytest
 from campaigns import compose
 from omegaconf import OmegaConf
 
-from gsparc.comparison.cells import Contender, code_version, contenders, key, plan
+from gsparc.comparison.cells import Budget, Contender, code_version, contenders, key, plan
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -16,7 +16,7 @@ METHODS = {
     "slow": Contender("slow", ("model=nerf2",), ("model.budget_s={budget_s}",), only_longest=True),
     "waves": Contender("waves", ("model=ngrf",), ("model.budget_s={budget_s}",), ("csi",)),
 }
-BUDGETS = [(60.0, [0, 1]), (300.0, [0])]
+BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
 
 
 def names(*only: str, kind: str = "spectrum") -> list[str]:
@@ -25,10 +25,21 @@ def names(*only: str, kind: str = "spectrum") -> list[str]:
 
 def test_a_whole_table_comes_before_further_seeds_and_budgets():
     assert names() == [
-        "rfid/random/gp/any/any", "rfid/random/fast/60/0", "rfid/random/fast/60/1",
-        "rfid/random/fast/300/0", "rfid/random/slow/300/0",
+        "rfid/random/gp/any/any", "rfid/random/fast/60/0",
+        "rfid/random/fast/300/0", "rfid/random/slow/300/0", "rfid/random/fast/60/1",
     ]  # fmt: skip
     assert "rfid/random/waves/60/1" in names(kind="csi")
+
+
+def test_every_room_has_its_first_table_before_any_has_a_second():
+    rooms = [("a", "random", "spectrum"), ("b", "random", "spectrum"), ("a", "grouped", "spectrum")]
+    budgets = [Budget(60, (0, 1), ("random",)), Budget(12, (0,), ("grouped",))]
+    found = [str(c) for c in plan(rooms, METHODS, budgets)]
+    assert found == [
+        "a/random/gp/any/any", "b/random/gp/any/any", "a/grouped/gp/any/any",
+        "a/random/fast/60/0", "a/random/slow/60/0", "b/random/fast/60/0", "b/random/slow/60/0",
+        "a/grouped/fast/12/0", "a/grouped/slow/12/0", "a/random/fast/60/1", "b/random/fast/60/1",
+    ]  # fmt: skip
 
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():

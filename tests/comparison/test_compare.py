@@ -10,6 +10,10 @@ from pathlib import Path
 import pytest
 from campaigns import spectra
 
+from gsparc.compare import _timed
+from gsparc.comparison.cells import Cell
+from gsparc.comparison.fitting import Filled
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -20,6 +24,16 @@ def compare(tmp_path, *more: str) -> subprocess.CompletedProcess:
         f"hydra.run.dir={tmp_path / 'run'}", *more,
     ]  # fmt: skip
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
+    """Results travel as text, models do not: their timings must not be replaced by those of a few."""
+    kept = {"gp": {"p50_ms": 1.5, "p95_ms": 2.0, "to_copy": 0.5, "rounds": 60}}
+    (tmp_path / "latency-toy.json").write_text(json.dumps(kept))
+    cells = [Filled(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})]
+    assert _timed(cells, {}, tmp_path, measure=True)["toy"]["gp"].p50_ms == 1.5
+    assert "models of gp are not here" in caplog.text
+    assert _timed(cells, {}, tmp_path / "none", measure=True) == {"toy": {}}
 
 
 @pytest.mark.slow

@@ -9,10 +9,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from boxes import room_of_spectra
 from campaigns import brief, channels, compose
 
 from gsparc.array.field import ArrayField
 from gsparc.array.packets import PacketSettings
+from gsparc.bearings.field import BearingField
+from gsparc.bearings.sources import SearchSettings
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.committee import Committee
 from gsparc.data.load import load
@@ -132,6 +135,34 @@ def test_a_gaussian_process_spares_components_pixels_and_its_variance(field):
     assert spare.reduced(method, {"confidence": True}, {}) is method
     few = spare.reduced(method, {"keep": 0.2, "stride": 2}, {})
     assert few.size() < len(method.axes) and 0 < away(method, few, data, fold.test) < 0.3
+
+
+@pytest.fixture(scope="module")
+def crossings(tmp_path_factory):
+    data = room_of_spectra()
+    rows = np.arange(len(data.target))
+    fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
+    method = BearingField(
+        SearchSettings(sources=17, rows=40, candidates=2000, steps=20), components=64, seed=0
+    )
+    method.fit(data, fold, tmp_path_factory.mktemp("run"))
+    return method, data, fold
+
+
+def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
+    method, data, fold = crossings
+    measured = spare.measure(method, data, fold.train)
+    assert spare.reduced(method, {"confidence": True}, measured) is method
+    silent = spare.reduced(method, {"confidence": False}, measured)
+    assert away(method, silent, data, fold.test) < 1e-8 and answer(silent, data, fold.test).variance is None
+    error = [
+        away(method, spare.reduced(method, settings, measured), data, fold.test)
+        for settings in ({"keep": 0.5}, {"keep": 0.05})
+    ]
+    assert 0 < error[0] < error[1] < 0.3
+    coarse = spare.reduced(method, {"stride": 2}, measured)
+    assert answer(coarse, data, fold.test).mean.shape == data.batch(fold.test).target.shape
+    assert 0 < away(method, coarse, data, fold.test) < 0.05
 
 
 def test_a_committee_answers_with_some_of_its_members(field):
