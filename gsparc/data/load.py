@@ -143,7 +143,7 @@ def _argos_folder(folder: Path, config: Mapping[str, Any]) -> Measurements:
 def _sionna(config: Mapping[str, Any]) -> Measurements:
     from gsparc.data.sionna import load_sionna
 
-    return load_sionna(_required_file(config), config.get("target"))
+    return load_sionna(_required_file(config), config.get("target"), config.get("truth"))
 
 
 FOLDERS = ("rfid", "rfid_sim", "argos", "argos_sim")  # datasets that are a folder; the others are one file

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
+
+import numpy as np
 
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret
@@ -15,16 +19,44 @@ log = logging.getLogger(__name__)
 TARGETS = ("spectrum", "csi")
 
 
-def load_sionna(path: str | Path, target: str | None = None) -> Measurements:
+def load_sionna(path: str | Path, target: str | None = None, truth: str | Path | None = None) -> Measurements:
     """A simulated dataset as spectra or as channels.
 
     Args:
         path: file that the simulator wrote.
         target: `spectrum` or `csi`; None for the one the file was mainly made for.
+        truth: another simulation of the same receivers, which test rows are compared with: what is lost by
+            having learned from a world with fewer effects.
 
     Raises:
-        DataError: not such a file, no such target, or anything that `load_own` refuses.
+        DataError: not such a file, no such target, other receivers, or anything that `load_own` refuses.
     """
+    data = _load(path, target)
+    if truth is None or Path(truth).resolve() == Path(path).resolve():
+        return data
+    return judged_by(data, _load(truth, target or data.site.kind), f"dataset.truth={truth}")
+
+
+def judged_by(data: Measurements, truth: Measurements, named: str) -> Measurements:
+    """`data`, whose own test rows hold the targets of `truth`; never those of training rows.
+
+    Raises:
+        DataError: `truth` is not of the same receivers, kind and split.
+    """
+    splits = (data.release_split, truth.release_split)
+    same = data.target.shape == truth.target.shape and data.target.dtype == truth.target.dtype
+    if not same or not np.allclose(data.rx_position, truth.rx_position, atol=1e-6):
+        raise DataError(f"{named}: other receivers or other targets; simulate with the same scene settings")
+    if splits[0] is None or splits[1] is None or not np.array_equal(splits[0][1], splits[1][1]):
+        raise DataError(f"{named}: both files must name the same test rows (scene.test_share)")
+    test, target = splits[0][1], data.target.copy()
+    ratio = truth.site.target_scale / data.site.target_scale
+    target[test] = truth.target[test] if ratio == 1 else truth.target[test] * target.dtype.type(ratio)
+    mixed = sha256(f"{data.site.sha256} {truth.site.sha256}".encode()).hexdigest()
+    return replace(data, target=target, site=replace(data.site, sha256=mixed))
+
+
+def _load(path: str | Path, target: str | None) -> Measurements:
     raw = read_raw(path)
     if "simulator" not in raw.attributes:
         raise DataError(f"{path}: not written by python -m gsparc.simulate; read it with dataset=own")

@@ -1,5 +1,6 @@
 """`dataset=sionna` through the same door as every other: training, baselines, evaluation, a stored model."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -7,7 +8,9 @@ import pytest
 from campaigns import compose
 
 import gsparc
+from gsparc.data.errors import DataError
 from gsparc.data.load import load
+from gsparc.data.sionna import judged_by
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import SceneSettings
@@ -32,11 +35,38 @@ SEARCH = [
 ROAD = {"spectrum": ["experiment=sionna", *SEARCH], "csi": ["dataset=sionna", "model=complex_gp"]}
 
 
+SPECTRUM = SpectrumSettings(height=18, width=36, rows=4, columns=4)
+
+
 @pytest.fixture(scope="module")
 def box(tmp_path_factory):
     path = tmp_path_factory.mktemp("simulated") / "box.h5"
-    simulate(Campaign(SCENE, MIRROR, spectrum=SpectrumSettings(height=18, width=36, rows=4, columns=4)), path)
+    simulate(Campaign(SCENE, MIRROR, spectrum=SPECTRUM), path)
     return path
+
+
+@pytest.mark.parametrize("kind", ROAD)
+def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tmp_path):
+    simulate(Campaign(SCENE, dataclasses.replace(MIRROR, depth=0), spectrum=SPECTRUM), tmp_path / "los.h5")
+    alone, whole = (
+        load({"name": "sionna", "file": str(path), "target": kind}) for path in (tmp_path / "los.h5", box)
+    )
+    config = {"name": "sionna", "file": str(tmp_path / "los.h5"), "target": kind, "truth": str(box)}
+    data = load(config)
+    train_rows, test_rows = data.release_split
+    assert np.array_equal(data.target[train_rows], alone.target[train_rows])
+    scale = [d.site.target_scale for d in (data, whole)]
+    np.testing.assert_allclose(
+        data.targets(test_rows) * scale[0], whole.targets(test_rows) * scale[1], rtol=1e-5
+    )
+    assert not np.array_equal(data.target[test_rows], alone.target[test_rows])
+    assert len({data.site.sha256, alone.site.sha256, whole.site.sha256}) == 3
+    assert load({**config, "truth": config["file"]}).site.sha256 == alone.site.sha256
+    elsewhere = dataclasses.replace(whole, rx_position=whole.rx_position + 0.1)
+    with pytest.raises(DataError, match="other receivers"):
+        judged_by(alone, elsewhere, "dataset.truth=x")
+    with pytest.raises(DataError, match="same test rows"):
+        judged_by(alone, dataclasses.replace(whole, release_split=None), "dataset.truth=x")
 
 
 @pytest.mark.parametrize("kind", ROAD)
