@@ -22,7 +22,7 @@ from gsparc.scoring import Scores, score
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 1  # raise it when a baseline or a metric changes its answers
+CACHE_VERSION = 2  # raise it when a baseline or a metric changes its answers
 STORE_ABOVE_S = 1.0  # a faster fit is repeated rather than stored
 
 

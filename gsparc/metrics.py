@@ -21,6 +21,7 @@ from gsparc.data.schema import Kind
 log = logging.getLogger(__name__)
 
 DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
+SILENCE = 1e-6  # of the true power: a silent prediction is 60 dB off, not infinitely
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
 
@@ -105,11 +106,13 @@ class SpectrumMetrics(SampleMetric):
 class ChannelMetrics(SampleMetric):
     """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR, NMSE after one complex scalar each.
 
+    `power_mae_db` is what a map of power can be judged by: how far the predicted power of a sample is off.
+
     Args:
         scale: physical channel = stored channel * scale.
     """
 
-    quantities = ("error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae")
+    quantities = ("error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db")
 
     def __init__(self, scale: float = 1.0) -> None:
         super().__init__()
@@ -130,6 +133,7 @@ class ChannelMetrics(SampleMetric):
             "snr_db": _db(power, error),
             "mse": error / count,
             "mae": np.abs(p - t).sum(1) / count,
+            "power_db": np.where(power > 0, _db(np.maximum(own, power * SILENCE), power), np.nan),
         }
 
     @staticmethod
@@ -144,6 +148,7 @@ class ChannelMetrics(SampleMetric):
             "snr_db": _mean(samples["snr_db"]),
             "mse": _mean(samples["mse"]),
             "mae": _mean(samples["mae"]),
+            "power_mae_db": _mean(np.abs(samples["power_db"])),
             "silent_samples": silent,
             "samples": len(samples["mse"]),
         }

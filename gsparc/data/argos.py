@@ -27,6 +27,7 @@ CARRIER_HZ = 2.4e9
 SPACING_HZ = 312.5e3
 TONES = (*range(-26, 0), *range(1, 27))
 STAND_IN = "argos-sim"
+FACTS = ("count", "seed", "scatterers")  # of a stand-in, that make its streets again
 
 Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -98,7 +99,7 @@ def load_argos(
             "layout": "argos",
             "positions": positions,
             "aligned": str(align),
-            **{name: str(description[name]) for name in ("count", "seed") if name in description},
+            **{name: str(description[name]) for name in FACTS if name in description},
         },
     )
     heard = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}

@@ -111,7 +111,7 @@ def _argos(config: Mapping[str, Any]) -> Measurements:
 
 
 def _argos_sim(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.simulate.argos_sim import ensure_argos_sim
+    from gsparc.simulate.argos_sim import SCATTERERS, ensure_argos_sim
 
     stand_in = config.get("stand_in") or {}
     folder = ensure_argos_sim(
@@ -119,6 +119,7 @@ def _argos_sim(config: Mapping[str, Any]) -> Measurements:
         count=int(stand_in.get("count", 4000)),
         seed=int(stand_in.get("seed", 0)),
         offsets=bool(stand_in.get("offsets", True)),
+        scatterers=int(stand_in.get("scatterers", SCATTERERS)),
     )
     log.warning("argos-sim: SIMULATED data in the layout of the Argos release, at %s", folder)
     return _argos_folder(folder, config)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.coherent.offsets import estimate
+from gsparc.data.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.link.grid import interpolated
 from gsparc.method import Method, Prediction
@@ -68,7 +69,8 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     site, uplink = data.site, data.uplink
     assert uplink is not None and site.uplink_hz is not None and site.antennas is not None
     assert site.carrier_hz is not None
-    there = world(int(data.provenance["count"]), int(data.provenance["seed"]))
+    told = (int(data.provenance[name]) for name in FACTS if name in data.provenance)
+    there = world(*told)
     heard = uplink[rows].astype(np.complex128) * site.target_scale
     clean = there.response(site.uplink_hz, rows)
     coarse = estimate(heard, clean, site.uplink_hz, site.carrier_hz, timing=True)

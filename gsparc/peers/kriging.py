@@ -2,8 +2,9 @@
 
 N. Cressie, "Statistics for Spatial Data" (1993), chapters 2 and 3; the exponential law is that of shadowing,
 M. Gudmundson, "Correlation model for shadow fading in mobile radio systems", Electronics Letters 27 (1991).
-Power is kriged in decibels; spectra pixel by pixel with one variogram for all, so that one set of weights
-serves them. Left out: drift with distance (universal kriging), anisotropy, search neighbourhoods.
+Power is kriged in decibels; spectra pixel by pixel, channels entry by entry, with one variogram for all, so
+that one set of weights serves them. A channel's phase is that of the measured ones under the same weights: a
+map of power knows no better. Left out: drift with distance (universal kriging), anisotropy, neighbourhoods.
 """
 
 from __future__ import annotations
@@ -82,30 +83,31 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
 
 
 class Kriging(Interpolator):
-    """Powers and spectra; `ValueError` for channels, whose phase has no logarithm of power."""
+    """Powers, spectra, and the power of channels."""
 
     name = "kriging"
-    kinds = ("spectrum", "rssi")
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         assert self.site is not None
-        if self.site.kind not in self.kinds:
-            raise ValueError(
-                "kriging: predicts powers and spectra; this dataset holds csi (model=complex_gp)"
-            )
         # Repeated places would make the system singular: their mean is kriged.
         self.positions, group = np.unique(positions, axis=0, return_inverse=True)
-        decibels = self._decibels(targets)
-        total = np.zeros((len(self.positions), decibels.shape[1]))
-        np.add.at(total, group.reshape(-1), decibels)
-        self.values = (total / np.bincount(group.reshape(-1))[:, None]).astype(np.float32)
+        decibels, group = self._decibels(targets), group.reshape(-1)
+        self.values = _by_place(decibels, group)
+        self.channels = _by_place(targets.reshape(len(targets), -1), group) if self._complex else None
         self.variogram = fit_variogram(positions, decibels)
         self._solve()
         v = self.variogram
         return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m",)
 
+    @property
+    def _complex(self) -> bool:
+        return self.site is not None and self.site.kind == "csi"
+
     def _decibels(self, targets: np.ndarray) -> np.ndarray:
         assert self.site is not None
+        if self._complex:
+            power = np.abs(targets.reshape(len(targets), -1)) ** 2
+            return 10 * np.log10(np.maximum(power, power.mean() * 1e-8)).astype(np.float32)
         rows = to_real(targets, self.site.kind)
         if self.site.kind == "rssi":
             return rows  # already decibels
@@ -128,11 +130,16 @@ class Kriging(Interpolator):
         right = np.ones((len(self.positions) + 1, len(queries)))
         right[:-1] = self._covariance(cdist(self.positions, queries))  # without the nugget: noise is not kept
         weights = lu_solve(self.system, right)
-        decibels = torch.from_numpy(weights[:-1].T).float() @ torch.from_numpy(self.values)
+        shares = torch.from_numpy(weights[:-1].T)
+        decibels = shares.float() @ torch.from_numpy(self.values)
         left = np.clip(self.variogram.total - (weights * right).sum(0), 0.0, None)
         variance = torch.from_numpy(left).float()
         power = self.site.kind == "rssi"
-        mean = self._decode(decibels if power else 10 ** (decibels / 10))
+        if self.channels is None:
+            mean = self._decode(decibels if power else 10 ** (decibels / 10))
+        else:
+            towards = shares.to(torch.complex64) @ torch.from_numpy(self.channels)
+            mean = torch.polar(10 ** (decibels / 20), towards.angle()).view(-1, *self.shape)
         sure = (1 - variance / self.variogram.total).clamp(0, 1)
         return Prediction(mean, sure, entry_variance(variance, mean, "rssi") if power else None)
 
@@ -142,9 +149,19 @@ class Kriging(Interpolator):
             "positions": torch.from_numpy(self.positions),
             "values": torch.from_numpy(self.values),
             "variogram": [v.nugget, v.sill, v.range],
+            **({} if self.channels is None else {"channels": torch.from_numpy(self.channels)}),
         }
 
     def _relearn(self, state: dict[str, Any]) -> None:
         self.positions, self.values = state["positions"].numpy(), state["values"].numpy()
+        self.channels = state["channels"].numpy() if "channels" in state else None
         self.variogram = Variogram(*(float(v) for v in state["variogram"]))
         self._solve()
+
+
+def _by_place(rows: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Means (P, D) of rows (n, D) of the same place (n,)."""
+    total = np.zeros((place.max() + 1, rows.shape[1]), np.result_type(rows, np.float64))
+    np.add.at(total, place, rows)
+    mean = total / np.bincount(place)[:, None]
+    return mean.astype(np.complex64 if np.iscomplexobj(rows) else np.float32)

@@ -28,6 +28,7 @@ LOWER, UPPER = np.array([-140.0, -105.0]), np.array([140.0, 105.0])  # [m] where
 HEIGHT_M = (1.0, 1.9)
 MEDIAN_SNR_DB = 25.0
 HEARD_DB = 5.0  # a weaker packet is not decoded, so no snapshot of it exists
+SCATTERERS = 60
 CHUNK = 250  # users whose responses are in memory at once
 
 
@@ -46,8 +47,8 @@ class Offsets:
     frequency: float = 0.01
 
 
-def scene(seed: int = 0) -> Streets:
-    """Nine blocks, a base station in the middle street, lamp posts and parked cars along the kerbs."""
+def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
+    """Nine blocks, a base station in the middle street, `scatterers` lamp posts and parked cars."""
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
     half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
@@ -60,8 +61,8 @@ def scene(seed: int = 0) -> Streets:
         scatterer_phase=np.zeros(0),
         base=np.array([-50.0, 37.0, 9.0]),
     )
-    places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (400, 2))
-    places = places[streets.open(places)][:60]
+    places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (max(400, 6 * scatterers), 2))
+    places = places[streets.open(places)][:scatterers]
     return Streets(
         buildings=streets.buildings,
         reflection=streets.reflection,
@@ -104,9 +105,9 @@ class World:
         return np.concatenate(parts)
 
 
-def world(count: int, seed: int = 0) -> World:
+def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
     """`count` users that the base station hears, in streets open to it and blocked from it."""
-    streets, rng = scene(seed), np.random.default_rng([seed, 2])
+    streets, rng = scene(seed, scatterers), np.random.default_rng([seed, 2])
     drawn = rng.uniform(LOWER, UPPER, (8 * count, 2))
     drawn = drawn[streets.open(drawn)][: 2 * count]
     users = np.column_stack([drawn, rng.uniform(*HEIGHT_M, len(drawn))])
@@ -144,9 +145,11 @@ def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
     return measured
 
 
-def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets) -> None:
+def write_argos_sim(
+    folder: Path, count: int, seed: int, offsets: Offsets, scatterers: int = SCATTERERS
+) -> None:
     """Write `count` snapshots in the release's layout; the folder must not exist."""
-    truth = world(count, seed)
+    truth = world(count, seed, scatterers)
     measured = snapshots(truth, offsets, seed)
     partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
     partial.mkdir(parents=True)
@@ -163,6 +166,7 @@ def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets) -> No
         "base_station_64": (scene(seed).base + array()).round(6).tolist(),
         "count": count,
         "seed": seed,
+        "scatterers": scatterers,
     }
     (partial / "base-station.yml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
     order = np.random.default_rng(seed).permutation(count)
@@ -178,16 +182,22 @@ def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets) -> No
             raise
 
 
-def ensure_argos_sim(parent: Path, count: int = 4000, seed: int = 0, offsets: bool = True) -> Path:
+def ensure_argos_sim(
+    parent: Path, count: int = 4000, seed: int = 0, offsets: bool = True, scatterers: int = SCATTERERS
+) -> Path:
     """The folder of this stand-in under `parent`, made when it is not there yet.
 
     Raises:
-        ValueError: fewer than ten users.
+        ValueError: fewer than ten users, or less than one scatterer.
     """
+    if scatterers < 1:
+        raise ValueError(f"dataset.stand_in.scatterers={scatterers}: expected at least 1")
     if count < 10:
         raise ValueError(f"dataset.count={count}: expected at least 10 users")
-    folder = Path(parent) / f"{STAND_IN}-{count}-{seed}{'' if offsets else '-aligned'}"
+    name = f"{STAND_IN}-{count}-{seed}{'' if offsets else '-aligned'}"
+    folder = Path(parent) / (name if scatterers == SCATTERERS else f"{name}-{scatterers}")
     if not folder.is_dir():
         folder.parent.mkdir(parents=True, exist_ok=True)
-        write_argos_sim(folder, count, seed, Offsets() if offsets else Offsets(0.0, 0.0, 0.0))
+        own = Offsets() if offsets else Offsets(0.0, 0.0, 0.0)
+        write_argos_sim(folder, count, seed, own, scatterers)
     return folder

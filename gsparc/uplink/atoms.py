@@ -2,13 +2,15 @@
 
 h[a, k] = sum_n g_n exp(+j 2 pi q_a . w_n) exp(-j 2 pi k t_n), with q_a the antenna's place in the array's
 plane in wavelengths, w_n the source's direction cosines in that plane, k the tone's number and t_n its delay
-in turns per tone. Gram matrices of such atoms are products of one over antennas and one over tones.
+in turns per tone. An atom and its slopes by both cosines and the delay are products of one vector over
+antennas and one over tones, and so are their inner products: every matrix of the search is cut from one.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -27,6 +29,16 @@ class Aperture:
     places: Tensor
     tones: Tensor
 
+    @cached_property
+    def turning(self) -> Tensor:
+        """What an atom is multiplied by when a cosine moves (2, 1, A)."""
+        return (2j * math.pi * self.places.T)[:, None]
+
+    @cached_property
+    def delaying(self) -> Tensor:
+        """What an atom is multiplied by when its delay moves (K,)."""
+        return -2j * math.pi * self.tones
+
     def at(self, tones: Tensor) -> Aperture:
         """The same array at other tones."""
         return Aperture(self.places, tones.to(self.places))
@@ -40,27 +52,52 @@ def flat_places(array: np.ndarray, wavelength: float) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Sources:
-    """N sources of each of B snapshots.
+class Columns:
+    """What N sources and their slopes put on an aperture: 4 N columns, each antennas times tones.
+
+    The slopes are of an atom of gain 1, by its first cosine, its second and its delay, in that order.
 
     Attributes:
-        direction: (B, N, 2) cosines in the array's plane.
-        delay: (B, N) turns per tone.
-        gain: (B, N) complex64.
-        variance: (B, N) of the gains.
-        delay_variance: (B, N) of the delays.
+        antennas: (B, 3, N, A) complex64: the atoms, and them by both cosines.
+        tones: (B, 2, N, K) complex64: the atoms, and them by the delay.
     """
 
-    direction: Tensor
-    delay: Tensor
-    gain: Tensor
-    variance: Tensor
-    delay_variance: Tensor
+    antennas: Tensor
+    tones: Tensor
 
-    def response(self, aperture: Aperture) -> Tensor:
-        """Channels (B, A, K) complex64."""
-        over_antennas, over_tones = steering(self.direction, aperture), delays(self.delay, aperture)
-        return (over_antennas * self.gain[..., None]).transpose(1, 2) @ over_tones
+    @staticmethod
+    def of(direction: Tensor, delay: Tensor, aperture: Aperture) -> Columns:
+        """Of sources (B, N, 2) and (B, N)."""
+        over_antennas = steering(direction, aperture)[:, None]
+        over_tones = delays(delay, aperture)[:, None]
+        by_cosine = over_antennas * aperture.turning
+        by_delay = over_tones * aperture.delaying
+        return Columns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
+
+    def gram(self) -> Tensor:
+        """Inner products (B, 4 N, 4 N) of all columns."""
+        n = self.antennas.shape[2]
+        over_antennas, over_tones = (flat.conj() @ flat.mT for flat in self._flat())
+        for side in (1, 2):  # columns are (atom, slope by x, by y, by delay)
+            atom, by_tones = over_antennas.narrow(side, 0, n), over_tones.narrow(side, 0, n)
+            over_antennas = torch.cat([over_antennas, atom], side)
+            over_tones = torch.cat([by_tones, by_tones, over_tones], side)
+        return over_antennas * over_tones
+
+    def inner(self, snapshot: Tensor) -> Tensor:
+        """Inner products (B, 4 N) of all columns with snapshots (B, A, K)."""
+        n, (antennas, tones) = self.antennas.shape[2], self._flat()
+        heard = antennas.conj() @ snapshot
+        by_cosine = (heard.unflatten(1, (3, n)) * tones[:, None, :n].conj()).sum(-1)
+        by_delay = (heard[:, :n] * tones[:, n:].conj()).sum(-1)
+        return torch.cat([by_cosine.flatten(1), by_delay], 1)
+
+    def _flat(self) -> tuple[Tensor, Tensor]:
+        return self.antennas.flatten(1, 2), self.tones.flatten(1, 2)
+
+    def response(self, gain: Tensor) -> Tensor:
+        """Channels (B, A, K) of the atoms with gains (B, N)."""
+        return (self.antennas[:, 0] * gain[..., None]).transpose(1, 2) @ self.tones[:, 0]
 
 
 def phasor(turns: Tensor) -> Tensor:
@@ -76,17 +113,6 @@ def steering(direction: Tensor, aperture: Aperture) -> Tensor:
 def delays(delay: Tensor, aperture: Aperture) -> Tensor:
     """(B, N, K) complex."""
     return phasor(-delay[..., None] * aperture.tones)
-
-
-def gram(antennas: Tensor, tones: Tensor, antennas2: Tensor, tones2: Tensor) -> Tensor:
-    """Inner products (B, N, M) of atoms (B, N, A), (B, N, K) with others."""
-    over_antennas = antennas.conj() @ antennas2.transpose(1, 2)
-    return over_antennas * (tones.conj() @ tones2.transpose(1, 2))
-
-
-def inner(antennas: Tensor, tones: Tensor, snapshot: Tensor) -> Tensor:
-    """Inner products (B, N) of atoms with snapshots (B, A, K)."""
-    return ((antennas.conj() @ snapshot) * tones.conj()).sum(-1)
 
 
 def mean_delay(snapshot: Tensor) -> Tensor:

@@ -7,16 +7,16 @@ Gauss-Newton steps on what the best gains leave unexplained.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool3d
 
-from gsparc.uplink.atoms import Aperture, Sources, delays, gram, inner, steering
+from gsparc.uplink.atoms import Aperture, Columns, delays, steering
+from gsparc.uplink.posterior import Sources
 
 LEAST_SHARE = 1e-7  # of a snapshot's power that a source's prior keeps, so that nothing divides by zero
+UNEXPLAINED = 0.2  # of what a round leaves counts as noise: sources not found yet pull on those found
 LARGEST_STEP = (0.06, 0.012)  # of direction cosines and of delays, a fraction of a resolution cell
 REACH = (0.03, 0.006)  # standard deviation of a step before anything is known: half a step of the grid
 
@@ -35,8 +35,8 @@ class SearchSettings:
         leakage: share of a snapshot's power that is not explained by sources (hardware, drift).
     """
 
-    rounds: int = 5
-    picks: int = 4
+    rounds: int = 6
+    picks: int = 3
     refinements: int = 1
     final: int = 3
     oversampling: float = 1.5
@@ -57,8 +57,6 @@ class SourceSearch:
         self.cosines, self.delays, self.shape = _grid(aperture, settings)
         self._over_antennas = steering(self.cosines[None], aperture)[0].conj()
         self._over_tones = delays(self.delays[None], aperture)[0].conj().T.contiguous()
-        self._turning = 2j * math.pi * aperture.places
-        self._delaying = -2j * math.pi * aperture.tones
 
     def __call__(self, snapshot: Tensor, noise: Tensor) -> tuple[Sources, Tensor]:
         """Sources of snapshots (B, A, K) complex64 of noise power (B,); also what is left, (B, A, K)."""
@@ -74,76 +72,71 @@ class SourceSearch:
             direction, delay = torch.cat([direction, new_direction], 1), torch.cat([delay, new_delay], 1)
             prior = torch.cat([prior, torch.full_like(new_delay, 1 / (s.rounds * s.picks))], 1)
             last = turn == s.rounds - 1
+            restless = noise + UNEXPLAINED * left.abs().square().mean((1, 2))
             for _ in range(s.refinements + (s.final if last else 0)):
-                direction, delay, prior, left = self._step(y, noise, direction, delay, prior)
+                fit = self._fit(y, restless, direction, delay, prior)
+                turned, moved = self._step(fit, restless)
+                direction, delay = direction + turned, delay + moved
+                prior = (fit.gain.abs().square() + fit.variance(restless)).clamp_min(LEAST_SHARE)
+            if not last:
+                left = y - fit.columns.response(fit.gain)
         fit = self._fit(y, noise, direction, delay, prior)
-        found = Sources(
-            direction,
-            delay,
-            fit.gain * scale[:, None],
-            fit.variance * power[:, None],
-            self._certainty(fit, noise),
-        )
-        return found, fit.left * scale[:, None, None]
+        left = scale[:, None, None] * (y - fit.columns.response(fit.gain))
+        return self._found(fit, noise, direction, delay, scale), left
 
     def _peaks(self, left: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest local maxima of the correlation with the grid's atoms."""
-        score = (self._over_antennas @ left @ self._over_tones).abs()
-        cube = score.view(-1, 1, *self.shape)
-        peaks = torch.where(max_pool3d(cube, 3, 1, 1) == cube, cube, torch.zeros_like(cube)).flatten(1)
+        score = torch.view_as_real(self._over_antennas @ (left @ self._over_tones)).square().sum(-1)
+        cube = score.view(-1, *self.shape)
+        peaks = torch.where(_largest_near(cube) == cube, cube, 0).flatten(1)
         at = peaks.topk(self.settings.picks, 1).indices
         return self.cosines[at // len(self.delays)], self.delays[at % len(self.delays)]
 
     def _fit(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
-        """Best gains of given sources, and what they leave."""
-        a, t = steering(direction, self.aperture), delays(delay, self.aperture)
-        own = gram(a, t, a, t)
-        torch.diagonal(own, dim1=1, dim2=2).add_((noise[:, None] / prior).to(y.dtype))
-        inverse = torch.linalg.inv(own)
-        gain = (inverse @ inner(a, t, y)[..., None])[..., 0]
-        variance = noise[:, None] * torch.diagonal(inverse, dim1=1, dim2=2).real
-        return _Fit(a, t, gain, variance, inverse, y - (a * gain[..., None]).transpose(1, 2) @ t)
-
-    def _step(
-        self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """A Gauss-Newton step of directions and delays on what the best gains leave."""
-        fit = self._fit(y, noise, direction, delay, prior)
-        over_antennas, over_tones = self._slopes(fit)
-        slope = inner(over_antennas, over_tones, fit.left).real
+        """Best gains of given sources, and which way their places should move."""
         n = delay.shape[1]
-        reach = self._reach(n)
-        factor, _ = torch.linalg.cholesky_ex(self._curvature(fit, over_antennas, over_tones, noise))
-        step = torch.cholesky_solve((slope * reach)[..., None], factor)[..., 0] * reach
-        turned = step[:, : 2 * n].view(-1, 2, n).transpose(1, 2).clamp(-LARGEST_STEP[0], LARGEST_STEP[0])
-        moved = step[:, 2 * n :].clamp(-LARGEST_STEP[1], LARGEST_STEP[1])
-        prior = (fit.gain.abs().square() + fit.variance).clamp_min(LEAST_SHARE)
-        return direction + turned, delay + moved, prior, fit.left
+        columns = Columns.of(direction, delay, self.aperture)
+        whole, heard = columns.gram(), columns.inner(y)
+        own, cross = whole[:, :n, :n], whole[:, n:, :n]
+        inverse = torch.linalg.inv(own + torch.diag_embed((noise[:, None] / prior).to(y.dtype)))
+        gain = (inverse @ heard[:, :n, None])[..., 0]
+        loud = gain.repeat(1, 3)
+        slope = ((heard[:, n:] - (cross @ gain[..., None])[..., 0]) * loud.conj()).real
+        follow = cross @ inverse
+        projected = whole[:, n:, n:] - follow @ cross.mH
+        return _Fit(
+            columns, gain, inverse, slope, (projected * loud[:, None] * loud.conj()[..., None]).real,
+            -(follow.mH * loud[:, None]),
+        )  # fmt: skip
 
-    def _certainty(self, fit: _Fit, noise: Tensor) -> Tensor:
-        """Variance of the delays (B, N); half the noise is in the real part."""
+    def _step(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on what the best gains leave."""
         n = fit.gain.shape[1]
-        factor, _ = torch.linalg.cholesky_ex(self._curvature(fit, *self._slopes(fit), noise))
-        spread = torch.diagonal(torch.cholesky_inverse(factor), dim1=1, dim2=2)[:, 2 * n :]
-        return (spread * (noise[:, None] / 2)).clamp_min(0) * self._reach(n)[2 * n :] ** 2
+        reach = self._reach(n)
+        factor, _ = torch.linalg.cholesky_ex(self._scaled(fit, noise))
+        step = torch.cholesky_solve((fit.slope * reach)[..., None], factor)[..., 0] * reach
+        turned = step[:, : 2 * n].view(-1, 2, n).transpose(1, 2).clamp(-LARGEST_STEP[0], LARGEST_STEP[0])
+        return turned, step[:, 2 * n :].clamp(-LARGEST_STEP[1], LARGEST_STEP[1])
 
-    def _slopes(self, fit: _Fit) -> tuple[Tensor, Tensor]:
-        """Derivatives of the heard sources by both cosines and the delay: (B, 3 N, A) and (B, 3 N, K)."""
-        loud = fit.antennas * fit.gain[..., None]
-        x, y = self._turning[:, 0], self._turning[:, 1]
-        return torch.cat([loud * x, loud * y, loud], 1), torch.cat(
-            [fit.tones, fit.tones, fit.tones * self._delaying], 1
+    def _scaled(self, fit: _Fit, noise: Tensor) -> Tensor:
+        """Curvature (B, 3 N, 3 N) in units of `_reach`, with the prior of a small step."""
+        reach = self._reach(fit.gain.shape[1])
+        return fit.curvature * (reach[:, None] * reach) + torch.diag_embed(
+            noise[:, None].expand(-1, len(reach))
         )
 
-    def _curvature(self, fit: _Fit, over_antennas: Tensor, over_tones: Tensor, noise: Tensor) -> Tensor:
-        """(B, 3 N, 3 N) of the projected problem, in units of `_reach`, with the prior of a small step."""
-        cross = gram(over_antennas, over_tones, fit.antennas, fit.tones)
-        whole = gram(over_antennas, over_tones, over_antennas, over_tones)
-        projected = (whole - cross @ fit.inverse @ cross.transpose(1, 2).conj()).real
+    def _found(self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor) -> Sources:
+        """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
         reach = self._reach(fit.gain.shape[1])
-        scaled = projected * reach[:, None] * reach
-        torch.diagonal(scaled, dim1=1, dim2=2).add_(noise[:, None])
-        return scaled
+        spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
+        return Sources(
+            direction,
+            delay,
+            fit.gain * scale[:, None],
+            fit.inverse * (noise * scale**2)[:, None, None],
+            spread * (noise / 2)[:, None, None],
+            fit.follow * scale[:, None, None],
+        )
 
     def _reach(self, count: int) -> Tensor:
         """Standard deviations (3 N,) of a step before anything is known."""
@@ -152,14 +145,40 @@ class SourceSearch:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Sources' atoms (B, N, A), (B, N, K), gains and variances (B, N), inverse Gram matrix, residual."""
+    """Gains of given sources, and the projected problem of their places (unit gains' columns made loud).
 
-    antennas: Tensor
-    tones: Tensor
+    Attributes:
+        columns: atoms and slopes.
+        gain: (B, N).
+        inverse: (B, N, N) of the regularised Gram matrix of the atoms.
+        slope: (B, 3 N) downhill.
+        curvature: (B, 3 N, 3 N).
+        follow: (B, N, 3 N) how gains move with places.
+    """
+
+    columns: Columns
     gain: Tensor
-    variance: Tensor
     inverse: Tensor
-    left: Tensor
+    slope: Tensor
+    curvature: Tensor
+    follow: Tensor
+
+    def variance(self, noise: Tensor) -> Tensor:
+        """Of the gains (B, N)."""
+        return noise[:, None] * torch.diagonal(self.inverse, dim1=1, dim2=2).real
+
+
+def _largest_near(cube: Tensor) -> Tensor:
+    """The largest value within one step along every axis of cubes (B, ...)."""
+    for axis in range(1, cube.ndim):
+        size = cube.shape[axis] - 1
+        if size:
+            grown = cube.clone()
+            for mine, other in ((0, 1), (1, 0)):
+                part = grown.narrow(axis, mine, size)
+                torch.maximum(part, cube.narrow(axis, other, size), out=part)
+            cube = grown
+    return cube
 
 
 def _grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[int, int, int]]:

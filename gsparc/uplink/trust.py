@@ -9,37 +9,56 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.uplink.atoms import Aperture, Sources
+from gsparc.uplink.atoms import Aperture
+from gsparc.uplink.posterior import Sources
 
 RIDGE = 1e-3
 LEAST_ERROR = 1e-6
 
 
-def signs(found: Sources, left: Tensor, uplink: Tensor, noise: Tensor, tones: Tensor) -> Tensor:
-    """Signs of trouble (B, 7): noise, misfit, expected blur at `tones`, cancellation, number and spread.
+@dataclass(frozen=True)
+class Heard:
+    """Snapshots and what a search made of them.
 
-    Args:
-        found: sources of the snapshots.
+    Attributes:
+        sources: of the snapshots.
         left: what they do not explain (B, U, L).
         uplink: (B, U, L).
         noise: (B,).
-        tones: (K,) of the downlink, numbers about the uplink's middle.
     """
-    power = uplink.abs().square().mean((1, 2)).clamp_min(1e-30)
+
+    sources: Sources
+    left: Tensor
+    uplink: Tensor
+    noise: Tensor
+
+
+def signs(heard: Heard, mean: Tensor, aperture: Aperture) -> Tensor:
+    """Signs of trouble (B, 10) at an aperture whose channels are predicted to be `mean` (B, A, K).
+
+    Noise, misfit, blur by the posterior and by delays alone (which saturates), cancellation, number and
+    spread of the sources, doubt in their gains, how deep a fade the aperture is in, and its size.
+    """
+    found = heard.sources
+    power = heard.uplink.abs().square().mean((1, 2)).clamp_min(1e-30)
     strength = found.gain.abs().square()
     total = strength.sum(1).clamp_min(1e-30)
-    blurred = 1 - torch.exp(-((2 * math.pi * tones.abs().max()) ** 2) * found.delay_variance)
-    blur = (strength * blurred + found.variance).sum(1) / power
+    turns = 2 * math.pi * aperture.tones.abs().max()
+    turned = (strength * (1 - torch.exp(-(turns**2) * found.delay_variance))).sum(1)
+    doubt = found.variance.sum(1)
     share = strength / total[:, None]
-    mean = (share * found.delay).sum(1, keepdim=True)
+    middle = (share * found.delay).sum(1, keepdim=True)
     columns = [
-        noise / power,
-        left.abs().square().mean((1, 2)) / noise.clamp_min(1e-30),
-        blur,
+        heard.noise / power,
+        heard.left.abs().square().mean((1, 2)) / heard.noise.clamp_min(1e-30),
+        found.blur(aperture) / power,
+        (turned + doubt) / power,
         total / power,
         1 / share.square().sum(1),
-        (share * (found.delay - mean) ** 2).sum(1).sqrt(),
-        found.variance.sum(1) / power,
+        (share * (found.delay - middle) ** 2).sum(1).sqrt(),
+        doubt / power,
+        mean.abs().square().mean((1, 2)) / power,
+        torch.full_like(power, mean[0].numel()),
     ]
     return torch.stack([column.clamp_min(1e-9).log10() for column in columns], 1)
 
@@ -49,9 +68,10 @@ class Trust:
     """Expected logarithm of the relative error as a quadratic form of the signs.
 
     Attributes:
-        middle, scale: (7,) of the signs in training.
+        middle, scale: (S,) of the signs in training.
         weights: (F,) of the quadratic terms.
         low, high: range of the training errors; nothing beyond is promised.
+        smearing: mean of the errors over that of the exponentials of their expected logarithms (Duan 1983).
     """
 
     middle: Tensor
@@ -59,15 +79,16 @@ class Trust:
     weights: Tensor
     low: float
     high: float
+    smearing: float
 
     def expected(self, seen: Tensor) -> Tensor:
-        """Relative error |e|^2 / |h|^2 to be expected (B,) for signs (B, 7)."""
+        """Relative error |e|^2 / |h|^2 to be expected (B,) for signs (B, S)."""
         logarithm = _quadratic((seen - self.middle) / self.scale) @ self.weights
-        return 10 ** logarithm.clamp(self.low, self.high)
+        return self.smearing * 10 ** logarithm.clamp(self.low, self.high)
 
 
 def learn(seen: Tensor, relative_error: Tensor) -> Trust:
-    """Fit to signs (n, 7) and the relative errors (n,) that came out."""
+    """Fit to signs (n, S) and the relative errors (n,) that came out."""
     middle, scale = seen.mean(0), seen.std(0, correction=0).clamp_min(1e-3)
     terms = _quadratic((seen - middle) / scale).double()
     target = relative_error.clamp_min(LEAST_ERROR).log10().double()
@@ -75,7 +96,9 @@ def learn(seen: Tensor, relative_error: Tensor) -> Trust:
     penalty[0, 0] = 0
     weights = torch.linalg.solve(terms.T @ terms + penalty, terms.T @ target)
     low, high = np.quantile(target.numpy(), [0.001, 0.999])
-    return Trust(middle, scale, weights.float(), float(low), float(high))
+    expected = 10 ** (terms @ weights).clamp(low, high)
+    smearing = relative_error.clamp_max(10**high).double().mean() / expected.mean()
+    return Trust(middle, scale, weights.float(), float(low), float(high), float(smearing))
 
 
 def _quadratic(x: Tensor) -> Tensor:

@@ -162,3 +162,20 @@ def test_kriging_serves_spectra_and_repeated_places(tmp_path):
     data.tx[fold.train[1]] = data.tx[fold.train[0]]
     method = fitted("kriging", data, fold, tmp_path)
     assert error(method, data, fold.test) < 0.5 * error(fitted("mean", data, fold, tmp_path), data, fold.test)
+
+
+def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
+    """A channel's power is kriged in decibels; a map of power knows no phase between its points."""
+    data, fold = campaign("csi", 60), folds(60).folds[0]
+    method = fitted("kriging", data, fold, tmp_path)
+    batch = data.batch(fold.test)
+    said = method.predict(batch.tx, batch.rx).mean
+    assert said.shape == batch.target.shape and said.is_complex()
+    again = fitted("kriging", data, fold, tmp_path)
+    again.restore(data.site, method.state())
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said)
+    rows = data.batch(fold.train)  # at a measured place the map is the measurement, less the nugget
+    method.variogram = type(method.variogram)(0.0, method.variogram.total, method.variogram.range)
+    method._solve()
+    there = method.predict(rows.tx, rows.rx).mean
+    assert torch.allclose(there, rows.target, atol=1e-2 * float(rows.target.abs().max()))

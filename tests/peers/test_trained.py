@@ -92,8 +92,8 @@ def test_budgets_are_processor_time(tmp_path):
 
 def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds):
     fold = folds(30).folds[0]
-    for name, kind in (("swiftwrf", "csi"), ("gsrf", "rssi"), ("kriging", "csi")):
-        method = method_class(name)() if name == "kriging" else brief(name)
+    for name, kind in (("swiftwrf", "csi"), ("gsrf", "rssi")):
+        method = brief(name)
         with pytest.raises(ValueError, match=f"{name}: predicts .*holds {kind}"):
             method.fit(campaign(kind, 30), fold, tmp_path)
     with pytest.raises(ValueError, match="newrf: needs directions of arrival"):

@@ -11,8 +11,9 @@ from gsparc import checkpoint
 from gsparc.data.argos import load_argos
 from gsparc.peers.fire import Fire
 from gsparc.peers.ridge import Ridge
-from gsparc.uplink.atoms import Aperture, Sources
+from gsparc.uplink.atoms import Aperture, Columns, delays, steering
 from gsparc.uplink.method import UplinkField
+from gsparc.uplink.posterior import Sources
 from gsparc.uplink.search import SearchSettings, SourceSearch
 from gsparc.uplink.trust import unheard_noise
 
@@ -25,7 +26,8 @@ def _aperture() -> Aperture:
 def _three() -> Sources:
     direction = torch.tensor([[[0.31, -0.2], [-0.52, 0.11], [0.05, 0.63]]])
     delay, gain = torch.tensor([[0.013, 0.091, -0.04]]), torch.tensor([[1.0, 0.5j, -0.3 + 0.1j]])
-    return Sources(direction, delay, gain, torch.zeros(1, 3), torch.zeros(1, 3))
+    none = torch.zeros(1, 3, 3), torch.zeros(1, 9, 9), torch.zeros(1, 3, 9, dtype=torch.complex64)
+    return Sources(direction, delay, gain, *none)
 
 
 def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
@@ -142,3 +144,51 @@ def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None
     method.fit(data, fold(), None)
     assert method.search.shape[1] == 1
     assert _share(method, data, fold().test) < 0.3
+
+
+def test_columns_are_the_slopes_and_their_inner_products() -> None:
+    """One Gram matrix holds atoms and slopes: it equals that of finite differences."""
+    aperture, three = _aperture(), _three()
+
+    def atoms(moved: torch.Tensor) -> torch.Tensor:
+        direction, delay = three.direction.double().clone(), three.delay.double().clone()
+        direction, delay = direction + moved[:2], delay + moved[2]
+        exact = Aperture(aperture.places.double(), aperture.tones.double())
+        return (steering(direction, exact)[..., None] * delays(delay, exact)[:, :, None]).flatten(2)[0]
+
+    step = 1e-6
+    slopes = [(atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()]
+    flat = torch.cat([atoms(torch.zeros(3).double()), *slopes])
+    columns = Columns.of(three.direction, three.delay, aperture)
+    assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
+    snapshot = three.response(aperture)
+    wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)
+    assert torch.allclose(columns.inner(snapshot)[0], wanted.to(torch.complex64), rtol=1e-3, atol=2.0)
+
+
+def test_posterior_tells_the_error_of_the_other_band() -> None:
+    """Blur is the mean squared error over draws of the noise, in the other band and on one antenna."""
+    aperture, truth = _aperture(), _three()
+    count, noise = 200, 0.05
+    generator = torch.Generator().manual_seed(0)
+    heard = truth.response(aperture).expand(count, -1, -1)
+    heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
+    search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
+    found, _ = search(heard, torch.full((count,), noise))
+    other = aperture.at(aperture.tones + 27)
+    for where in (other, Aperture(other.places[:1], other.tones[:5])):
+        miss = (found.response(where) - truth.response(where)).abs().square().mean((1, 2))
+        assert 0.6 < float(miss.median() / found.blur(where).median()) < 1.6
+
+
+def test_trust_holds_on_a_narrow_grid_of_one_antenna(fitted) -> None:
+    """Pieces of the downlink are in fades that the whole never is in: expected errors follow."""
+    method, data = fitted
+    rows = np.concatenate([fold().val, fold().test])
+    batch = data.batch(rows)
+    few = torch.from_numpy(data.site.subcarriers_hz[11:15])
+    found = method.listen_at(batch.uplink, few, batch.noise_variance, slice(0, 1))
+    error = (found.mean - batch.target[:, :1, 11:15]).abs().square().mean((1, 2))
+    sure = found.confidence > found.confidence.median()
+    share = error / batch.target[:, :1, 11:15].abs().square().mean((1, 2))
+    assert share[sure].median() < 0.5 * share[~sure].median()
