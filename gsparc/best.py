@@ -21,7 +21,7 @@ from gsparc.effects import (
     probe_array,
     probe_phase,
 )
-from gsparc.hybrid import Rest, learn_rest
+from gsparc.hybrid import Beside, Rest, learn_rest, restored
 from gsparc.learned import LearnedField
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
@@ -62,7 +62,7 @@ class Gsparc(LearnedField):
         self._models = {"phase": phase_model, "array": array_model, "bearings": bearing_model}
         self._probe = phase_probe
         self._chosen: str | None = None
-        self._rest: Rest | None = None
+        self._rest: Rest | Beside | None = None
         self.decisions: tuple[Decision, ...] = ()
 
     @property
@@ -75,8 +75,8 @@ class Gsparc(LearnedField):
         return chosen + hybrid
 
     @property
-    def answering(self) -> tuple[Method, Rest | None]:
-        """What computes the answers, itself when no effect is on, and what is added to them."""
+    def answering(self) -> tuple[Method, Rest | Beside | None]:
+        """What computes the answers, itself when no effect is on, and the process that completes them."""
         return (self if self._chosen is None else self._models[self._chosen]), self._rest
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
@@ -98,7 +98,7 @@ class Gsparc(LearnedField):
             if isinstance(chosen, VirtualSourceGP) and budget_s is not None:
                 chosen.budget_s = budget_s - sum(d.seconds for d in self.decisions)
             report = chosen.fit(data, fold, run_dir)
-            decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data)
+            decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data, fold)
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
@@ -126,13 +126,13 @@ class Gsparc(LearnedField):
         return phase, array
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; the variance errs high by what a process of the rest explains."""
+        """See `Method.predict`; the variance errs high by what a process beside it explains."""
         if self._chosen is None:
             return super().predict(tx, rx)
         said = self._models[self._chosen].predict(tx, rx)
         if self._rest is None:
             return said
-        return replace(said, mean=said.mean + self._rest.at(rx.position.reshape(-1, 3).expand(len(tx), 3)))
+        return replace(said, mean=self._rest.completed(said.mean, tx, rx))
 
     def state(self) -> dict[str, Any]:
         """What was chosen, and its state."""
@@ -148,7 +148,7 @@ class Gsparc(LearnedField):
         else:
             self._models[self._chosen].restore(site, state["inner"])
         rest = state.get("rest")
-        self._rest = None if rest is None else Rest.restore(site, rest)
+        self._rest = None if rest is None else restored(site, rest)
 
     def size(self) -> int:
         """Number of Gaussians or sources."""

@@ -1,8 +1,12 @@
-"""What physics leaves over, learned as a process: where sources explain part of a channel, a kernel the rest.
+"""A process beside physics: of what sources leave over, or of whole images where it is as good as an array.
 
-Rough walls and clutter make many weak paths that no search finds, and that a Gaussian process knows as far as
-receivers stand within half a wavelength of each other. It is taught what each receiver measured less what the
-sources of all *other* receivers say, and counts by how well its own leave-one-out predictions do.
+**Rest.** Rough walls and clutter make many weak paths that no search finds, and that a Gaussian process
+knows as far as receivers stand within half a wavelength of each other. It is taught what each receiver
+measured less what the sources of all *other* receivers say, and counts by its own left-out predictions.
+
+**Beside.** From a few spectra an array's vectors are no better learned than images are, and the two err
+differently: where both predict training spectra without their neighbours about equally well, the mean of both
+answers, weighted by these predictions.
 """
 
 from __future__ import annotations
@@ -16,13 +20,19 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.array.field import ArrayField
+from gsparc.array.tuning import LeftOut, without
 from gsparc.coherent.complex_gp import ComplexGP
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.effects import Decision, Switch
 from gsparc.method import Method
+from gsparc.ops import Pose
+from gsparc.peers.gp import GaussianProcess, choose_kernel
 
+LEVEL_DB = 0.25  # a process of images this far behind an array, left out, is level with it
+WEIGHTS = np.linspace(0, 1, 21)
 LEAST_GAIN = 0.03  # of the left-out residual's power, below which `auto` does without
 
 
@@ -44,6 +54,10 @@ class Rest:
         """What it adds (B, A, K) complex64 at places (B, 3) [m]."""
         return self.weight * self.process.mean_at(places)
 
+    def completed(self, mean: Tensor, tx: Tensor, rx: Pose) -> Tensor:
+        """What physics says, with it."""
+        return mean + self.at(rx.position.reshape(-1, 3).expand(len(tx), 3))
+
     def state(self) -> dict[str, Any]:
         """Everything `restore` needs."""
         return {"process": self.process.state(), "weight": self.weight, "gain": self.gain}
@@ -56,15 +70,50 @@ class Rest:
         return Rest(process, float(state["weight"]), float(state["gain"]))
 
 
-def learn_rest(switch: Switch, physics: Method, data: Measurements) -> tuple[Decision, Rest | None]:
-    """Whether a process is to explain the rest, decided by leave-one-out, and the process.
+@dataclass(frozen=True)
+class Beside:
+    """A process of whole images that answers with the physics.
+
+    Attributes:
+        process: taught the images.
+        weight: in (0, 1], its say.
+    """
+
+    process: GaussianProcess
+    weight: float
+
+    def completed(self, mean: Tensor, tx: Tensor, rx: Pose) -> Tensor:
+        """What physics says (B, H, W), averaged with it."""
+        return torch.lerp(mean, self.process.mean_at(tx), self.weight)
+
+    def state(self) -> dict[str, Any]:
+        """Everything `restore` needs."""
+        return {"beside": self.process.state(), "weight": self.weight}
+
+
+def restored(site: Site, state: dict[str, Any]) -> Rest | Beside:
+    """The one whose `state()` this was."""
+    if "beside" not in state:
+        return Rest.restore(site, state)
+    process = GaussianProcess()
+    process.restore(site, state["beside"])
+    return Beside(process, float(state["weight"]))
+
+
+def learn_rest(
+    switch: Switch, physics: Method, data: Measurements, fold: Fold
+) -> tuple[Decision, Rest | Beside | None]:
+    """Whether a process is to help, decided by leaving training rows out, and the process.
 
     Args:
         switch: `auto`, true or false.
         physics: fitted on `data`.
         data: all measurements; only rows that physics holds are looked at.
+        fold: whose training and validation rows these are.
     """
     started = time.perf_counter()
+    if isinstance(physics, ArrayField) and switch is not False:
+        return _beside(switch is True, physics, data, fold, started)
     obstacle = None
     if switch is False:
         obstacle = "as configured"
@@ -85,6 +134,39 @@ def learn_rest(switch: Switch, physics: Method, data: Measurements) -> tuple[Dec
     reason = f"a process explains {max(gain, 0):.0%} of what the sources leave over, left out one by one"
     spent = time.perf_counter() - started
     return Decision("hybrid", on, reason, spent), Rest(process, weight, gain) if on else None
+
+
+def _beside(
+    wanted: bool, physics: ArrayField, data: Measurements, fold: Fold, started: float
+) -> tuple[Decision, Beside | None]:
+    if physics.left_out is None:
+        return Decision("hybrid", False, "too few spectra to leave any out"), None
+    behind, weight = compared(physics.left_out)
+    weight = max(weight, float(WEIGHTS[1])) if wanted else weight
+    on = wanted or (weight > 0 and behind < LEVEL_DB)
+    found = "as good as" if behind < LEVEL_DB else "worse than"
+    reason = f"left out, a process of images is {found} the array ({-behind:+.2f} dB)"
+    if not on:
+        return Decision("hybrid", False, reason, time.perf_counter() - started), None
+    process = GaussianProcess()
+    process.fit(data, fold, Path())
+    reason += f", and has {weight:.0%} of the say"
+    return Decision("hybrid", True, reason, time.perf_counter() - started), Beside(process, weight)
+
+
+def compared(left: LeftOut) -> tuple[float, float]:
+    """How far a process of images is behind what was predicted [dB], and its best weight in their mean.
+
+    On the same samples, gaps and pixels; its kernel is chosen on all of them.
+    """
+    mean = left.images.mean(0)
+    vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
+    kernel = choose_kernel(left.positions, vectors * lengths, len(mean))
+    inverse = np.linalg.inv(kernel.gram(left.positions))
+    distance = np.linalg.norm(left.positions[:, None] - left.positions[None], axis=-1)
+    said = mean + without(inverse, left.images - mean, distance, left.centres, left.gaps)[0]
+    error = [left.mismatch_db((1 - w) * left.drawn + w * said) for w in WEIGHTS]
+    return error[-1] - error[0], float(WEIGHTS[int(np.argmin(error))])
 
 
 def _worth(process: ComplexGP, residual: Tensor) -> tuple[float, float]:

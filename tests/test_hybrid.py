@@ -11,11 +11,15 @@ from campaigns import compose
 from invented import invent
 from rooms import nmse, rough, shoebox
 
+from gsparc.array.tuning import LeftOut
 from gsparc.coherent.vsgp import VirtualSourceGP
-from gsparc.hybrid import Rest, learn_rest
+from gsparc.data.load import load
+from gsparc.data.splits import Fold
+from gsparc.hybrid import Beside, Rest, compared, learn_rest
 from gsparc.peers.mean import Mean
 from gsparc.registry import build
 
+NONE = Fold(*[np.zeros(0, np.int64)] * 3)
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "furniture": False, "edges": False}
 
 
@@ -43,7 +47,7 @@ def test_a_rest_of_waves_is_learned_and_one_of_noise_is_not(diffuse):
     rng = np.random.default_rng(1)
     noise = torch.from_numpy(rng.normal(size=(120, 2))).float()
     left = torch.from_numpy(data.target[:, 0]) if diffuse else torch.view_as_complex(noise)[:, None]
-    decision, rest = learn_rest("auto", Known(left), data)
+    decision, rest = learn_rest("auto", Known(left), data, NONE)
     assert decision.on == diffuse
     if rest is not None:
         assert rest.gain > 0.8 and 0.5 < rest.weight <= 1
@@ -55,7 +59,7 @@ def test_diffuse_paths_are_left_to_a_process_and_it_is_stored(tmp_path):
     """Receivers .4 wavelengths apart, a third of the power from rough walls."""
     data, fold = rough(260)
     physics = _physics(data, fold)
-    decision, rest = learn_rest("auto", physics, data)
+    decision, rest = learn_rest("auto", physics, data, fold)
     assert decision.on and "leave over" in decision.reason and 0.03 < rest.gain < 1
     batch = data.batch(fold.test)
     said, true = physics.predict(batch.tx, batch.rx).mean, batch.target.numpy()
@@ -73,12 +77,42 @@ def test_diffuse_paths_are_left_to_a_process_and_it_is_stored(tmp_path):
 
 def test_where_sources_explain_everything_there_is_no_rest():
     _, data, fold = shoebox(150, size=(3.0, 2.5, 2.2), max_order=1)
-    decision, rest = learn_rest("auto", _physics(data, fold), data)
+    decision, rest = learn_rest("auto", _physics(data, fold), data, fold)
     assert not decision.on and rest is None
 
 
 def test_it_is_for_sources_with_carrier_phase():
     data = invent("csi")
     for switch, word in (("auto", "only sources"), (False, "as configured")):
-        decision, rest = learn_rest(switch, Mean(), data)
+        decision, rest = learn_rest(switch, Mean(), data, NONE)
         assert rest is None and not decision.on and word in decision.reason
+
+
+@pytest.mark.parametrize(("off", "level"), [(0.01, False), (0.1, True), (0.5, True)])
+def test_a_process_of_images_has_a_say_where_the_array_predicts_no_better(off, level):
+    """Smooth images, and an array that is off by so much of their spread."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 1, (40, 3))
+    images = np.sin(places @ rng.normal(size=(3, 30)) * 2) / 4 + 0.5
+    centres, gaps = np.arange(0, 40, 2), np.array([0.0, 0.2])
+    wrong = rng.normal(size=(2, 20, 30)) * off * images.std()
+    behind, weight = compared(LeftOut(places, images, centres, gaps, images[centres] + wrong))
+    assert (behind < 0.25) == level and (weight > 0.2) == level and (weight > 0.8) == (off == 0.5)
+
+
+def test_an_array_of_few_spectra_answers_with_a_process_beside_it(tmp_path):
+    data = load({"name": "rfid_sim", "count": 32, "root": str(tmp_path / "sim"), "seed": 0})
+    rows = np.arange(32)
+    fold = Fold(rows[rows % 2 > 0], rows[:0], rows[::2])
+    settings = ["array_model.cache=false", "array_model.packets.samples=300", "effects.array=true"]
+    method = build(compose(*(f"model.{s}" for s in settings), "model.effects.hybrid=true").model)
+    method.fit(data, fold, tmp_path)
+    array, beside = method.answering
+    assert isinstance(beside, Beside) and 0 < beside.weight <= 1 and method.effects == "array+hybrid"
+    batch = data.batch(fold.test)
+    found = method.predict(batch.tx, batch.rx).mean
+    parts = [m.predict(batch.tx, batch.rx).mean for m in (array, beside.process)]
+    torch.testing.assert_close(found, torch.lerp(*parts, beside.weight), atol=1e-5, rtol=1e-5)
+    again = build(compose().model)
+    again.restore(data.site, method.state())
+    torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, found, atol=1e-5, rtol=1e-5)

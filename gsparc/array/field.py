@@ -16,7 +16,7 @@ from gsparc.array.process import learn_process, mirror_elements
 from gsparc.array.render import SpectrumRenderer
 from gsparc.array.response import site_problem, steering
 from gsparc.array.store import recovered, report
-from gsparc.array.tuning import LEAST_LEFT, tune
+from gsparc.array.tuning import LEAST_LEFT, LeftOut, tune
 from gsparc.baselines import platform_cache
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -60,6 +60,7 @@ class ArrayField(Method):
         self.background: Tensor | None = None
         self.error = (0.0, 0.0)
         self.seen = 0
+        self.left_out: LeftOut | None = None  # known after `fit`, not stored
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Recover the vectors of the training rows, learn them, distil.
@@ -104,6 +105,7 @@ class ArrayField(Method):
         )  # fmt: skip
         teacher = learn_process(vectors, places, partner, tuned.kernel)
         self.site, self.seen, self.error = site, len(rows), tuned.error_model()
+        self.left_out = tuned.left_out
         self.field = distil(teacher, self.packets, site.wavelength, self.seed).requires_grad_(False)
         self.background = torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width)
         self.renderer = SpectrumRenderer(site, self.background)

@@ -25,6 +25,72 @@ STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """Training spectra predicted without their neighbours, for whoever wants to do better.
+
+    Attributes:
+        positions: (n, 3) [m].
+        images: (n, P) float64, some pixels of the spectra.
+        centres: (c,) rows that were predicted.
+        gaps: (g,) [m] within which their neighbours were left out.
+        drawn: (g, c, P) predicted; NaN where nothing was left.
+    """
+
+    positions: np.ndarray
+    images: np.ndarray
+    centres: np.ndarray
+    gaps: np.ndarray
+    drawn: np.ndarray
+
+    def mismatch_db(self, drawn: np.ndarray) -> float:
+        """Minus the PSNR [dB] of predictions (g, c, P), averaged over samples and gaps."""
+        return 10 / np.log(10) * _mean_log(((drawn - self.images[self.centres]) ** 2).mean(-1))
+
+
+def without(
+    inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What a process says of samples without all others within a gap, and how much it does not know.
+
+    Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
+    `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
+
+    Args:
+        inverse: (n, n) of the Gram matrix with noise.
+        values: (n, M) real or complex.
+        distance: (n, n) [m].
+        centres: (c,) rows.
+        gaps: (g,) [m].
+
+    Returns:
+        Means (g, c, M), and variances (g, c) with noise; NaN where nothing is left.
+    """
+    weighted = inverse @ values
+    mean = np.full((len(gaps), len(centres), values.shape[1]), np.nan, dtype=values.dtype)
+    variance = np.full(mean.shape[:2], np.nan)
+    for g, gap in enumerate(gaps):
+        for c, i in enumerate(centres):
+            near = distance[i] <= gap
+            near[i] = True
+            if near.all():
+                continue
+            rows = np.flatnonzero(near)
+            own = int(np.searchsorted(rows, i))
+            unit = np.zeros(len(rows))
+            unit[own] = 1.0
+            share = np.linalg.solve(inverse[np.ix_(rows, rows)], unit)
+            mean[g, c] = values[i] - share @ weighted[rows]
+            variance[g, c] = share[own]
+    return mean, variance
+
+
+def _mean_log(error: np.ndarray) -> float:
+    """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
+    usable = ~np.isnan(error).all(1)
+    return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
+
+
+@dataclass(frozen=True)
 class Tuned:
     """The chosen kernel and how wrong it was.
 
@@ -32,11 +98,13 @@ class Tuned:
         kernel: length and noise.
         left: (k,) unknown share of the variance at each prediction made in passing.
         error: (k,) mean squared error of its spectrum.
+        left_out: those predictions; None for too few samples.
     """
 
     kernel: Kernel
     left: np.ndarray
     error: np.ndarray
+    left_out: LeftOut | None = None
 
     def error_model(self) -> tuple[float, float]:
         """(a, p): the expected squared error of a pixel is about `a (left + LEAST_LEFT)^p`.
@@ -114,9 +182,11 @@ def tune(
     )  # fmt: skip
     kernel = kernel_at(found.x)
     inverse = np.linalg.inv(kernel.gram(positions))
-    left, error = looks.predictions(kernel, inverse, settle(settled, inverse, partner))
+    left, drawn = looks.predictions(kernel, inverse, settle(settled, inverse, partner))
+    error = looks.error(drawn)
     seen = ~np.isnan(error)
-    return Tuned(kernel, left[seen], error[seen])
+    left_out = LeftOut(positions, looks.images, looks.centres, looks.gaps, drawn)
+    return Tuned(kernel, left[seen], error[seen], left_out)
 
 
 @dataclass(frozen=True)
@@ -132,34 +202,16 @@ class _Looks:
     def predictions(
         self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Unknown share and squared error (gaps, centres) of left-out predictions; NaN where nothing is left.
+        """Unknown share (g, c) and spectra (g, c, P) of left-out predictions; NaN where nothing is left."""
+        mean, variance = without(inverse, vectors, self.distance, self.centres, self.gaps)
+        left = np.clip(variance - kernel.noise, 0.0, 1.0)
+        power = np.abs(mean @ self.matrix) ** 2 + left[..., None] * self.background
+        return left, np.sqrt(power)
 
-        Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
-        `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
-        """
-        weighted = inverse @ vectors
-        left = np.full((len(self.gaps), len(self.centres)), np.nan)
-        error = left.copy()
-        for g, gap in enumerate(self.gaps):
-            mean = np.zeros((len(self.centres), vectors.shape[1]), dtype=np.complex128)
-            for c, i in enumerate(self.centres):
-                near = self.distance[i] <= gap
-                near[i] = True
-                if near.all():
-                    continue
-                rows = np.flatnonzero(near)
-                own = int(np.searchsorted(rows, i))
-                unit = np.zeros(len(rows))
-                unit[own] = 1.0
-                share = np.linalg.solve(inverse[np.ix_(rows, rows)], unit)
-                mean[c] = vectors[i] - share @ weighted[rows]
-                left[g, c] = min(max(share[own] - kernel.noise, 0.0), 1.0)
-            power = np.abs(mean @ self.matrix) ** 2 + left[g][:, None] * self.background
-            error[g] = ((np.sqrt(power) - self.images[self.centres]) ** 2).mean(1)
-        return left, error
+    def error(self, drawn: np.ndarray) -> np.ndarray:
+        """(g, c) mean squared."""
+        return ((drawn - self.images[self.centres]) ** 2).mean(-1)
 
     def score(self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray) -> float:
         """Mean over gaps and centres of the log of the squared error: up to a factor, minus the PSNR."""
-        error = self.predictions(kernel, inverse, vectors)[1]
-        usable = ~np.isnan(error).all(1)
-        return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
+        return _mean_log(self.error(self.predictions(kernel, inverse, vectors)[1]))

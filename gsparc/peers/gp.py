@@ -11,6 +11,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, eigh
 from scipy.linalg.lapack import dtrtri
 from scipy.optimize import minimize
 from sklearn.gaussian_process.kernels import Matern
+from torch import Tensor
 
 from gsparc.data.schema import Kind
 from gsparc.method import Prediction
@@ -184,6 +185,12 @@ class GaussianProcess(Interpolator):
             confidence=torch.from_numpy(1 - left / prior).float(),
             variance=entry_variance(variance, mean, self.site.kind),
         )
+
+    def mean_at(self, places: Tensor) -> Tensor:
+        """The mean (B, ...) alone at places (B, 3) [m]; the variance is most of a prediction."""
+        cross = self.kernel.cross(places.detach().cpu().double().numpy(), self.positions)
+        scores = (torch.from_numpy(cross) @ self.weights).float()
+        return self._decode(torch.addmm(self.mean, scores, self.axes))
 
     def _learned(self) -> dict[str, Any]:
         return {

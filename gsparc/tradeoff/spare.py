@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsparc.best import Gsparc
 from gsparc.data.schema import Measurements
-from gsparc.hybrid import Rest
+from gsparc.hybrid import Beside, Rest
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.tradeoff.points import Settings
@@ -45,15 +45,15 @@ def answering(method: Method) -> Method:
     return method.answering[0] if isinstance(method, Gsparc) else method
 
 
-def _rest(method: Method) -> Rest | None:
-    """What is added to its answers."""
+def _rest(method: Method) -> Rest | Beside | None:
+    """The process that completes its answers."""
     return method.answering[1] if isinstance(method, Gsparc) else None
 
 
 class WithRest(View):
-    """Answers plus the process of what sources leave over."""
+    """Answers completed by the process beside the physics."""
 
-    def __init__(self, inner: Method, rest: Rest) -> None:
+    def __init__(self, inner: Method, rest: Rest | Beside) -> None:
         super().__init__(inner)
         self.rest = rest
 
@@ -61,7 +61,7 @@ class WithRest(View):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
         said = self.inner.predict(tx, rx)
-        return replace(said, mean=said.mean + self.rest.at(rx.position.reshape(-1, 3).expand(len(tx), 3)))
+        return replace(said, mean=self.rest.completed(said.mean, tx, rx))
 
 
 def family(method: Method) -> ModuleType | None:
