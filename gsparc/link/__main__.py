@@ -16,13 +16,15 @@ from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc import cli
-from gsparc.calibration.evidence import Evidence, gather
+from gsparc.calibration.evidence import Evidence
 from gsparc.calibration.threshold import Promise, Threshold, choose, levels_of
 from gsparc.calibration.trial import best_kind, cells, divided
 from gsparc.clock import machine_facts
 from gsparc.evaluate import open_files
 from gsparc.evaluation import dataset_facts, split_facts
-from gsparc.link.channels import channels
+from gsparc.link.adaptation import Band
+from gsparc.link.channels import Channels, channels
+from gsparc.link.evidence import on_band
 from gsparc.link.grid import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.link.pictures import draw_acceptance, draw_errors, draw_rates
 from gsparc.link.pusch import RECEIVERS, Pusch, frequency_correlation
@@ -33,6 +35,7 @@ from gsparc.link.study import (
     curves,
     pusch_facts,
     rate_facts,
+    tradeoff,
     transmit,
 )
 from gsparc.link.tables import tables
@@ -40,6 +43,7 @@ from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 
+NEED_VARIANCE = ("predicted_variance", "predicted_pilots")
 SHARES = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 
 
@@ -64,6 +68,11 @@ def accept(
     return used, found, test, choose_on
 
 
+def band(found: Channels) -> Band:
+    """One antenna's channels, for rate adaptation."""
+    return Band(found.true[:, 0], found.predicted[:, 0], found.variance.nan_to_num(0.0))
+
+
 def task(config: DictConfig) -> dict[str, Any]:
     """All three experiments on one checkpoint; returns the facts of `summary.json`."""
     need_sionna()
@@ -76,7 +85,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     if data.site.kind != "csi" or data.site.subcarriers_hz is None:
         raise ValueError(f"gsparc.link needs complex channels with their frequencies, not {data.site.kind}")
     started = time.perf_counter()
-    evidence = gather(method, data, fold, fold.test)
+    shape, tones = settings["pusch"], data.site.subcarriers_hz
+    antenna, last = int(config.antenna), data.target.shape[1]
+    if not 0 <= antenna < last:
+        raise ValueError(f"antenna={antenna}: the target has {last}")
+    one = slice(antenna, antenna + 1)
+    count, spacing = SUBCARRIERS_PER_BLOCK * shape["blocks"], 1e3 * shape["spacing_khz"]
+    # What is accepted is judged on the band that is used: this antenna, the PUSCH grid.
+    grid = channels(method, data, fold.test, centred(float(tones.mean()), spacing, count), one)
+    evidence = on_band(grid, data, fold, fold.test)
     promise = Promise(**settings["promise"])
     kind, threshold, test, aside = accept(
         evidence, promise, config.confidence, config.spatial, int(config.seed)
@@ -92,12 +109,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         "promise/calibrated_on": threshold.accepted,
         "promise/bound": threshold.bound(promise.delta),
     }  # fmt: skip
-    own = channels(method, data, rows, data.site.subcarriers_hz)
-    if own.true.shape[1] > 1:
-        facts |= beam_facts(own.true, own.predicted, accepted)
-    antenna = int(config.antenna)
-    if antenna >= own.true.shape[1]:
-        raise ValueError(f"antenna={antenna}: the target has {own.true.shape[1]}")
+    if last > 1:
+        every = channels(method, data, rows, tones)
+        facts |= beam_facts(every.true, every.predicted, accepted)
     title = f"{data.site.name}, {method.name}"
     with Progress(
         *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
@@ -105,27 +119,24 @@ def task(config: DictConfig) -> dict[str, Any]:
         levels = settings["mcs"]["snr_db"]
         adapting = bar.add_task("rate adaptation", total=len(levels), now="")
         sure = aside[evidence.scores[kind][aside] >= threshold.value]
-        other = channels(method, data, fold.test[sure if len(sure) else aside], data.site.subcarriers_hz)
-        here, there = ((one.true[:, antenna], one.predicted[:, antenna]) for one in (own, other))
-        rates = adapt(here, there, levels, settings["mcs"], lambda: bar.advance(adapting))
+        own = channels(method, data, rows, tones, one)
+        other = channels(method, data, fold.test[sure if len(sure) else aside], tones, one)
+        rates = adapt(band(own), band(other), levels, settings["mcs"], lambda: bar.advance(adapting))
         facts |= rate_facts(rates, accepted, score) | {"time/mcs_s": time.perf_counter() - started}
-        draw_rates(rates, score, title, run_dir / "mcs.png")
+        draw_rates(rates["expected"], score, title, run_dir / "mcs.png")
         write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
-        shape = settings["pusch"]
         receivers = list(shape["receivers"])
         missing = {"perfect", "lmmse", "predicted"} - set(receivers)
         if missing or set(receivers) - set(RECEIVERS):
             raise ValueError(f"pusch.receivers={receivers}: expected perfect, lmmse and predicted at least")
         wanted = {name: values for name, values in shape["ebno_db"].items() if values}
         sending = bar.add_task("PUSCH", total=sum(map(len, wanted.values())), now="")
-        count, spacing = SUBCARRIERS_PER_BLOCK * shape["blocks"], 1e3 * shape["spacing_khz"]
-        tones = data.site.subcarriers_hz
-        grid = channels(method, data, rows, centred(float(tones.mean()), spacing, count))
         known = frequency_correlation(data.targets(fold.train)[:, antenna], tones, spacing, count)
-        facts["pusch/truth"] = grid.source
-        if "predicted_variance" in receivers and not grid.variance.isfinite().all():
-            log.warning("%s states no error variance: receiver predicted_variance is left out", method.name)
-            receivers.remove("predicted_variance")
+        facts["pusch/truth"], grid = grid.source, grid.of(test)
+        unsaid = [name for name in NEED_VARIANCE if name in receivers]
+        if unsaid and not grid.variance.isfinite().all():
+            log.warning("%s states no error variance: left out are %s", method.name, ", ".join(unsaid))
+            receivers = [name for name in receivers if name not in unsaid]
         drawn, trades = {}, {}
         for modulation, points in wanted.items():
             begun = time.perf_counter()
@@ -138,7 +149,7 @@ def task(config: DictConfig) -> dict[str, Any]:
                 bar.advance(sending)
 
             found = transmit(
-                pusch, grid.true[:, antenna], grid.predicted[:, antenna], grid.variance, points,
+                pusch, grid.true[:, 0], grid.predicted[:, 0], grid.variance, points,
                 (shape["coarse"], shape["fine"], shape["batch"]), tick,
             )  # fmt: skip
             drawn[modulation] = curves(found, accepted)
@@ -148,6 +159,8 @@ def task(config: DictConfig) -> dict[str, Any]:
             for name in ("perfect", "predicted"):
                 for share, rate in zip(SHARES, trades[modulation][name], strict=True):
                     facts[f"tradeoff/{modulation}/{name}/{share:.0%}"] = float(rate)
+            trade = tradeoff(found, score, SHARES)
+            facts |= {f"tradeoff/{modulation}/{name}": value for name, value in trade.items()}
             facts[f"time/pusch_{modulation}_s"] = time.perf_counter() - begun
             facts["pilots/share_of_slot"] = pusch.pilot_share
             facts["pilots/saved"] = pusch.pilot_share * float(accepted.mean())

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+Rule = Literal["target", "expected"]
 SYMBOLS = 12  # of a slot that carry data
-CHUNK = 32
+CHUNK = 256
 OUTAGE = 0.5  # a transport block that fails more often than this carries nothing worth having
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(9)  # of a normal law
+SLOW_DECIBEL = 20 / np.log(10) / np.sqrt(2)  # SINR error [dB] of one flat tone per root of relative error
 
 
 @dataclass(frozen=True)
@@ -21,8 +25,10 @@ class Rates:
         snr_db: median over positions of the mean signal-to-noise ratio [dB].
         oracle, chosen: (n,) MCS from the true and from the predicted channel.
         oracle_bps, chosen_bps: (n,) throughput with the transport blocks that arrive [bit/s].
+        best_bps: (n,) of the MCS that carries most, were the channel known [bit/s].
+        fails: (n,) block error rate of the chosen MCS.
         outage: (n,) bool, the oracle's transport blocks mostly fail.
-        backoff_db: subtracted from predicted signal-to-noise ratios before choosing [dB].
+        care: what the choice allowed for: a backoff [dB], or a share of `SLOW_DECIBEL`.
     """
 
     snr_db: float
@@ -30,16 +36,41 @@ class Rates:
     chosen: np.ndarray
     oracle_bps: np.ndarray
     chosen_bps: np.ndarray
+    best_bps: np.ndarray
+    fails: np.ndarray
     outage: np.ndarray
-    backoff_db: float
+    care: float
+
+
+@dataclass(frozen=True)
+class Band:
+    """What is known of one antenna's band at n positions.
+
+    Attributes:
+        true, predicted: (n, K) complex.
+        variance: (n,) expected squared error per entry; 0 where the method states none.
+    """
+
+    true: Tensor
+    predicted: Tensor
+    variance: Tensor
+
+    @property
+    def expected_power(self) -> Tensor:
+        """E |h|^2 (n, K): a mean that was shrunk by its doubt is no estimate of power."""
+        return self.predicted.abs().square() + self.variance[:, None]
 
 
 class Adaptation:
-    """Sionna's inner loop on effective SINRs (EESM), PUSCH, MCS table 1.
+    """MCS by effective SINR (EESM) and Sionna's block error tables, PUSCH, MCS table 1.
+
+    The oracle takes the highest MCS whose blocks fail in at most `bler_target`. From a prediction, rule
+    `target` does the same after a backoff; rule `expected` takes the MCS that is expected to carry most,
+    the effective SINR being normal in dB with a spread that grows with the expected error.
 
     Args:
         bler_target: of a transport block.
-        subcarriers: allocated (paper: 624); tones are repeated to fill them.
+        subcarriers: allocated (paper: 624); the tones stand for them evenly.
         symbols_per_s: OFDM symbols a second (paper: 28,000).
     """
 
@@ -47,50 +78,81 @@ class Adaptation:
         self, bler_target: float = 0.1, subcarriers: int = 624, symbols_per_s: float = 28_000
     ) -> None:
         from sionna.phy.nr.utils import decode_mcs_index
-        from sionna.sys import InnerLoopLinkAdaptation, PHYAbstraction
+        from sionna.sys import PHYAbstraction
 
         self.abstraction = PHYAbstraction()
-        self.loop = InnerLoopLinkAdaptation(self.abstraction, bler_target=bler_target)
+        self.bler_target = bler_target
         self.subcarriers, self.symbols_per_s = subcarriers, symbols_per_s
         order, rate = decode_mcs_index(torch.arange(28), table_index=1, is_pusch=True)
-        self.efficiency = (order.double() * rate.double()).cpu().numpy()
+        efficiency = (order.double() * rate.double()).cpu()
+        self.full_bps = efficiency * subcarriers * symbols_per_s
 
-    def rates(self, true: Tensor, predicted: Tensor, noise: float, backoff_db: float = 0.0) -> Rates:
-        """Choose on `predicted`, live with `true`: both (n, K) complex, `noise` their noise power."""
-        predicted = predicted * 10 ** (-backoff_db / 20)
-        oracle, chosen, oracle_fails, chosen_fails = [], [], [], []
-        for start in range(0, len(true), CHUNK):
-            there, guess = (self._sinr(h[start : start + CHUNK], noise) for h in (true, predicted))
-            best, own = self._choice(there), self._choice(guess)
-            oracle.append(best)
-            chosen.append(own)
-            oracle_fails.append(self._fails(best, there))
-            chosen_fails.append(self._fails(own, there))
-        right, taken = (torch.cat(x).flatten().cpu().numpy().astype(int) for x in (oracle, chosen))
-        lost_best, lost_own = (
-            torch.cat(x).flatten().cpu().double().numpy() for x in (oracle_fails, chosen_fails)
-        )
-        full = self.efficiency * self.subcarriers * self.symbols_per_s
-        snr = true.abs().square().mean(1) / noise
+    def rates(self, band: Band, noise: float, care: float = 0.0, rule: Rule = "target") -> Rates:
+        """Choose on the prediction, live with the truth; `noise` is the noise power, `care` as in `Rates`."""
+        there = self._effective_db(band.true.abs().square() / noise)
+        guess = self._effective_db(band.expected_power / noise)
+        fails = self._fails(there)
+        oracle = self._highest(fails)
+        if rule == "target":
+            chosen = self._highest(self._fails(guess - care))
+        else:
+            loud = band.expected_power.mean(1).clamp_min(1e-30)
+            spread = care * SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()
+            chosen = self._carries_most(guess, spread)
+        delivered = self.full_bps * (1 - fails.clamp_max(1))
+        snr = band.true.abs().square().mean(1) / noise
+
+        def of(table: Tensor, mcs: Tensor) -> np.ndarray:
+            return table.gather(1, mcs[:, None])[:, 0].double().numpy()
+
         return Rates(
             float(10 * snr.median().log10()),
-            right,
-            taken,
-            full[right] * (1 - lost_best),
-            full[taken] * (1 - lost_own),
-            lost_best > OUTAGE,
-            backoff_db,
+            oracle.numpy(),
+            chosen.numpy(),
+            of(delivered, oracle),
+            of(delivered, chosen),
+            delivered.max(1).values.numpy(),
+            of(fails.clamp_max(1), chosen),
+            of(fails, oracle) > OUTAGE,
+            care,
         )
 
-    def _sinr(self, channel: Tensor, noise: float) -> Tensor:
-        """(n, symbols, subcarriers, 1, 1), linear."""
-        per_tone = channel.abs().square() / noise
-        at = torch.arange(self.subcarriers) * per_tone.shape[1] // self.subcarriers
-        return per_tone[:, None, at, None, None].expand(-1, SYMBOLS, -1, 1, 1).contiguous()
+    def _effective_db(self, sinr: Tensor) -> Tensor:
+        """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""
+        parts = []
+        for some in sinr.split(CHUNK):
+            tones = some[:, None, None, :, None, None].expand(-1, 28, 1, -1, 1, 1)
+            parts.append(self.abstraction(self._every(len(some)), sinr=tones, **self._table)[2][..., 0])
+        return 10 * torch.cat(parts).cpu().log10()
 
-    def _choice(self, sinr: Tensor) -> Tensor:
-        return self.loop(sinr=sinr, mcs_table_index=1, mcs_category=0)
+    def _fails(self, effective_db: Tensor) -> Tensor:
+        """Transport-block error rates (n, 28); infinite where there is no such MCS."""
+        allocated = torch.full((len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32)
+        effective = (10 ** (effective_db / 10))[..., None]
+        told = self.abstraction(
+            self._every(len(effective)), sinr_eff=effective, num_allocated_re=allocated, **self._table
+        )
+        return told[3][..., 0].cpu().double()
 
-    def _fails(self, mcs: Tensor, sinr: Tensor) -> Tensor:
-        """Transport-block error rate (n, 1)."""
-        return self.abstraction(mcs, sinr=sinr, mcs_table_index=1, mcs_category=0)[3]
+    def _highest(self, fails: Tensor) -> Tensor:
+        """The highest MCS (n,) that meets the target; the lowest there is where none does."""
+        number = torch.arange(28)
+        good = torch.where(fails <= self.bler_target, number, -1).max(1).values
+        lowest = torch.where(fails.isfinite(), number, 28).min(1).values
+        return torch.where(good >= 0, good, lowest)
+
+    def _carries_most(self, effective_db: Tensor, spread_db: Tensor) -> Tensor:
+        """The MCS (n,) of the largest expected throughput; of equal ones, as where all fail, the lowest."""
+        mean = torch.zeros(effective_db.shape, dtype=torch.float64)
+        for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
+            mean += weight * self._fails(effective_db + node * spread_db[:, None]).clamp_max(1)
+        carried = self.full_bps * (1 - mean)
+        lowest = torch.where(self._fails(effective_db).isfinite(), torch.arange(28), 28).min(1).values
+        return torch.where(carried.max(1).values > 0, carried.argmax(1), lowest)
+
+    @property
+    def _table(self) -> dict[str, int | bool]:
+        return {"mcs_table_index": 1, "mcs_category": 0, "check_mcs_index_validity": False}
+
+    def _every(self, count: int) -> Tensor:
+        return torch.arange(28, dtype=torch.int32)[None, :, None].expand(count, -1, -1)

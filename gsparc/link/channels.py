@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -15,6 +17,9 @@ from gsparc.link.grid import interpolated
 from gsparc.method import Method, Prediction
 from gsparc.uplink.method import UplinkField
 
+if TYPE_CHECKING:
+    from gsparc.simulate.argos_sim import World
+
 CHUNK = 32
 
 
@@ -25,32 +30,52 @@ class Channels:
     Attributes:
         true: (n, A, K) complex64; of simulated streets exact, else interpolated from measured tones.
         predicted: (n, A, K) complex64.
-        variance: (n,) expected squared error per entry; NaN where the method gives none.
+        variance: (n,) expected squared error per entry of this very band; NaN where the method gives none.
+        confidence: (n,) the method's own; NaN where it has none.
         source: where the truth comes from, for the summary.
     """
 
     true: Tensor
     predicted: Tensor
     variance: Tensor
+    confidence: Tensor
     source: str
 
+    def of(self, index: np.ndarray) -> Channels:
+        """Some of the positions."""
+        at = torch.from_numpy(index)
+        return Channels(
+            self.true[at], self.predicted[at], self.variance[at], self.confidence[at], self.source
+        )
 
-def channels(method: Method, data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Channels:
-    """True and predicted channels of `rows` at absolute frequencies (K,) [Hz]."""
+
+def channels(
+    method: Method,
+    data: Measurements,
+    rows: np.ndarray,
+    frequency_hz: np.ndarray,
+    antennas: slice = slice(None),
+) -> Channels:
+    """True and predicted channels of `rows` at absolute frequencies (K,) [Hz], of some of the antennas."""
     assert data.site.subcarriers_hz is not None
-    predicted, variance = [], []
+    predicted, variance, confidence = [], [], []
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
         if isinstance(method, UplinkField) and batch.uplink is not None:
-            found = method.listen_at(batch.uplink, torch.from_numpy(frequency_hz), batch.noise_variance)
+            wanted = torch.from_numpy(frequency_hz)
+            found = method.listen_at(batch.uplink, wanted, batch.noise_variance, antennas)
         else:
             found = method.answer(batch)
-            mean = interpolated(found.mean, data.site.subcarriers_hz, frequency_hz)
+            mean = interpolated(found.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
             found = Prediction(mean, found.confidence, found.variance)
+        none = torch.full((len(batch),), torch.nan)
         predicted.append(found.mean)
-        variance.append(torch.full((len(batch),), torch.nan) if found.variance is None else found.variance)
+        variance.append(none if found.variance is None else found.variance)
+        confidence.append(none if found.confidence is None else found.confidence)
     true, source = truth(data, rows, frequency_hz)
-    return Channels(true, torch.cat(predicted), torch.cat(variance), source)
+    return Channels(
+        true[:, antennas], torch.cat(predicted), torch.cat(variance), torch.cat(confidence), source
+    )
 
 
 def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
@@ -62,15 +87,19 @@ def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tup
     return interpolated(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
 
 
-def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:
-    """Rays at these frequencies, turned as each snapshot was (phase and timing, found on its uplink)."""
+@lru_cache(maxsize=1)
+def _streets(*facts: int) -> World:
     from gsparc.simulate.argos_sim import world
 
+    return world(*facts)
+
+
+def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:
+    """Rays at these frequencies, turned as each snapshot was (phase and timing, found on its uplink)."""
     site, uplink = data.site, data.uplink
     assert uplink is not None and site.uplink_hz is not None and site.antennas is not None
     assert site.carrier_hz is not None
-    told = (int(data.provenance[name]) for name in FACTS if name in data.provenance)
-    there = world(*told)
+    there = _streets(*(int(data.provenance[name]) for name in FACTS if name in data.provenance))
     heard = uplink[rows].astype(np.complex128) * site.target_scale
     clean = there.response(site.uplink_hz, rows)
     coarse = estimate(heard, clean, site.uplink_hz, site.carrier_hz, timing=True)

@@ -19,12 +19,24 @@ STYLES = {
     "lmmse@accepted": ("LMMSE pilots, accepted", "tab:green", "-"),
     "predicted@accepted": ("predicted, accepted", "tab:blue", "-"),
     "predicted_variance@accepted": ("predicted with its variance, accepted", "tab:purple", "-"),
+    "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", "tab:brown", "-"),
     "perfect": ("perfect, all", "black", ":"),
     "lmmse": ("LMMSE pilots, all", "tab:green", ":"),
     "predicted": ("predicted, all", "tab:red", ":"),
+    "predicted_pilots": ("prediction corrected by pilots, all", "tab:brown", ":"),
     "fallback": ("predicted, else LMMSE pilots, all", "tab:orange", "--"),
 }
-SHORT = {"perfect": "k-o", "lmmse": "g-o", "predicted": "b-o", "predicted_variance": "m--o"}
+SHORT = {
+    "perfect": "k-o",
+    "lmmse": "g-o",
+    "predicted": "b-o",
+    "predicted_variance": "m--o",
+    "predicted_pilots": "C5-o",
+}
+NAMES = {
+    "predicted_variance": "predicted with its variance",
+    "predicted_pilots": "prediction corrected by pilots",
+}
 LEAST_RATE = 3e-4
 
 
@@ -64,6 +76,7 @@ def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) ->
     left, right = figure.subplots(1, 2)
     snr = [one.snr_db for one in found]
     left.plot(snr, [one.oracle_bps.mean() / 1e6 for one in found], "k-o", label="from the true channel")
+    left.plot(snr, [one.best_bps.mean() / 1e6 for one in found], "k:", label="the most there is")
     left.plot(snr, [one.chosen_bps.mean() / 1e6 for one in found], "b--o", label="from the predicted one")
     left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
     left.legend()
@@ -89,7 +102,7 @@ def draw_acceptance(
     for axis, (modulation, trade) in zip(axes, found.items(), strict=True):
         for name, rates in trade.items():
             if name in SHORT:
-                axis.plot(trade["share"], rates, SHORT[name], label=name.replace("_", " with its "))
+                axis.plot(trade["share"], rates, SHORT[name], label=NAMES.get(name, name))
         axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {float(trade['ebno_db']):g} dB")

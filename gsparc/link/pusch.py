@@ -1,4 +1,4 @@
-"""5G NR PUSCH with five kinds of channel knowledge, every block the same for all of them."""
+"""5G NR PUSCH with six kinds of channel knowledge, every block the same for all of them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+Prior = Callable[[], tuple[Tensor, Tensor] | None]
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-RECEIVERS = ("perfect", "ls", "lmmse", "predicted", "predicted_variance")
+RECEIVERS = ("perfect", "ls", "lmmse", "predicted", "predicted_variance", "predicted_pilots")
+LEAST_DOUBT = 1e-6  # of a channel's power: pilots are never told that there is nothing to learn
 MODULATIONS = {"qpsk": 5, "qam16": 14}  # MCS of table 1: rates 0.37 and 0.54
 
 
@@ -71,6 +73,7 @@ class Pusch:
         self.grid = self.transmitter.resource_grid
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
+        self._prior: tuple[Tensor, Tensor] | None = None
         ls = PUSCHLSChannelEstimator(
             self.grid,
             config.dmrs.length,
@@ -81,6 +84,7 @@ class Pusch:
         estimators: dict[str, Estimator] = {
             "ls": ls,
             "lmmse": _Wiener(self.grid, correlation),
+            "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
             **{name: self._told(name) for name in ("perfect", "predicted", "predicted_variance")},
         }
         decoder = TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
@@ -129,6 +133,7 @@ class Pusch:
             self._known = {
                 "perfect": (there, sure), "predicted": (guess, sure), "predicted_variance": (guess, doubt)
             }  # fmt: skip
+            self._prior = predicted[at] / scale, variance[at] / scale[:, 0] ** 2
             sent, bits = self.transmitter(len(at))
             received = apply(sent, there, no)
             for name, receiver in self.receivers.items():
@@ -149,9 +154,14 @@ class Pusch:
 
 
 class _Wiener:
-    """LMMSE interpolation of one layer's DMRS over frequency; symbols of a slot are averaged."""
+    """LMMSE interpolation of one layer's DMRS over frequency; symbols of a slot are averaged.
 
-    def __init__(self, grid, correlation: np.ndarray) -> None:
+    With a `prior`, means (n, K) and variances (n,) of the channels, pilots correct the prediction: what they
+    tell of its error is spread over frequency as channels are correlated. Without, the mean is 0 and the
+    variance 1.
+    """
+
+    def __init__(self, grid, correlation: np.ndarray, prior: Prior | None = None) -> None:
         pattern = grid.pilot_pattern
         mask = pattern.mask[0, 0].bool().cpu()
         full = torch.zeros(mask.shape, dtype=torch.complex64)
@@ -162,20 +172,29 @@ class _Wiener:
         lag = np.arange(mask.shape[1])[:, None] - np.arange(mask.shape[1])
         whole = np.where(lag >= 0, correlation[np.abs(lag)], correlation[np.abs(lag)].conj())
         self.whole = torch.from_numpy(whole).to(torch.complex128)
+        self.prior = prior
 
     def __call__(self, y: Tensor, no: Tensor) -> tuple[Tensor, Tensor]:
         heard = y[:, 0, 0][:, self.symbols][:, :, self.comb]
         energy = self.pilots.abs().square().sum(0)
         matched = (heard * self.pilots.conj()).sum(1) / energy
         noise = float(torch.as_tensor(no).flatten()[0]) / energy.double()
-        known = self.whole[self.comb][:, self.comb] + torch.diag(noise).to(self.whole.dtype)
+        told = None if self.prior is None else self.prior()
+        mean, variance = (torch.zeros(1, self.whole.shape[0]), torch.ones(1)) if told is None else told
+        variance = variance.double().clamp_min(LEAST_DOUBT)[:, None]
+        # In units of the prior variance: R_c (R_cc + N / v)^-1, a matrix for each position with its own.
+        known = self.whole[self.comb][:, self.comb] + torch.diag_embed(
+            (noise / variance).to(self.whole.dtype)
+        )
         cross = self.whole[:, self.comb]
-        filtering = torch.linalg.solve(known.T, cross.T).T
-        smooth = (matched.to(filtering.dtype) @ filtering.T).to(torch.complex64)
-        left = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(1).real).clamp_min(0).float()
+        filtering = torch.linalg.solve(known.mT, cross.T.expand(len(known), -1, -1)).mT
+        news = (matched - mean[:, self.comb]).to(filtering.dtype)
+        smooth = mean + (filtering @ news[..., None])[..., 0].to(torch.complex64)
+        left = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(-1).real).clamp_min(0)
         shape = (len(y), 1, 1, 1, 1, y.shape[3], y.shape[4])
+        spread = (variance * left).float().view(-1, 1, 1, 1, 1, 1, self.whole.shape[0])
         estimate = smooth.view(len(y), 1, 1, 1, 1, 1, -1).expand(shape).contiguous()
-        return estimate, left.view(1, 1, 1, 1, 1, 1, -1).expand(shape).contiguous()
+        return estimate, spread.expand(shape).contiguous()
 
 
 def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: float, count: int) -> np.ndarray:

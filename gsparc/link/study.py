@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gsparc.link.adaptation import Adaptation, Rates
+from gsparc.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.link.beams import gain, loss_db
 from gsparc.link.pusch import Blocks, Pusch
 from gsparc.link.statistics import crossing, interval
@@ -48,60 +48,80 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
 
 
 def adapt(
-    channels: tuple[Tensor, Tensor],
-    aside: tuple[Tensor, Tensor],
+    band: Band,
+    aside: Band,
     snr_db: list[float],
     settings: Mapping[str, Any],
     tick: Callable[[], None],
-) -> list[Rates]:
-    """Rates at noise levels that put the median position at `snr_db`.
+) -> dict[Rule, list[Rates]]:
+    """Rates of both rules at noise levels that put the median position at `snr_db`.
 
     Args:
-        channels: true and predicted, (n, K) each.
-        aside: the same of other positions, on which the backoff is chosen.
+        band: of the positions to be judged.
+        aside: of others, on which a rule's care is chosen.
         snr_db, settings: see conf/link.yaml.
         tick: called after each level.
     """
-    true, predicted = channels
     loop = Adaptation(
         float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
     )
-    median = float(true.abs().square().mean(1).median())
-    found = []
+    median = float(band.true.abs().square().mean(1).median())
+    cares: dict[Rule, list[float]] = {"expected": settings["care"], "target": settings["backoff_db"]}
+    found: dict[Rule, list[Rates]] = {rule: [] for rule in cares}
     for level in snr_db:
         noise = median / 10 ** (level / 10)
-        tried = {b: loop.rates(*aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
-        found.append(loop.rates(true, predicted, noise, max(tried, key=lambda b: tried[b])))
+        for rule, tried in cares.items():
+            carried = {care: loop.rates(aside, noise, care, rule).chosen_bps.mean() for care in tried}
+            best = max(carried, key=lambda care: carried[care])
+            found[rule].append(loop.rates(band, noise, best, rule))
         tick()
     return found
 
 
-def rate_facts(found: list[Rates], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
-    """`mcs/<snr>dB/*`: throughput against the oracle, misses, outage; of all and of accepted positions."""
+def rate_facts(found: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+    """`mcs/<snr>dB/*` of rule `expected`, `mcs/<snr>dB/target/*` of the other: throughput against the oracle.
+
+    `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that carries
+    most; of all positions, of accepted ones, and of all where the others send pilots.
+    """
     facts: dict[str, Any] = {}
-    for one in found:
-        room = f"mcs/{one.snr_db:.0f}dB"
-        miss = np.abs(one.chosen - one.oracle)
-        # Whoever is not accepted sends pilots, and chooses as the oracle does.
-        together = np.where(accepted, one.chosen_bps, one.oracle_bps)
+    for rule, ones in found.items():
+        for one in ones:
+            level = f"mcs/{one.snr_db:.0f}dB"
+            facts |= _rates_of(one, level if rule == "expected" else f"{level}/{rule}", accepted, score)
+    return facts
+
+
+def _rates_of(one: Rates, room: str, accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+    miss = np.abs(one.chosen - one.oracle)
+    # Whoever is not accepted sends pilots, and chooses as the oracle does.
+    together = np.where(accepted, one.chosen_bps, one.oracle_bps)
+    facts: dict[str, Any] = {
+        f"{room}/oracle_mbps": one.oracle_bps.mean() / 1e6,
+        f"{room}/best_mbps": one.best_bps.mean() / 1e6,
+        f"{room}/chosen_mbps": one.chosen_bps.mean() / 1e6,
+        f"{room}/shortfall": 1 - one.chosen_bps.mean() / one.oracle_bps.mean(),
+        f"{room}/shortfall_best": 1 - one.chosen_bps.mean() / one.best_bps.mean(),
+        f"{room}/shortfall_with_fallback": 1 - together.mean() / one.oracle_bps.mean(),
+        f"{room}/exact": float((miss == 0).mean()),
+        f"{room}/off_by_more_than_2": float((miss > 2).mean()),
+        f"{room}/tbler": float(one.fails.mean()),
+        f"{room}/outage": float(one.outage.mean()),
+        f"{room}/care": one.care,
+    }
+    for share in (0.5, 0.7, 0.9):
+        surest = score >= np.quantile(score, 1 - share)
+        short = 1 - one.chosen_bps[surest].mean() / one.oracle_bps[surest].mean()
+        facts[f"{room}/shortfall_surest_{share:.0%}"] = short
+    if accepted.any():
+        oracle, best = one.oracle_bps[accepted].mean(), one.best_bps[accepted].mean()
+        taken = one.chosen_bps[accepted].mean()
         facts |= {
-            f"{room}/oracle_mbps": one.oracle_bps.mean() / 1e6,
-            f"{room}/chosen_mbps": one.chosen_bps.mean() / 1e6,
-            f"{room}/shortfall": 1 - one.chosen_bps.mean() / one.oracle_bps.mean(),
-            f"{room}/shortfall_with_fallback": 1 - together.mean() / one.oracle_bps.mean(),
-            f"{room}/exact": float((miss == 0).mean()),
-            f"{room}/off_by_more_than_2": float((miss > 2).mean()),
-            f"{room}/outage": float(one.outage.mean()),
-            f"{room}/backoff_db": one.backoff_db,
+            f"{room}/shortfall_accepted": 1 - taken / oracle,
+            f"{room}/shortfall_best_accepted": 1 - taken / best,
+            f"{room}/tbler_accepted": float(one.fails[accepted].mean()),
+            f"{room}/off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
         }
-        for share in (0.5, 0.7, 0.9):
-            surest = score >= np.quantile(score, 1 - share)
-            short = 1 - one.chosen_bps[surest].mean() / one.oracle_bps[surest].mean()
-            facts[f"{room}/shortfall_surest_{share:.0%}"] = short
-        if accepted.any():
-            taken = one.chosen_bps[accepted].mean() / one.oracle_bps[accepted].mean()
-            facts[f"{room}/shortfall_accepted"] = 1 - taken
-            facts[f"{room}/off_by_more_than_2_accepted"] = float((miss[accepted] > 2).mean())
     return facts
 
 
@@ -218,3 +238,19 @@ def acceptance(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> di
         for name in curves:
             curves[name][i] = at.failed[name][taken].mean()
     return {"share": shares, "ebno_db": np.array(at.ebno_db), **curves}
+
+
+def tradeoff(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> dict[str, Any]:
+    """`<share>/behind_db`: dB behind perfect knowledge at 10 % failed blocks, on the surest shares."""
+    facts: dict[str, Any] = {}
+    levels = np.array([b.ebno_db for b in found])
+    for share in shares:
+        taken = [score[b.position] >= np.quantile(score, 1 - share) for b in found]
+
+        def at(name: str, taken: list[np.ndarray] = taken) -> float | None:
+            rates = [b.failed[name][t].mean() for b, t in zip(found, taken, strict=True)]
+            return crossing(levels, np.array(rates))
+
+        own, perfect = at("predicted"), at("perfect")
+        facts[f"{share:.0%}/behind_db"] = None if own is None or perfect is None else own - perfect
+    return facts

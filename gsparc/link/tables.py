@@ -16,7 +16,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {facts['confidence/kind']}"
     )
     rates = Table(title=f"{title}: throughput, {accepted}")
-    for column in ("median SNR dB", "oracle Mbit/s", "chosen", "short", "short, accepted", "outage"):
+    for column in ("median SNR dB", "oracle Mbit/s", "chosen", "short", "short, accepted", "TBLER", "outage"):
         rates.add_column(column, justify="right")
     for level in levels:
         room = f"mcs/{level:.0f}dB"
@@ -26,6 +26,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
             f"{facts[f'{room}/chosen_mbps']:.1f}",
             f"{facts[f'{room}/shortfall']:.1%}",
             _shown(facts.get(f"{room}/shortfall_accepted"), ".1%"),
+            f"{facts[f'{room}/tbler']:.1%}",
             f"{facts[f'{room}/outage']:.1%}",
         )
     found = [rates]

@@ -115,17 +115,35 @@ def test_export_on_any_grid(trained) -> None:
 @needs_sionna
 @pytest.mark.slow
 def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
-    from gsparc.link.adaptation import Adaptation
+    from gsparc.link.adaptation import Adaptation, Band
 
     generator = torch.Generator().manual_seed(0)
     true = torch.randn(40, 26, dtype=torch.complex64, generator=generator)
+    known = Band(true, true, torch.zeros(40))
     loop = Adaptation()
-    found = loop.rates(true, true, 0.03)
+    found = loop.rates(known, 0.03)
     assert np.array_equal(found.oracle, found.chosen) and found.oracle_bps.mean() > 5e6
-    careful = loop.rates(true, true, 0.03, backoff_db=3.0)
+    assert np.allclose(loop.rates(known, 0.03, 1.0, "expected").chosen_bps, found.best_bps)
+    assert (found.best_bps >= found.oracle_bps).all()
+    careful = loop.rates(known, 0.03, 3.0)
     assert (careful.chosen <= found.oracle).all() and (careful.chosen < found.oracle).mean() > 0.5
-    deaf = loop.rates(true, true, 1e4)
+    deaf = loop.rates(known, 1e4)
     assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
+    from gsparc.link.adaptation import Adaptation, Band
+
+    generator = torch.Generator().manual_seed(0)
+    true = torch.randn(200, 1, dtype=torch.complex64, generator=generator).expand(200, 26)
+    error = torch.randn(200, 1, dtype=torch.complex64, generator=generator).expand(200, 26) * 0.2
+    band = Band(true, true + error, torch.full((200,), 0.04))
+    loop = Adaptation()
+    bold, careful = (loop.rates(band, 0.01, care, "expected") for care in (0.0, 1.0))
+    assert careful.chosen.mean() < bold.chosen.mean()
+    assert bold.chosen_bps.mean() < careful.chosen_bps.mean() < careful.best_bps.mean()
 
 
 @needs_sionna
@@ -151,6 +169,31 @@ def test_pusch_knows_who_knows_more() -> None:
 
 @needs_sionna
 @pytest.mark.slow
+def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
+    from gsparc.link.pusch import Pusch, frequency_correlation
+
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    true, error = torch.randn(2, 16, 1, dtype=torch.complex64, generator=generator).expand(2, 16, 48)
+    share = 0.2
+    guess, doubt = true + share**0.5 * true.abs() * error, share * true[:, 0].abs().square()
+    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
+    pusch = Pusch("qpsk", 4, 30, known, 8, ["perfect", "lmmse", "predicted", "predicted_pilots"])
+    found = pusch.run(true.contiguous(), guess, doubt, 3.0, np.arange(256) % 16, 64)
+    wrong = {name: failed.mean() for name, failed in found.failed.items()}
+    assert wrong["predicted_pilots"] < wrong["predicted"] - 0.05
+    assert wrong["perfect"] - 0.02 <= wrong["predicted_pilots"] <= wrong["lmmse"] + 0.02
+    # Without any doubt the pilots are not listened to, with all of it the prediction is not.
+    sure, deaf = (pusch.receivers[name]._channel_estimator for name in ("predicted_pilots", "lmmse"))
+    y = torch.randn(4, 1, 1, 14, 48, dtype=torch.complex64, generator=generator)
+    pusch._prior = guess[:4], torch.zeros(4)
+    assert torch.allclose(sure(y, torch.tensor(0.1))[0][:, 0, 0, 0, 0, 0], guess[:4], atol=1e-2)
+    pusch._prior = torch.zeros(4, 48), torch.ones(4)
+    assert torch.allclose(sure(y, torch.tensor(0.1))[0], deaf(y, torch.tensor(0.1))[0], atol=1e-5)
+
+
+@needs_sionna
+@pytest.mark.slow
 def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     from hydra.core.hydra_config import HydraConfig
 
@@ -162,6 +205,7 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     config = compose(
         f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
         "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",
+        "mcs.care=[1.0]",
         "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
         config="link",
     )  # fmt: skip
