@@ -13,19 +13,18 @@ from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gsparc.comparison.table import Row
+from gsparc.comparison.table import SCORE, Row
 
 LEAST_S = 1e-3  # faster fits are drawn here
 MARKS = "osD^vP*X<>ph"
-LABEL = {"psnr_db": "PSNR [dB]", "nmse": "-10 log10 NMSE [dB]", "rmse_db": "-RMSE [dB]"}
 
 
 def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
     """A line of panels per dataset and split; a method keeps its colour, a line joins its budgets."""
     rooms = list(dict.fromkeys((r.dataset, r.split) for r in rows))
     names = list(dict.fromkeys(r.method for r in rows))
-    palette = matplotlib.colormaps["tab10"]
-    looks = {name: (palette(i % 10), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
+    palette = matplotlib.colormaps["tab20"]
+    looks = {name: (palette((2 * i + i // 10) % 20), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
     figure = Figure(figsize=(11, 3.4 * len(rooms) + 0.6), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.subplots(len(rooms), 2, squeeze=False, sharey="row")
@@ -45,7 +44,7 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
                         label=name,
                         **style,
                     )
-        line[0].set_ylabel(LABEL[here[0].figure])
+        line[0].set_ylabel(SCORE[here[0].figure])
         line[0].set_title(f"{dataset}, split {split}", loc="left", fontsize=10)
         line[0].set_xlabel("training of one model, processor time [s]")
         line[1].set_xlabel("one query, median [ms]")

@@ -17,6 +17,7 @@ from gsparc.summary import BUSY
 
 FIGURE = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}  # the one that places are given by
 SECOND = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
+SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
 SIMPLE = ("zero", "mean", "nearest", "idw", "gp", "kriging", "complex_gp")
 CLOSE_DB = 0.5
 
@@ -186,12 +187,14 @@ def markdown(
 
 def _page(block: Block, ours: str) -> str:
     some = block.rows[0]
-    head = ["method", f"{some.figure}", "score dB", some.second, "seeds", "train s", "cpu s",
-            "query ms p50", "p95", "x copy"]  # fmt: skip
+    plain = some.figure == "psnr_db"  # is its own score
+    head = ["method", SCORE[some.figure], *([] if plain else [some.figure]), some.second, "seeds",
+            "train s", "cpu s", "query ms p50", "p95", "x copy"]  # fmt: skip
     lines = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
     for row in block.rows:
         near = "" if row.spread_db is None else f" ± {row.spread_db:.2f}"
-        cells = [row.method, f"{row.value:.4g}", f"{row.score_db:.2f}{near}", _shown(row.second_value, ".4g"),
+        raw = [] if plain else [f"{row.value:.4g}"]
+        cells = [row.method, f"{row.score_db:.2f}{near}", *raw, _shown(row.second_value, ".4g"),
                  str(row.seeds), f"{row.train_s:.3g}", f"{row.train_cpu_s:.3g}", _shown(row.query_ms, ".3g"),
                  _shown(row.query_p95_ms, ".3g"), _shown(row.to_copy, ".2g")]  # fmt: skip
         bold = row.method == ours

@@ -74,7 +74,8 @@ class Mean(View):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; Matern-3/2 as in `gsparc.peers.gp.Kernel`, in float32."""
         where = tx if self._end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
-        far = torch.cdist((where - self._middle) * self._scale, self._places)
+        query = (where - self._middle) * self._scale
+        far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower
         scores = ((1 + far) * torch.exp(-far)) @ self._weights
         return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
 

@@ -91,7 +91,7 @@ class Mean(View):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; Matern-3/2 as in `gsparc.peers.gp.Kernel`."""
         where = rx.position.reshape(-1, 3).expand(len(tx), 3)
-        far = torch.cdist(where - self._middle, self._places)
+        far = torch.linalg.vector_norm((where - self._middle)[:, None] - self._places, dim=-1)
         power = torch.addmm(self._level, _matern(far * self._smooth), self._trend)
         atoms = self._space.atoms(bearings(self._sources, where, self._rotation))
         image = self._space.spectrum(mixed(power, atoms))

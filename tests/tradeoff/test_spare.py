@@ -201,7 +201,7 @@ def test_what_a_hybrid_adds_stays_unless_it_is_spared(field):
     method = copy.copy(field.methods[0])
     measured = spare.measure(method, data, fold.train)
     assert "hybrid" not in spare.knobs(method)
-    method._rest = SimpleNamespace(at=lambda places: 1.0)
+    method._rest = SimpleNamespace(completed=lambda mean, tx, rx: mean + 1.0)
     assert "hybrid" in spare.knobs(method)
     plain, added = (
         answer(spare.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
