@@ -128,17 +128,16 @@ def plan(
     """
     able = {(d, s): [m for m in methods.values() if m.serves(kind)] for d, s, kind in rooms}
     cells = [Cell(*room, m.name, None, None) for room, those in able.items() for m in those if not m.budget]
+    longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
     for turn in range(turns):  # first seeds of all budgets before second ones
         for budget in (b for b in budgets if turn < len(b.seeds)):
             for room, those in able.items():
-                here = [b for b in budgets if b.given(room[1])]
-                longest = max((b.seconds for b in here), default=0.0)
                 cells += [
                     Cell(*room, m.name, budget.seconds, budget.seeds[turn])
                     for m in those
                     if m.budget
-                    and budget in here
+                    and budget.given(room[1])
                     and not (m.only_longest and (turn > 0 or budget.seconds < longest))
                 ]
     for pattern in only:
