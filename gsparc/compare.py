@@ -104,6 +104,7 @@ def fill_all(
             expected = _expected_s(one.cell, rooms)
             if limit_s is not None and time.monotonic() - started + expected > limit_s:
                 log.warning("max_hours: %s is not started", one.cell)
+                filled += _earlier(one, rooms)
                 continue
             log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
             left -= expected
@@ -118,9 +119,14 @@ def fill_all(
                 else "-"
             )
             log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
-        if found is not None:
-            filled.append(found)
+        filled += [found] if found is not None else _earlier(one, rooms)
     return filled
+
+
+def _earlier(one: Prepared, rooms: Mapping[tuple[str, str], Room]) -> list[Filled]:
+    """What was measured with earlier program text, where nothing newer is there."""
+    found = one.found_earlier(rooms[one.cell.dataset, one.cell.split])
+    return [] if found is None else [found]
 
 
 def _expected_s(cell: Cell, rooms: Mapping[tuple[str, str], Room]) -> float:

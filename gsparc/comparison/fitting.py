@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ from gsparc.trainer import Training
 log = logging.getLogger(__name__)
 
 RESULT = "cell.json"
+EARLIER = "measured at commit"  # among the facts of a result of earlier program text
 
 
 @dataclass(frozen=True)
@@ -81,6 +83,11 @@ class Filled:
     folder: Path
     facts: dict[str, Any]
 
+    @property
+    def earlier(self) -> str | None:
+        """Commit of an earlier program text that it was measured with; None for this one's."""
+        return self.facts.get(EARLIER)
+
     def scored(self) -> bool:
         """Whether it was tested, not only timed."""
         return any(name.startswith("test/") for name in self.facts)
@@ -107,6 +114,24 @@ class Prepared:
         except (OSError, json.JSONDecodeError):
             return None
         return Filled(self.cell, self.folder, facts)
+
+    def found_earlier(self, room: Room) -> Filled | None:
+        """The latest result of other program text or settings for this cell, the same data and split.
+
+        Published results outlive the code they were measured with; a table must say so, not lose them.
+        """
+        stem = self.folder.name.rpartition("-")[0]
+        same = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
+        same |= {"dataset/sha256": room.data.site.sha256, "split/sha256": room.folds.sha256}
+        found = []
+        for file in self.folder.parent.glob(f"{stem}-*/{RESULT}"):
+            facts = json.loads(file.read_text(encoding="utf-8"))
+            if all(facts.get(name) == value for name, value in same.items()):
+                found.append((str(facts.get("made")), file.parent, facts))
+        if not found:
+            return None
+        _, folder, facts = max(found, key=lambda entry: entry[0])
+        return Filled(self.cell, folder, {**facts, EARLIER: str(facts.get("git"))[:8]})
 
 
 def prepare(cell: Cell, contender: Contender, settings: dict[str, Any], room: Room, kept: Path) -> Prepared:
@@ -160,6 +185,7 @@ def fill(prepared: Prepared, room: Room) -> Filled:
         "model/notes": "; ".join(notes),
         "seed": prepared.cell.seed,
         "budget_s": prepared.cell.budget_s,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     facts |= dataset_facts(room.data) | split_facts(room.folds) | machine_facts() | provenance()
     write_summary(folder / RESULT, facts)  # last: a cell without it does not count

@@ -40,6 +40,7 @@ class Row:
         query_p95_ms: 95th percentile [ms].
         to_copy: the median in units of a 16 MiB copy of the same rounds.
         load: 1-minute load per core at the end of the training, mean over seeds.
+        earlier: commits of earlier program text that it was measured with; empty for today's.
     """
 
     dataset: str
@@ -59,6 +60,7 @@ class Row:
     query_p95_ms: float | None
     to_copy: float | None
     load: float | None
+    earlier: str = ""
 
 
 def score_db(kind: str, facts: Mapping[str, Any]) -> float:
@@ -104,6 +106,7 @@ def _row(same: list[Filled], latency: Latency | None) -> Row:
         train_s=mean("time/train_s") or 0.0, train_cpu_s=mean("time/train_cpu_s") or 0.0,
         query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
         to_copy=latency.to_copy if latency else None, load=mean("machine/load"),
+        earlier=" ".join(sorted({one.earlier for one in same if one.earlier})),
     )  # fmt: skip
 
 
@@ -160,6 +163,12 @@ def remarks(block: Block, ours: str) -> list[str]:
         quick = min(close, key=lambda r: r.query_ms or np.inf)
         said.append(
             f"fastest within {CLOSE_DB} dB of the first: {quick.method}, {quick.query_ms:.3g} ms a query"
+        )
+    old = {r.method: r.earlier for r in block.rows if r.earlier}
+    if old:
+        said.append(
+            "measured before the program or its settings were last changed (at commit): "
+            + ", ".join(f"{method} ({commits})" for method, commits in old.items())
         )
     loads = [r.load for r in block.rows if r.load is not None and r.budget_s is not None]
     if loads and max(loads) > BUSY:

@@ -151,12 +151,13 @@ def _facts(
     points: list[Point], best: list[Point], figure: str, rivals: dict[str, Rival], copy_ms: float
 ) -> dict[str, Any]:
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
-    scores = [score_of(figure, p.value(figure)) for p in best]
+    useful = [p for p in best if beaten_by(p, rivals, figure) is None]  # a slope of points nobody should take
+    halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
         "tradeoff/span": best[-1].p50 / best[0].p50,
-        "tradeoff/per_halving": cost_of_halving([p.p50 for p in best], scores),
+        "tradeoff/per_halving": halving,
         "tradeoff/figure": figure,
         "tradeoff/front_beaten_by_others": sum(beaten_by(p, rivals, figure) is not None for p in best),
         "time/copy_ms": copy_ms,
@@ -186,9 +187,11 @@ def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run
     console.print(table)
     slope = facts["tradeoff/per_halving"]
     if slope is not None:
+        beaten = facts["tradeoff/front_beaten_by_others"]
+        rest = f" ({len(best) - beaten} that no baseline beats)" if beaten else ""
         console.print(
             f"{len(best)} points span {facts['tradeoff/span']:.1f} times in latency; each halving costs "
-            f"{slope:.2g} dB on average along the front",
+            f"{slope:.2g} dB on average along the front{rest}",
             highlight=False,
         )
     console.print(f"written to {run_dir}", highlight=False)

@@ -6,13 +6,14 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from campaigns import spectra
 
 from gsparc.compare import _timed
 from gsparc.comparison.cells import Cell
-from gsparc.comparison.fitting import Filled
+from gsparc.comparison.fitting import Filled, Prepared
 
 ROOT = Path(__file__).parents[2]
 
@@ -34,6 +35,29 @@ def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
     assert _timed(cells, {}, tmp_path, measure=True)["toy"]["gp"].p50_ms == 1.5
     assert "models of gp are not here" in caplog.text
     assert _timed(cells, {}, tmp_path / "none", measure=True) == {"toy": {}}
+
+
+def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
+    """Published cells would vanish from the table with every edit of a method."""
+    cell = Cell("toy", "random", "gp", None, None)
+    prepared = Prepared(cell, None, tmp_path / "toy-random-gp-today")
+    room = SimpleNamespace(
+        data=SimpleNamespace(site=SimpleNamespace(sha256="d")), folds=SimpleNamespace(sha256="s")
+    )
+    facts = {"seed": None, "budget_s": None, "dataset/sha256": "d", "split/sha256": "s", "git": "0123456789"}
+
+    def write(name: str, **changes: str) -> None:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
+
+    write("toy-random-gp-other", **{"dataset/sha256": "e"})
+    assert prepared.found() is None and prepared.found_earlier(room) is None
+    write("toy-random-gp-old", made="2026-01-01")
+    write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
+    found = prepared.found_earlier(room)
+    assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
+    write("toy-random-gp-today")
+    assert prepared.found().earlier is None
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import pytest
 
 from gsparc.comparison.cells import Cell
 from gsparc.comparison.figure import draw
-from gsparc.comparison.fitting import Filled
+from gsparc.comparison.fitting import EARLIER, Filled
 from gsparc.comparison.latency import Latency
 from gsparc.comparison.table import blocks, markdown, remarks, rows, score_db, write_csv
 
@@ -52,6 +52,14 @@ def test_losers_are_not_hidden():
     said = " | ".join(remarks(blocks(rows(far, {}))[0], "gsparc"))
     assert "2.00 dB behind gp" in said and "spread" not in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
+
+
+def test_what_an_earlier_program_measured_is_said():
+    old = filled("gsrf", 29.0, 0, 60.0)
+    old = Filled(old.cell, None, {**old.facts, EARLIER: "0123abcd"})
+    found = blocks(rows([*FOUND[:1], old], {}))[0]
+    assert found.rows[1].earlier == "0123abcd" and not found.rows[0].earlier
+    assert "last changed (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
 
 
 def test_scores_are_decibels_of_which_more_are_better():
