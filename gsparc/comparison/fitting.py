@@ -121,7 +121,7 @@ class Prepared:
         Published results outlive the code they were measured with; a table must say so, not lose them.
         """
         stem = self.folder.name.rpartition("-")[0]
-        same = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
+        same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
         same |= {"dataset/sha256": room.data.site.sha256, "split/sha256": room.folds.sha256}
         found = []
         for file in self.folder.parent.glob(f"{stem}-*/{RESULT}"):
