@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc import checkpoint
+from gsparc.calibration.stored import Trusted, kept
 from gsparc.data.schema import Kind, Site
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
@@ -33,11 +34,20 @@ class Predictor:
         site: the dataset's fixed facts.
         whole: asked for the confidence, where `method` spares it; None asks `method`.
         point: the operating point `method` answers at, if one was chosen.
+        trusted: which confidence is answered, and from when on a prediction is accepted.
+        kind: of the confidence; None: as `trusted` says.
     """
 
     def __init__(
-        self, method: Method, site: Site, whole: Method | None = None, point: Operating | None = None
+        self,
+        method: Method,
+        site: Site,
+        whole: Method | None = None,
+        point: Operating | None = None,
+        trusted: Trusted | None = None,
+        kind: str | None = None,
     ) -> None:
+        self.trusted, self.kind = trusted or Trusted(None, float("inf"), None, np.zeros((0, 3)), None), kind
         self.method, self.site, self.point = method, site, point
         self._whole = whole or method
         self._still = self._still_pose()
@@ -88,26 +98,69 @@ class Predictor:
         found = export.on_grid(asked, self.site, frequency_hz, symbols)
         return found if any(isinstance(end, Tensor) for end in (tx, rx)) else found.numpy()
 
-    def paths(self, uplink: Any) -> Paths:
-        """Gains, delays and directions of what a fresh uplink (B, U, L) holds; see `gsparc.link.export`."""
+    def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
+        """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
+        positions; see `gsparc.link.export`.
+
+        Raises:
+            ValueError: the model's channels are not made of paths.
+        """
         from gsparc.link import export
 
-        return export.paths(self.method, self.site, uplink)
+        if uplink is not None:
+            return export.heard_paths(self.method, self.site, uplink)
+        asked, pose, _, _ = self._ends(tx, rx)
+        return export.placed_paths(self._whole, self.site, asked, pose)
 
     def rssi(self, tx: Any = None, rx: Any = None) -> Any:
         """Received power (B, 1) float32, linear, in the physical units of the measurements."""
         return self._ask("rssi", tx, rx)
 
-    def confidence(self, tx: Any = None, rx: Any = None) -> Any:
+    def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """How sure the model is, (B,) float32 in [0, 1], larger is surer.
 
+        Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
+        `python -m gsparc.calibration` found best, else the model's own.
+
         Raises:
-            ValueError: the method has no confidence.
+            ValueError: the method has no confidence of that kind.
         """
-        prediction, single, like = self._predict(tx, rx, self._whole)
-        if prediction.confidence is None:
+        sure, single, like = self._sure(tx, rx, uplink)
+        return _returned(sure, single, like)
+
+    def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
+        """Whether predictions (B,) bool are as good as promised: see `Predictor.trusted.promise`.
+
+        Raises:
+            ValueError: the model was never calibrated, or for another kind of confidence.
+        """
+        if self.trusted.promise is None:
+            raise ValueError("accepts: no threshold is stored; run python -m gsparc.calibration ckpt=FILE")
+        if self.kind not in (None, self.trusted.kind):
+            raise ValueError(
+                f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
+            )
+        sure, single, like = self._sure(tx, rx, uplink)
+        good = sure >= self.trusted.threshold
+        good = good[0] if single else good
+        return good if like else (bool(good) if good.ndim == 0 else good.numpy())
+
+    def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
+        """Confidences (B,), whether one was asked for, and whether torch was given."""
+        if uplink is not None:
+            from gsparc.link import export
+
+            said = export.judged(self.method, self.site, uplink)
+            single, like, places = np.ndim(uplink) == 2, isinstance(uplink, Tensor), None
+        else:
+            asked, pose, single, like = self._ends(tx, rx)
+            with torch.no_grad():
+                said = self._whole.predict(asked, pose)
+            moved = asked if self.site.moving_end == "tx" else pose.position.reshape(-1, 3)
+            places = moved.double().numpy()
+        if said.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             raise ValueError(f"{self.method.name} has no confidence")
-        return _returned(prediction.confidence, single, like)
+        return torch.from_numpy(self.trusted.confidence(said, places, self.kind)), single, like
 
     def _ask(self, kind: Kind, tx: Any, rx: Any) -> Any:
         if self.site.kind != kind:
@@ -121,6 +174,12 @@ class Predictor:
 
     def _predict(self, tx: Any, rx: Any, method: Method) -> tuple[Prediction, bool, bool]:
         """The prediction, whether one position was asked for, and whether torch was given."""
+        asked, pose, single, like = self._ends(tx, rx)
+        with torch.no_grad():
+            return method.predict(asked, pose), single, like
+
+    def _ends(self, tx: Any, rx: Any) -> tuple[Tensor, Pose, bool, bool]:
+        """Both ends in local coordinates, whether one position was asked for, and whether torch was given."""
         given = rx.position if isinstance(rx, Pose) else rx
         places = {
             end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
@@ -133,9 +192,7 @@ class Predictor:
         single = all(place.ndim == 1 for place in places.values())
         if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
             asked = _float(np.atleast_2d(places[moving] - self.site.origin))
-            with torch.no_grad():
-                prediction = method.predict(asked, self._still)
-            return prediction, single, isinstance(tx, Tensor)
+            return asked, self._still, single, isinstance(tx, Tensor)
         local = {end: np.atleast_2d(place) - self.site.origin for end, place in places.items()}
         count = max(len(place) for place in local.values())
         for end, place in local.items():
@@ -148,9 +205,8 @@ class Predictor:
         else:
             positions = np.broadcast_to(ends["rx"], (count, 3))
             pose = Pose(_float(positions), _float(np.broadcast_to(rotation, (count, 3, 3))))
-        with torch.no_grad():
-            prediction = method.predict(_float(np.broadcast_to(ends["tx"], (count, 3))), pose)
-        return prediction, single, any(isinstance(v, Tensor) for v in (tx, given))
+        asked = _float(np.broadcast_to(ends["tx"], (count, 3)))
+        return asked, pose, single, any(isinstance(v, Tensor) for v in (tx, given))
 
     def _still_pose(self) -> Pose | None:
         """The pose of a receiver that never moved, made once; None for any other site."""
@@ -180,7 +236,7 @@ class Predictor:
         return np.eye(3) if self.site.rx_rotation is None else self.site.rx_rotation
 
 
-def load(path: str | Path, budget_ms: float | None = None) -> Predictor:
+def load(path: str | Path, budget_ms: float | None = None, confidence: str | None = None) -> Predictor:
     """The model in a checkpoint, ready to be asked.
 
     Args:
@@ -188,18 +244,24 @@ def load(path: str | Path, budget_ms: float | None = None) -> Predictor:
         budget_ms: what one query may take on this machine, end to end [ms]. The operating points that
             `python -m gsparc.tradeoff` stored with the model are timed here (a few seconds), the most
             accurate that fits answers, and torch's number of threads becomes that point's.
+        confidence: `learned`, `expected`, `distance` or `gp_variance`; None takes the one that
+            `python -m gsparc.calibration` found best on positions set aside and stored with the model, and
+            the model's own where it was never calibrated.
 
     Raises:
         gsparc.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
-        ValueError: nothing is as fast as `budget_ms`; the fastest is named.
+        ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence.
     """
     method, stored = checkpoint.load(path)
+    trusted = kept(stored.extra)
+    if confidence is not None:
+        trusted.check(confidence)
     if budget_ms is None:
-        return Predictor(method, stored.site)
+        return Predictor(method, stored.site, trusted=trusted, kind=confidence)
     from gsparc.tradeoff.choose import within
 
     chosen, point = within(method, stored, budget_ms)
-    return Predictor(chosen, stored.site, whole=method, point=point)
+    return Predictor(chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence)
 
 
 def _positions(end: str, value: Any) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,18 @@ from rich.table import Table
 
 from gsparc import cli
 from gsparc.calibration.curves import bounded, perfect_area, rank_correlation, risk_coverage
-from gsparc.calibration.evidence import CHUNK, Evidence, gather, joined
+from gsparc.calibration.evidence import (
+    CHUNK,
+    Evidence,
+    gather,
+    joined,
+    known_positions,
+    position_kernel,
+)
 from gsparc.calibration.pictures import draw
+from gsparc.calibration.stored import Trusted, keep, threshold_of
 from gsparc.calibration.threshold import Promise
-from gsparc.calibration.trial import Trial, trials
+from gsparc.calibration.trial import Trial, accept, trials
 from gsparc.clock import machine_facts
 from gsparc.data.argos import peers_figures, peers_normalisation
 from gsparc.data.schema import Measurements
@@ -52,6 +61,29 @@ def collect(
     return joined(parts), facts
 
 
+def store(path: str, dataset: dict[str, Any], split: dict[str, Any], how: Settled) -> Trusted:
+    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model."""
+    run = open_files([path], dataset, split)
+    method, data, fold = run.methods[0], run.data, run.split.folds[0]
+    evidence = gather(method, data, fold, rows_of(fold, "test"))
+    used, found, _, _ = accept(evidence, how.promise, how.kind, how.spatial, how.seed)
+    told = Trusted(
+        used, threshold_of(used, found), how.promise, known_positions(data, fold), position_kernel(data, fold)
+    )
+    keep(path, told)
+    return told
+
+
+@dataclass(frozen=True)
+class Settled:
+    """How a confidence and its threshold are chosen; see conf/calibration.yaml."""
+
+    promise: Promise
+    kind: str
+    spatial: bool
+    seed: int
+
+
 def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:
     """`peers/*` and `denormalised/*` of Argos data: the figures under both normalisations, all test rows."""
     if data.uplink is None:
@@ -83,6 +115,9 @@ def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[st
         facts |= {
             f"trial/{trial.how}/kind": trial.kind,
             f"trial/{trial.how}/broken": trial.broken,
+            f"trial/{trial.how}/broken_low": None if trial.interval is None else trial.interval[0],
+            f"trial/{trial.how}/broken_high": None if trial.interval is None else trial.interval[1],
+            f"trial/{trial.how}/silent": trial.silent,
             f"trial/{trial.how}/realised": trial.mean_realised,
             f"trial/{trial.how}/coverage": float(trial.coverage.mean()),
             f"trial/{trial.how}/draws": len(trial.realised),
@@ -96,11 +131,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         torch.set_num_threads(int(config.threads))
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    evidence, known = collect(
-        paths,
-        OmegaConf.to_container(config.dataset, resolve=True),  # type: ignore[arg-type]
-        OmegaConf.to_container(config.split, resolve=True),  # type: ignore[arg-type]
-    )
+    settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    evidence, known = collect(paths, settings["dataset"], settings["split"])
     if config.confidence != "auto" and config.confidence not in evidence.scores:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Promise(float(config.limit_db), float(config.alpha), float(config.delta))
@@ -128,6 +160,15 @@ def task(config: DictConfig) -> dict[str, Any]:
     console = Console()
     for table in tables(facts, evidence, found):
         console.print(table)
+    if config.store:
+        how = Settled(promise, config.confidence, bool(config.spatial), int(config.seed))
+        for path in paths:
+            told = store(path, settings["dataset"], settings["split"], how)
+            facts["stored/kind"], facts["stored/threshold"] = told.kind, told.threshold
+            console.print(
+                f"{path}: confidence={told.kind}, accepted from {told.threshold:.4g}", highlight=False
+            )
+        write_summary(run_dir / "summary.json", facts)
     console.print(f"written to {run_dir}", highlight=False)
     return facts
 
@@ -144,7 +185,15 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
             kind, f"{own['area']:.4g}", f"{own['area_below_distance']:.0%}", f"{own['risk_at_70']:.4g}", rank
         )
     second = Table(title=f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB")
-    for column in ("split", "confidence", "accepted", "bad among them", "broken", "promised"):
+    for column in (
+        "split",
+        "confidence",
+        "accepted",
+        "bad among them",
+        "broken",
+        "promised",
+        "accepted nobody",
+    ):
         second.add_column(column, justify="left" if column in ("split", "confidence") else "right")
     for trial in found:
         bad = "-" if trial.mean_realised is None else f"{trial.mean_realised:.1%}"
@@ -153,10 +202,18 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
             trial.kind,
             f"{trial.coverage.mean():.0%}",
             bad,
-            f"{trial.broken:.1%}",
+            _broken(trial),
             f"{trial.delta:.0%}",
+            f"{trial.silent:.0%}",
         )
     return [first, second]
+
+
+def _broken(trial: Trial) -> str:
+    if trial.broken is None or trial.interval is None:
+        return "-"
+    low, high = trial.interval
+    return f"{trial.broken:.1%} ({low:.0%} to {high:.0%})"
 
 
 def main() -> None:

@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.method import Method
+from gsparc.method import Method, Prediction
 from gsparc.peers.encoding import training_targets
-from gsparc.peers.gp import choose_kernel, principal_components
+from gsparc.peers.gp import Kernel, choose_kernel, principal_components
 
 KINDS = ("learned", "expected", "distance", "gp_variance")
 CHUNK = 64
@@ -61,8 +62,7 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
         sure = found.confidence
         none = np.full(len(batch), np.nan)
         learned.append(none if sure is None else sure.double().numpy())
-        loud = found.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
-        expected.append(none if found.variance is None else -(found.variance / loud).double().numpy())
+        expected.append(none if found.variance is None else expected_score(found).double().numpy())
     own = {"learned": np.concatenate(learned), "expected": np.concatenate(expected)}
     scores = {kind: score for kind, score in own.items() if not np.isnan(score).any()}
     return Evidence(rows, data.moving[rows], np.concatenate(errors), scores | rivals(data, fold, rows))
@@ -70,19 +70,36 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
 
 def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
     """The two cheap confidences: minus the distance to the nearest training point, minus a GP's variance."""
+    known = known_positions(data, fold)
+    distance = cKDTree(known).query(data.moving[rows])[0]
+    variance = process_variance(position_kernel(data, fold), known, data.moving[rows])
+    return {"distance": -distance, "gp_variance": -variance}
+
+
+def known_positions(data: Measurements, fold: Fold) -> np.ndarray:
+    """Of the moving end, local, that a method may have learned from (n, 3) [m]."""
+    return data.moving[np.concatenate([fold.train, fold.val])]
+
+
+def position_kernel(data: Measurements, fold: Fold) -> Kernel:
+    """Of the process whose variance is the rival: length and noise by likelihood on a few known rows."""
     known = np.concatenate([fold.train, fold.val])
-    distance = cKDTree(data.moving[known]).query(data.moving[rows])[0]
-    return {"distance": -distance, "gp_variance": -_process_variance(data, known, rows)}
-
-
-def _process_variance(data: Measurements, known: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """What a Gaussian process of the positions `known` does not know of `rows`, as a share of the prior."""
     few = np.random.default_rng(0).permutation(known)[:KERNEL_ROWS]
     parts = principal_components(training_targets(data, few), data.site.kind, COMPONENTS)
-    kernel = choose_kernel(data.moving[few], parts.scores, len(parts.mean))
-    factor = cho_factor(kernel.gram(data.moving[known]), lower=True)
-    cross = kernel.cross(data.moving[rows], data.moving[known])
+    return choose_kernel(data.moving[few], parts.scores, len(parts.mean))
+
+
+def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """What a process of the positions `known` (n, 3) does not know of `places` (B, 3), share of the prior."""
+    factor = cho_factor(kernel.gram(known), lower=True)
+    cross = kernel.cross(places, known)
     return 1 + kernel.noise - (cross * cho_solve(factor, cross.T).T).sum(1)
+
+
+def expected_score(said: Prediction) -> Tensor:
+    """Minus the error variance over the power predicted (B,): in a fade the same variance is worse."""
+    assert said.variance is not None
+    return -said.variance / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
 
 
 def joined(parts: Sequence[Evidence]) -> Evidence:

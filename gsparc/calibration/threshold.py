@@ -62,6 +62,16 @@ class Threshold:
         return float(beta.ppf(1 - delta, self.bad + 1, self.accepted - self.bad))
 
 
+def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[float, float]:
+    """Clopper and Pearson's interval (1934) of a rate."""
+    if count == 0:
+        return 0.0, 1.0
+    tail = (1 - level) / 2
+    low = 0.0 if errors == 0 else float(beta.ppf(tail, errors, count - errors + 1))
+    high = 1.0 if errors == count else float(beta.ppf(1 - tail, errors + 1, count - errors))
+    return low, high
+
+
 def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
     """Thresholds to try, strict to lax: quantiles of scores that are not the calibration's."""
     return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsparc.calibration.curves import bounded, risk_coverage
 from gsparc.calibration.evidence import Evidence
-from gsparc.calibration.threshold import Promise, choose, levels_of, spread_out
+from gsparc.calibration.threshold import Promise, Threshold, binomial_interval, choose, levels_of, spread_out
 
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
@@ -37,9 +37,27 @@ class Trial:
     delta: float
 
     @property
-    def broken(self) -> float:
-        """Share of draws in which more than alpha were bad; the promise is at most delta."""
-        return float(np.mean(np.nan_to_num(self.realised, nan=0.0) > self.alpha))
+    def silent(self) -> float:
+        """Share of draws in which nobody was accepted: nothing was promised, so nothing was kept."""
+        return float(np.isnan(self.realised).mean())
+
+    @property
+    def broken(self) -> float | None:
+        """Share of draws in which more than alpha were bad, of those that accepted anybody; None of none.
+
+        The promise is at most delta.
+        """
+        spoke = self.realised[~np.isnan(self.realised)]
+        return float((spoke > self.alpha).mean()) if len(spoke) else None
+
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Clopper and Pearson's 95 % interval of `broken`, as if the draws were independent.
+
+        They share their positions, so this is the least that chance allows for.
+        """
+        spoke = self.realised[~np.isnan(self.realised)]
+        return binomial_interval(int((spoke > self.alpha).sum()), len(spoke)) if len(spoke) else None
 
     @property
     def mean_realised(self) -> float | None:
@@ -75,6 +93,21 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
     """The confidence of the smallest area under risk-coverage on `rows`."""
     loss = bounded(evidence.error[rows])
     return min(evidence.scores, key=lambda kind: risk_coverage(evidence.scores[kind][rows], loss).area)
+
+
+def accept(
+    evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int
+) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
+    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside."""
+    rng = np.random.default_rng(seed)
+    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
+    used = best_kind(evidence, choose_on) if kind == "auto" else kind
+    if used not in evidence.scores:
+        raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
+    score, bad = evidence.scores[used], promise.bad(evidence.error)
+    patch = cells(evidence.position)[calibrate] if spatial else None
+    found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
+    return used, found, test, choose_on
 
 
 def trials(

@@ -82,6 +82,22 @@ class Edges:
         return torch.stack(each, -1)
 
 
+def diffracted(places: Tensor, edges: Edges, transmitter: Tensor) -> tuple[Tensor, Tensor]:
+    """Ranges (n, K) float64 [m] of the rays by way of the edges, and where they meet them (n, K, 3) [m]."""
+    length, across_rx, across, along_rx, along_tx = _unfolded(places, edges.point, edges.axis, transmitter)
+    met = along_rx + (along_tx - along_rx) * across_rx / across.clamp_min(NEAR_M)
+    return length, edges.point + met[..., None] * edges.axis
+
+
+def _unfolded(places: Tensor, point: Tensor, axis: Tensor, transmitter: Tensor) -> tuple[Tensor, ...]:
+    """Length of the straight line, distance of the place and of both ends from the edge, and along it."""
+    along_rx, across_rx = about_edge(places, point, axis)
+    along_tx, across_tx = about_edge(transmitter[None], point, axis)
+    across = across_rx + across_tx
+    length = ((along_rx - along_tx).square() + across.square() + NEAR_M**2).sqrt()
+    return length, across_rx, across, along_rx, along_tx
+
+
 def edge_wave(
     places: Tensor, point: Tensor, axis: Tensor, transmitter: Tensor, frequency_hz: Tensor
 ) -> Tensor:
@@ -93,10 +109,7 @@ def edge_wave(
         transmitter: (3,) float64 [m].
         frequency_hz: (n,) float64 [Hz].
     """
-    along_rx, across_rx = about_edge(places, point, axis)
-    along_tx, across_tx = about_edge(transmitter[None], point, axis)
-    across = across_rx + across_tx
-    length = ((along_rx - along_tx).square() + across.square() + NEAR_M**2).sqrt()
+    length, across_rx, across = _unfolded(places, point, axis, transmitter)[:3]
     after = length * across_rx / across.clamp_min(NEAR_M)
     spread = (after.clamp_min(NEAR_M) * (length - after).clamp_min(NEAR_M) * length).sqrt()
     return torch.polar((1 / spread).float(), reduced_phase(length, frequency_hz[:, None]))

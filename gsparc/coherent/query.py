@@ -101,10 +101,7 @@ class Query:
         means, variances, priors = [], [], []
         middle = tones[len(tones) // 2]
         for part in queries.split(CHUNK):
-            correlation = self.pack.correlation(part)
-            gains = torch.complex(correlation @ self.real, correlation @ self.imag) * self.turn  # (K, m, R)
-            seen = self.pack.shade(part)
-            gains = gains * seen[:, :, None]
+            gains, correlation, seen = self._gains(part)
             waves = wave_over_band(ranges(part, self.pack.sources), tones)  # (m, K, F)
             split = zip(gains.split(self.counts), waves.split(self.counts, 1), strict=True)
             means.append(torch.stack([torch.einsum("kmr,mkf->mrf", g, w) for g, w in split]))
@@ -113,6 +110,16 @@ class Query:
             variances.append(variance)
             priors.append(prior)
         return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
+
+    def gains(self, queries: Tensor) -> Tensor:
+        """Complex gains (K, m, R) of the sources of all processes, one after another, as queries see them."""
+        return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
+
+    def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Gains (K, m, R), visibility correlations (K, m, n), and how much is seen (K, m)."""
+        correlation, seen = self.pack.correlation(part), self.pack.shade(part)
+        gains = torch.complex(correlation @ self.real, correlation @ self.imag) * self.turn
+        return gains * seen[:, :, None], correlation, seen
 
     def _variance(
         self, part: Tensor, tone: Tensor, correlation: Tensor, shade: Tensor

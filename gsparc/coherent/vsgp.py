@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.coherent.edges import Edges, find_edges, with_gains, without
+from gsparc.coherent.edges import Edges, diffracted, edge_wave, find_edges, with_gains, without
 from gsparc.coherent.ensemble import Budget, Member, search_many, weights
 from gsparc.coherent.furniture.clutter import Clutter
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.offsets import KINDS, Offsets, estimate
-from gsparc.coherent.phase import ranges, wave_over_band
+from gsparc.coherent.phase import LIGHT, ranges, wave, wave_over_band
 from gsparc.coherent.process import Scene
 from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows, elements, gather, query_elements, tones_of
@@ -259,12 +259,8 @@ class VirtualSourceGP(Method):
         expected there that is known.
         """
         site = self._fitted()
-        if site.moving_end == "rx":
-            places = query_elements(site, rx, len(tx), self.antennas)
-        else:
-            places = tx.detach().cpu().double().numpy()[:, None]
-        count, per = places.shape[:2]
-        flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
+        flat, count = self._places(tx, rx)
+        per = len(flat) // count
         tones = torch.from_numpy(tones_of(site))
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
@@ -280,6 +276,42 @@ class VirtualSourceGP(Method):
             confidence=(1 - variance / prior).clamp(0, 1),
             variance=variance * self.frame.scale**2,
         )
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
+        """What `predict` sums: one path a source of every search, weighted as the searches are, and edges.
+
+        Returns:
+            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
+            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from.
+        """
+        flat, count = self._places(tx, rx)
+        start, carrier = self.members[0].scene.transmitter, self.frame.carrier_hz
+        middle = flat.view(count, -1, 3).mean(1)
+        weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
+        away = ranges(flat, self.query.pack.sources)
+        gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
+        towards = self.query.pack.sources - middle[:, None]
+        if len(self.edges):
+            length, met = diffracted(flat, self.edges, start)
+            hertz = torch.full((len(flat),), carrier, dtype=torch.float64)
+            waves = edge_wave(flat, self.edges.point, self.edges.axis, start, hertz)
+            gain = torch.cat([gain, waves.T[..., None] * self.edges.gain[:, None]])
+            away = torch.cat([away, length], 1)
+            # every element meets an edge elsewhere: the middle of where they do
+            met = met.view(count, -1, len(self.edges), 3).mean(1)
+            towards = torch.cat([towards, met - middle[:, None]], 1)
+        gain = (gain * self.frame.scale).movedim(0, -1).reshape(count, self.antennas, -1)
+        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
+        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+
+    def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
+        """Antennas of the moving end (B E, 3) float64 in the search's frame, and B."""
+        site = self._fitted()
+        if site.moving_end == "rx":
+            places = query_elements(site, rx, len(tx), self.antennas)
+        else:
+            places = tx.detach().cpu().double().numpy()[:, None]
+        return torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle, len(places)
 
     def left_over(self) -> tuple[np.ndarray, Tensor]:
         """Receivers (n,) and what all others leave unexplained of their channels (n, R), in stored units."""

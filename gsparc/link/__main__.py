@@ -16,9 +16,8 @@ from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc import cli
-from gsparc.calibration.evidence import Evidence
-from gsparc.calibration.threshold import Promise, Threshold, choose, levels_of
-from gsparc.calibration.trial import best_kind, cells, divided
+from gsparc.calibration.threshold import Promise
+from gsparc.calibration.trial import accept
 from gsparc.clock import machine_facts
 from gsparc.evaluate import open_files
 from gsparc.evaluation import dataset_facts, split_facts
@@ -51,21 +50,6 @@ def need_sionna() -> None:
     """Refuse in words where Sionna is not installed."""
     if find_spec("sionna") is None:
         raise ValueError("gsparc.link needs Sionna: pip install 'gsparc[sionna]'")
-
-
-def accept(
-    evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int
-) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
-    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside."""
-    rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
-    used = best_kind(evidence, choose_on) if kind == "auto" else kind
-    if used not in evidence.scores:
-        raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
-    score, bad = evidence.scores[used], promise.bad(evidence.error)
-    patch = cells(evidence.position)[calibrate] if spatial else None
-    found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
-    return used, found, test, choose_on
 
 
 def band(found: Channels) -> Band:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.calibration.evidence import Evidence, rivals
+from gsparc.calibration.evidence import Evidence, expected_score, rivals
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.link.channels import Channels
+from gsparc.method import Prediction
 
 
 def on_band(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
     power = band.true.abs().square().mean((1, 2))
     error = (band.predicted - band.true).abs().square().mean((1, 2)) / power.clamp_min(1e-30)
-    loud = band.predicted.abs().square().mean((1, 2)).clamp_min(1e-30)
-    own = {"learned": band.confidence, "expected": -band.variance / loud}
+    said = Prediction(band.predicted, band.confidence, band.variance)
+    own = {"learned": band.confidence, "expected": expected_score(said)}
     scores = {kind: s.double().numpy() for kind, s in own.items() if not s.isnan().any()}
     return Evidence(rows, data.moving[rows], error.double().numpy(), scores | rivals(data, fold, rows))

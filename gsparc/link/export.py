@@ -9,25 +9,43 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.best import Gsparc
+from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Site
 from gsparc.link.grid import interpolated, resource_grid
-from gsparc.method import Method
+from gsparc.method import Method, Prediction
+from gsparc.ops import Pose
 from gsparc.uplink.method import UplinkField
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Plane waves at the array, N for each of B snapshots.
+    """Plane waves at the array: N for each of B snapshots or positions.
+
+    The channel at f is the sum of `gain exp(-j 2 pi (f - reference_hz) delay_s)`, at positions times
+    `reference_hz / f`.
 
     Attributes:
-        gain: (B, N) complex64 at the middle of the uplink's band, physical units.
-        delay_s: (B, N) [s], up to the snapshot's own timing.
-        cosines: (B, N, 2) direction cosines along the array's two widest axes.
+        gain: complex64, physical units, at `reference_hz`: (B, N) at the array's middle for snapshots,
+            (B, A, N) at every antenna for positions.
+        delay_s: like `gain` [s]; of snapshots up to their own timing.
+        reference_hz: the middle of the uplink's band, or the carrier [Hz].
+        cosines: (B, N, 2) direction cosines along the array's two widest axes; None for positions.
+        direction: (B, N, 3) unit vectors in the world towards where a path comes from; None for snapshots.
     """
 
     gain: np.ndarray
     delay_s: np.ndarray
-    cosines: np.ndarray
+    reference_hz: float
+    cosines: np.ndarray | None = None
+    direction: np.ndarray | None = None
+
+
+def judged(method: Method, site: Site, uplink: Any) -> Prediction:
+    """Channels of the measured tones in stored units with their confidence and variance; see `heard`."""
+    snapshots = _snapshots(method, site, uplink)
+    assert isinstance(method, UplinkField)
+    return method.listen(snapshots)
 
 
 def heard(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
@@ -44,15 +62,38 @@ def heard(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> 
     return method.listen_at(snapshots, wanted).mean * site.target_scale
 
 
-def paths(method: Method, site: Site, uplink: Any) -> Paths:
+def heard_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """The sources of uplinks (B, U, L), physical units; see `heard`."""
-    found = method.sources(_snapshots(method, site, uplink))  # type: ignore[attr-defined]
+    snapshots = _snapshots(method, site, uplink)
+    assert isinstance(method, UplinkField)
+    found = method.sources(snapshots)
     assert site.uplink_hz is not None
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
     return Paths(
         (found.gain * site.target_scale).numpy(),
         (found.delay.double() / spacing).numpy(),
-        found.direction.numpy(),
+        float(site.uplink_hz.mean()),
+        cosines=found.direction.numpy(),
+    )
+
+
+def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
+    """The paths of a coherent field at positions in local coordinates.
+
+    What a process beside the field adds (`model.effects.hybrid`) has no paths and is not among them.
+
+    Raises:
+        ValueError: the model's channels are not made of paths.
+    """
+    method = method.answering[0] if isinstance(method, Gsparc) else method
+    if not isinstance(method, VirtualSourceGP):
+        raise ValueError(f"paths: channels of {method.name} are not made of paths (model=vsgp, uplink)")
+    gain, delay, direction = method.paths(tx, rx)
+    return Paths(
+        (gain * site.target_scale).numpy(),
+        delay.numpy(),
+        method.frame.carrier_hz,
+        direction=direction.numpy(),
     )
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from gsparc.calibration.threshold import binomial_interval
 from gsparc.link.adaptation import Rates
-from gsparc.link.statistics import interval
 from gsparc.link.study import Curve
 
 STYLES = {
@@ -51,7 +51,9 @@ def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path
                 continue
             curve = curves[name]
             shown = np.maximum(curve.bler, LEAST_RATE)
-            bounds = [interval(int(e), int(n)) for e, n in zip(curve.errors, curve.blocks, strict=True)]
+            bounds = [
+                binomial_interval(int(e), int(n)) for e, n in zip(curve.errors, curve.blocks, strict=True)
+            ]
             low, high = np.maximum(np.array(bounds).T, LEAST_RATE)
             axes[0, column].errorbar(
                 curve.ebno_db, shown, [np.maximum(shown - low, 0), np.maximum(high - shown, 0)],

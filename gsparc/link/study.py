@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from gsparc.calibration.threshold import binomial_interval
 from gsparc.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.link.beams import gain, loss_db
 from gsparc.link.pusch import Blocks, Pusch
-from gsparc.link.statistics import crossing, interval
+from gsparc.link.statistics import crossing
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
 FALLBACK = "lmmse"
@@ -213,7 +214,7 @@ def pusch_facts(modulation: str, drawn: Mapping[str, Curve]) -> dict[str, Any]:
         facts[f"{room}/ebno_at_bler_0.1"] = at
         facts[f"{room}/behind_perfect_db"] = None if at is None or reference is None else at - reference
         for i, level in enumerate(curve.ebno_db):
-            low, high = interval(int(curve.errors[i]), int(curve.blocks[i]))
+            low, high = binomial_interval(int(curve.errors[i]), int(curve.blocks[i]))
             facts |= {
                 f"{room}/{level:g}dB/bler": None if np.isnan(curve.bler[i]) else float(curve.bler[i]),
                 f"{room}/{level:g}dB/bler_low": low,

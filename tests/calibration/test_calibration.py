@@ -8,7 +8,7 @@ import pytest
 from gsparc.calibration.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.calibration.evidence import Evidence, gather, joined
 from gsparc.calibration.threshold import Promise, Threshold, choose, levels_of, spread_out
-from gsparc.calibration.trial import best_kind, divided, trials
+from gsparc.calibration.trial import Trial, best_kind, divided, trials
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
@@ -121,3 +121,13 @@ def test_evidence_of_a_method(campaign, folds) -> None:
 def test_impossible_promises_are_refused() -> None:
     with pytest.raises(ValueError, match="between 0 and 1"):
         Promise(alpha=1.5)
+
+
+def test_nobody_accepted_is_no_promise_kept() -> None:
+    """A draw that accepts nobody says nothing: it is counted by itself, not among the kept."""
+    trial = Trial("learned", "random", np.array([np.nan, 0.05, 0.2]), np.array([0.0, 0.5, 0.5]), 0.1, 0.1)
+    assert trial.silent == 1 / 3 and trial.broken == 0.5
+    low, high = trial.interval
+    assert low < 0.5 < high
+    mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
+    assert mute.broken is None and mute.interval is None and mute.silent == 1

@@ -7,7 +7,7 @@ import pytest
 import torch
 from rooms import WAVELENGTH, nmse, shoebox
 
-from gsparc.coherent.edges import Edges, edge_wave
+from gsparc.coherent.edges import Edges, diffracted, edge_wave
 from gsparc.coherent.sources import SourceKind, box_of, kinds
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.own import from_arrays
@@ -61,6 +61,9 @@ def test_a_diffracted_wave_takes_the_shortest_way_and_spreads_as_keller_says():
     assert float(wave.abs()) == pytest.approx((s1 * s2 * (s1 + s2)) ** -0.5, rel=1e-3)
     turn = np.exp(-2j * np.pi * 2.4e9 / LIGHT * (s1 + s2))
     assert abs(complex(wave / wave.abs()) - turn) < 1e-2
+    length, met = diffracted(rx, Edges(EDGE, UP, torch.ones(1, 1, dtype=torch.complex64)), tx)
+    assert float(length) == pytest.approx(s1 + s2, rel=1e-6)
+    assert torch.allclose(met[0, 0], points[best], atol=1e-3)
 
 
 def test_an_edge_is_found_where_it_is_and_explains_what_no_point_can(tmp_path):

@@ -6,6 +6,7 @@ import torch
 from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
 
+from gsparc import checkpoint, load
 from gsparc.coherent.pictures import plot_visibility
 from gsparc.coherent.rows import gather
 from gsparc.coherent.vsgp import VirtualSourceGP
@@ -55,6 +56,26 @@ def test_variance_is_of_the_size_of_the_error(small):
     assert prediction.confidence.min() > 0.9
     outside = method.predict(torch.zeros(1, 3), _shifted(data, fold.test[:1], 30.0))
     assert outside.confidence[0] <= prediction.confidence.min()
+
+
+def test_paths_sum_to_the_prediction(small, tmp_path):
+    """Gains, delays and directions are what `predict` adds up; the loudest comes from the transmitter."""
+    _, data, fold, method, _ = small
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    predictor = load(tmp_path / "m.ckpt")
+    world = data.moving[fold.test[:5]] + data.site.origin
+    found = predictor.paths(rx=world)
+    frequency = np.atleast_1d(data.site.subcarriers_hz)[:, None]
+    turns = (frequency - found.reference_hz) * found.delay_s[:, :, None]
+    waves = found.gain[:, :, None] * np.exp(-2j * np.pi * turns)
+    summed = (waves * found.reference_hz / frequency).sum(-1)
+    assert np.allclose(summed, predictor.csi(rx=world), atol=1e-3 * np.abs(summed).max())
+    loudest = np.abs(found.gain[:, 0]).argmax(1)
+    towards = data.tx[fold.test[:5]] - data.moving[fold.test[:5]]
+    distance = np.linalg.norm(towards, axis=1)
+    rows = np.arange(5)
+    assert np.abs((found.direction[rows, loudest] * towards).sum(1) / distance - 1).max() < 1e-3
+    assert np.abs(found.delay_s[rows, 0, loudest] * 299_792_458.0 - distance).max() < 0.05
 
 
 def _shifted(data, index, metres):

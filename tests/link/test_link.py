@@ -11,10 +11,11 @@ from campaigns import compose
 from cities import city, fold
 
 from gsparc import checkpoint, load
+from gsparc.calibration.threshold import binomial_interval
 from gsparc.link.beams import gain, loss_db
 from gsparc.link.channels import truth
 from gsparc.link.grid import centred, interpolated, resource_grid
-from gsparc.link.statistics import crossing, interval
+from gsparc.link.statistics import crossing
 from gsparc.uplink.method import UplinkField
 from gsparc.uplink.search import SearchSettings
 
@@ -75,9 +76,12 @@ def test_crossing_and_intervals() -> None:
     x = np.array([0.0, 1, 2])
     assert np.isclose(crossing(x, np.array([1.0, 0.1, 0.01])), 1.0)
     assert crossing(x, np.array([1.0, 0.5, 0.2])) is None
-    low, high = interval(10, 100)
+    low, high = binomial_interval(10, 100)
     assert (
-        low < 0.1 < high and interval(0, 10)[0] == 0 and interval(10, 10)[1] == 1 and interval(0, 0) == (0, 1)
+        low < 0.1 < high
+        and binomial_interval(0, 10)[0] == 0
+        and binomial_interval(10, 10)[1] == 1
+        and binomial_interval(0, 0) == (0, 1)
     )
 
 
