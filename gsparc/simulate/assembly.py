@@ -22,6 +22,8 @@ from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import Shards
 from gsparc.simulate.spectrum import spectra
 
+SECONDS = "seconds"  # entry of a shard: what tracing it cost, so that the bill survives an interruption
+
 
 @dataclass(frozen=True)
 class Assembled:
@@ -66,16 +68,26 @@ def assemble(
     effects: Effects,
     choice: Choice | None,
     convergence: Convergence | None,
+    seconds: float,
     shards: Shards,
     out: Path,
 ) -> Assembled:
     """Put the shards together, write the file, drop the shards.
 
+    Args:
+        campaign, engine, receivers, effects, choice, convergence: what the file is of.
+        seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
+        shards: all of them there.
+        out: the file.
+
     Raises:
         ValueError: nothing reaches any receiver.
     """
     parts = [shards.get(n) for n in range(-(-len(receivers) // campaign.shard))]
-    whole = {k: np.concatenate([p[k] for p in parts]) for k in parts[0] if k not in (*ARRAYS, "offsets")}
+    seconds += sum(float(p[SECONDS]) for p in parts)
+    whole = {
+        k: np.concatenate([p[k] for p in parts]) for k in parts[0] if k not in (*ARRAYS, "offsets", SECONDS)
+    }
     paths = join([Paths(*(p[name] for name in ("offsets", *ARRAYS))) for p in parts])
     del parts
     power = whole["received_power"]
@@ -95,6 +107,7 @@ def assemble(
     }
     arrays = _arrays(campaign, engine, receivers, effects, whole, paths)
     about = _provenance(campaign, engine, effects, choice, convergence, facts)
+    about["simulate_s"] = seconds
     data = write_own(out, arrays, about)
     shards.remove()
     return Assembled(data, power, whole["delay_spread"], facts)

@@ -18,6 +18,7 @@ from gsparc.simulate.engine import Engine
 log = logging.getLogger(__name__)
 
 TIMED = 48  # probes that times are measured on
+REPEATS = 3
 TIMING_NOISE = 0.1  # a competing process moves a measured time by more than this
 
 
@@ -222,11 +223,14 @@ def _cheapest(costs: Mapping[Effects, float], holds: Callable[[Effects], bool], 
 
 
 def _timed(engine: Engine, receivers: np.ndarray, effects: Effects) -> float:
-    """Seconds of a warm trace: the first call of a combination compiles."""
-    engine.trace(receivers[:1], effects)
-    start = time.perf_counter()
+    """Seconds of a warm trace, the best of `REPEATS`: the first compiles, any single one may be held up."""
     engine.trace(receivers, effects)
-    return time.perf_counter() - start
+    seconds = []
+    for _ in range(REPEATS):
+        start = time.perf_counter()
+        engine.trace(receivers, effects)
+        seconds.append(time.perf_counter() - start)
+    return min(seconds)
 
 
 def _estimate(some: Effects, full: Effects, seconds: Mapping[str, float], everything: float) -> float:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.simulate import auto, priors
-from gsparc.simulate.assembly import Assembled, assemble, part
+from gsparc.simulate.assembly import SECONDS, Assembled, assemble, part
 from gsparc.simulate.attribution import Deliverable, Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.convergence import Convergence, compare
@@ -22,6 +22,8 @@ from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import Shards
 
 log = logging.getLogger(__name__)
+
+PARTS = 2  # version of what a shard holds: those of another are refused
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
         raise ValueError(f"out={out} exists; remove it or say another")
     clock = _Clock()
     engine, receivers = build(campaign.scene, campaign.sampling)
-    shards = Shards(out, asdict(campaign))
+    shards = Shards(out, {**asdict(campaign), "parts": PARTS})
     clock.lap("build")
     choice, changed, effects = None, None, campaign.effects
     if isinstance(effects, AutoSettings):
@@ -84,7 +86,8 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     clock.lap("trace")
     convergence = _converge(campaign, engine, receivers, effects)
     clock.lap("converge")
-    made = assemble(campaign, engine, receivers, effects, choice, convergence, shards, out)
+    besides = clock.seconds["build"] + _decided_s(shards) + clock.seconds["converge"]
+    made = assemble(campaign, engine, receivers, effects, choice, convergence, besides, shards, out)
     clock.lap("write")
     return Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, clock.seconds)
 
@@ -103,6 +106,7 @@ def _choose(
     campaign: Campaign, settings: AutoSettings, engine: Engine, receivers: np.ndarray, shards: Shards
 ) -> tuple[Choice, Changed]:
     """The decision of `auto`, taken once and kept with the shards; and what the dropped effects change."""
+    begin = time.perf_counter()
     stored = shards.noted("choice")
     if stored is not None:
         changed = Changed(np.array(stored["rows"], dtype=int), np.array(stored["errors"]))
@@ -128,7 +132,12 @@ def _choose(
     changed = Changed(held, probe.errors(choice.effects, deliverable))
     shards.note(
         "choice",
-        {"choice": choice.as_dict(), "rows": held.tolist(), "errors": changed.errors.tolist()},
+        {
+            "choice": choice.as_dict(),
+            "rows": held.tolist(),
+            "errors": changed.errors.tolist(),
+            "seconds": time.perf_counter() - begin,
+        },
     )
     return choice, changed
 
@@ -174,9 +183,17 @@ def _trace_all(
     todo = sum(min(campaign.shard, len(receivers) - starts[n]) for n in missing)
     for number in missing:
         places = receivers[starts[number] : starts[number] + campaign.shard]
-        shards.put(number, part(engine.trace(places, effects), campaign, engine.wavelength))
+        start = time.perf_counter()
+        made = part(engine.trace(places, effects), campaign, engine.wavelength)
+        shards.put(number, {**made, SECONDS: np.array(time.perf_counter() - start)})
         done += len(places)
         rate = done / (time.perf_counter() - begin)
         standing = len(receivers) - todo + done
         left = (todo - done) / rate
         log.info("%d of %d receivers, %.1f per s, %.0f s left", standing, len(receivers), rate, left)
+
+
+def _decided_s(shards: Shards) -> float:
+    """What `auto` cost in whichever run decided [s]."""
+    stored = shards.noted("choice")
+    return 0.0 if stored is None else float(stored["seconds"])

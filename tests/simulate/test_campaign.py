@@ -1,6 +1,7 @@
 """Whole campaigns on our own engine: no ray tracer needed."""
 
 import json
+import time
 
 import h5py
 import numpy as np
@@ -56,6 +57,7 @@ def test_the_file_is_the_schema_and_equals_the_exact_room(tmp_path):
     assert load_own(tmp_path / "box.h5").site.kind == "spectrum"
     assert check([str(tmp_path / "box.h5")]) == 0
     assert outcome.convergence is None and outcome.made.facts["paths_per_receiver"] > 5
+    assert 0 < about["simulate_s"] <= sum(outcome.seconds.values())
     paths = stored["path_offsets"]
     assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
 
@@ -106,6 +108,7 @@ def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
         calls.append(len(receivers))
         if len(calls) == 3:
             raise KeyboardInterrupt
+        time.sleep(0.1)
         return real(self, receivers, *rest, **named)
 
     monkeypatch.setattr(Mirrors, "trace", dies)
@@ -127,6 +130,8 @@ def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
     (one, about), (two, other) = (arrays(tmp_path / f"{n}.h5") for n in ("whole", "cut"))
     for name in one:
         np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+    _, bill = about.pop("simulate_s"), other.pop("simulate_s")
+    assert bill > 0.2  # what the killed run had spent on its two shards is in it
     assert about == other and len(np.unique(two["rx_position"], axis=0)) == 60
 
 
