@@ -9,6 +9,7 @@ from typing import Any
 
 from torch import Tensor
 
+from gsparc.bearings.field import BearingField
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -27,6 +28,7 @@ from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.gp import GaussianProcess
 from gsparc.response import ResponseSettings
+from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)
 
@@ -95,8 +97,8 @@ class Gsparc(LearnedField):
             self._go_on(self._models[self._chosen])
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             chosen, budget_s = self._models[self._chosen], self.training.settings.budget_s
-            if isinstance(chosen, VirtualSourceGP) and budget_s is not None:
-                chosen.budget_s = budget_s - sum(d.seconds for d in self.decisions)
+            if budget_s is not None:
+                _limit(chosen, self.training, budget_s - sum(d.seconds for d in self.decisions))
             report = chosen.fit(data, fold, run_dir)
             decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data, fold)
             log.info("%s", decision)
@@ -153,3 +155,11 @@ class Gsparc(LearnedField):
     def size(self) -> int:
         """Number of Gaussians or sources."""
         return super().size() if self._chosen is None else self._models[self._chosen].size()
+
+
+def _limit(chosen: Method, training: Training, budget_s: float) -> None:
+    """Leave a method that takes a budget what the probes have left of it [s]."""
+    if isinstance(chosen, VirtualSourceGP):
+        chosen.budget_s = budget_s
+    elif isinstance(chosen, BearingField):
+        chosen.training = Training(replace(training.settings, budget_s=max(budget_s, 1.0)), training.seed)

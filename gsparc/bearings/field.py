@@ -2,14 +2,13 @@
 
 The trend moves directions of arrival with the receiver, which interpolating images cannot; the process on
 what the trend leaves (interference, shadow edges) is the Gaussian process that serves as our rival, given
-that trend (universal kriging; Matheron 1969).
+that trend (universal kriging; Matheron 1969). Images of several searches are averaged.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,44 +18,40 @@ from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from gsparc.bearings.compress import components
+from gsparc.bearings.doubt import Doubt, Looks, learn_doubt
 from gsparc.bearings.lags import BLOCK, Lags
 from gsparc.bearings.sources import SearchSettings, bearings, find_sources, mixed, powers
+from gsparc.bearings.trend import Trend, TrendSettings, learn_trend
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.method import FitReport, Prediction
 from gsparc.peers.encoding import to_real
 from gsparc.peers.gp import Kernel, choose_kernel
 from gsparc.peers.interpolation import Interpolator
+from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)
 
 CHOOSING = 128  # components that kernels are chosen with
 POOR = 0.02  # share of the energy that lags may leave of a spectrum that the array really measured
-
-
-@dataclass(frozen=True)
-class TrendSettings:
-    """How smooth the powers of the sources are taken to be.
-
-    Attributes:
-        lengths: of the Matern kernels tried, in diagonals of the receivers' box.
-        noise: variance of what is not smooth, relative to the kernel's.
-        rows: training rows that the length and the rest's kernel are chosen on, by leaving one out.
-    """
-
-    lengths: tuple[float, ...] = (0.06, 0.12, 0.25)
-    noise: float = 1.0
-    rows: int = 600
+LEAST_GAIN = (
+    0.005  # of the left-out error: searches end when the last `PATIENCE` of them gained less together
+)
+PATIENCE = 3
+LAST = 0.8  # share of a budget after which no search may end
 
 
 class BearingField(Interpolator):
     """Sources seen through the receiver's array.
 
+    With `trainer.budget_s` it searches until that is spent or nothing is gained.
+
     Args:
         search: how sources are found.
         trend: how smooth their powers are.
-        components: largest number of principal components of what the trend leaves; 0: the trend alone.
-        seed: of the search.
+        searches: how often, without a budget.
+        components: largest number of principal components of what the trends leave; 0: the trends alone.
+        seed: of the first search; the others have the next ones.
         name: as it appears in tables.
     """
 
@@ -66,13 +61,18 @@ class BearingField(Interpolator):
         self,
         search: SearchSettings | None = None,
         trend: TrendSettings | None = None,
+        searches: int = 1,
         components: int = 512,
         seed: int = 0,
         name: str = "bearings",
     ) -> None:
         super().__init__()
+        if searches < 1:
+            raise ValueError(f"{name}: model.searches={searches}: expected at least 1")
         self.search, self.trend = search or SearchSettings(), trend or TrendSettings()
-        self.components, self.seed, self.name = components, seed, name
+        self.searches, self.components, self.seed, self.name = searches, components, seed, name
+        self.training = Training()
+        self.trends: list[Trend] = []
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Find sources, learn their powers and what they leave.
@@ -83,41 +83,61 @@ class BearingField(Interpolator):
         problem = site_problem(data)
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
+        if self.training.resume is not None:
+            raise ValueError(f"ckpt_path: {self.name} trains in one piece; start again without ckpt_path")
         return super().fit(data, fold, run_dir)
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         begin = time.perf_counter()
         space = self.lags()
-        receivers = torch.from_numpy(positions).float()
+        self.positions = positions
         self.exponent, lags = self._lags(space, targets)
-        rows = _spread(len(targets), self.search.rows)
+        budget_s, longest = self.training.settings.budget_s, 0.0
+        drawn = np.zeros((len(targets), *space.image), dtype=np.float32)  # sum over searches, each row unseen
+        self.trends, errors = [], []
+        while True:
+            start = time.perf_counter()
+            trend, left_out = self._search(space, lags, positions, targets)
+            self._add(space, trend.sources, left_out, drawn)
+            self.trends.append(trend)
+            error, self.rest = self._judge(positions, targets, drawn)
+            errors.append(error)
+            now = time.perf_counter()
+            longest = max(longest, now - start)
+            log.info(
+                "%s: search %d, %d sources, trend %.3g m, left-out error %.4g, %.0f s",
+                self.name, len(errors), len(trend.sources), trend.kernel.length, error, now - begin,
+            )  # fmt: skip
+            if budget_s is None and len(errors) == self.searches:
+                break
+            if budget_s is not None and (now - begin + longest > LAST * budget_s or _settled(errors)):
+                break
+        drawn /= -len(self.trends)
+        self._learn_rest(self._images_less(targets, drawn), targets)
+        note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, left-out error " + " ".join(
+            f"{error:.4g}" for error in errors
+        )
+        return (note, f"{self.name}: rest {self.rest.length:.3g} m and noise {self.rest.noise:.3g}")
+
+    def _search(
+        self, space: Lags, lags: Tensor, positions: np.ndarray, targets: np.ndarray
+    ) -> tuple[Trend, np.ndarray]:
+        """The next search's trend, and the powers (n, K) it says of each row without that row."""
         assert self.site is not None and self.site.grid is not None
+        receivers = torch.from_numpy(positions).float()
+        rows = _spread(len(targets), self.search.rows)
         still = self.site.static_position
         first = None if still is None else torch.from_numpy(np.asarray(still)).float()
-        self.sources = find_sources(
-            lags[rows],
-            receivers[rows],
-            first,
-            self.rotation(),
-            space,
-            self.site.grid,
-            self.search,
-            self.seed,
-        )
-        found_s = time.perf_counter() - begin
+        sources = find_sources(
+            lags[rows], receivers[rows], first, self.rotation(), space, self.site.grid, self.search,
+            self.seed + len(self.trends),
+        )  # fmt: skip
         power = torch.cat([
-            powers(part, self._atoms(space, some), self.search.ridge).detach()
+            powers(part, self._atoms(space, sources, some), self.search.ridge)
             for part, some in zip(lags.split(BLOCK), receivers.split(BLOCK), strict=True)
         ]).double().numpy()  # fmt: skip
-        self._choose(space, positions, power, targets)
-        left = self._residuals(space, positions, power, targets)
-        self.positions = positions
-        self._learn_rest(left)
-        log.info(
-            "%s: %d sources in %.1f s, trend %.3g m, rest %.3g m and noise %.3g",
-            self.name, len(self.sources), found_s, self.smooth.length, self.rest.length, self.rest.noise,
-        )  # fmt: skip
-        return (f"{self.name}: {len(self.sources)} sources, trend over {self.smooth.length:.3g} m",)
+        kernel = self._choose(space, sources, positions, power, targets)
+        return learn_trend(sources, kernel, positions, power)
 
     def _lags(self, space: Lags, targets: np.ndarray) -> tuple[int, Tensor]:
         """Whether pixels are amplitude (2) or power (1), and the lags (n, Q) of all spectra.
@@ -136,85 +156,112 @@ class BearingField(Interpolator):
         ]
         return exponent, torch.cat(parts)
 
-    def _choose(self, space: Lags, positions: np.ndarray, power: np.ndarray, targets: np.ndarray) -> None:
-        """Length of the trend and kernel of the rest, by leaving out rows one at a time."""
+    def _choose(
+        self, space: Lags, sources: Tensor, positions: np.ndarray, power: np.ndarray, targets: np.ndarray
+    ) -> Kernel:
+        """Kernel of a trend, by leaving out rows one at a time."""
         rows = _spread(len(positions), self.trend.rows)
         diagonal = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
-        best = np.inf
+        errors = {}
         for length in self.trend.lengths:
             kernel = Kernel(length * diagonal, self.trend.noise)
-            self._learn_trend(kernel, positions[rows], power[rows])
-            left = self._residuals(space, positions[rows], power[rows], targets[rows])
-            parts = components(left, CHOOSING)
-            rest = choose_kernel(positions[rows], parts.scores, len(parts.mean))
-            error = _left_out(rest, positions[rows], parts.scores) + parts.lost * len(parts.mean)
-            if error < best:
-                best, self.smooth, self.rest = error, kernel, rest
-        self._learn_trend(self.smooth, positions, power)
+            said = learn_trend(sources, kernel, positions[rows], power[rows])[1]
+            drawn = np.zeros((len(rows), *space.image), dtype=np.float32)
+            self._add(space, sources, said, drawn, positions[rows])
+            errors[kernel] = _explained(positions[rows], self._images_less(targets[rows], -drawn))[0]
+        return min(errors, key=lambda kernel: errors[kernel])
 
-    def _learn_trend(self, kernel: Kernel, positions: np.ndarray, power: np.ndarray) -> None:
-        factor = cho_factor(kernel.gram(positions), lower=True)
-        self.level = power.mean(0)
-        self.trend_weights = cho_solve(factor, power - self.level)
-        inverse = cho_solve(factor, np.eye(len(positions)))
-        self._left_out_powers = power - self.trend_weights / np.diag(inverse)[:, None]
+    def _judge(self, positions: np.ndarray, targets: np.ndarray, drawn: np.ndarray) -> tuple[float, Kernel]:
+        """Left-out error (mean square) of all searches so far together, and the kernel of what they leave."""
+        rows = _spread(len(positions), self.trend.rows)
+        return _explained(positions[rows], self._images_less(targets[rows], drawn[rows] / -len(self.trends)))
 
-    def _residuals(
-        self, space: Lags, positions: np.ndarray, power: np.ndarray, targets: np.ndarray
-    ) -> np.ndarray:
-        """What the trend leaves of each image when it has not seen that image (n, H, W) float32."""
-        left = np.empty((len(targets), *space.image), dtype=np.float32)
+    def _add(
+        self,
+        space: Lags,
+        sources: Tensor,
+        power: np.ndarray,
+        drawn: np.ndarray,
+        places: np.ndarray | None = None,
+    ) -> None:
+        """Add to images (n, H, W) those of sources of powers (n, K) at places (n, 3), all rows by default."""
+        places = self.positions if places is None else places
+        for start in range(0, len(drawn), BLOCK):
+            rows = slice(start, start + BLOCK)
+            receivers = torch.from_numpy(places[rows]).float()
+            drawn[rows] += self._draw(space, sources, receivers, power[rows]).numpy()
+
+    def _images_less(self, targets: np.ndarray, minus: np.ndarray) -> np.ndarray:
+        """Targets plus `minus` (n, H, W) float32, in place of `minus`: images of thousands exist once."""
         for start in range(0, len(targets), BLOCK):
             rows = slice(start, start + BLOCK)
-            said = self._draw(space, torch.from_numpy(positions[rows]).float(), self._left_out_powers[rows])
-            left[rows] = (self._images(targets[rows]) - said).numpy()
-        return left
+            minus[rows] += self._images(targets[rows]).numpy()
+        return minus
 
-    def _learn_rest(self, left: np.ndarray) -> None:
+    def _learn_rest(self, left: np.ndarray, targets: np.ndarray) -> None:
+        """The process of what the trends leave (n, H, W), and how wrong both together are where."""
         self._factor = cho_factor(self.rest.gram(self.positions), lower=True)
         if self.components == 0:
             self.mean = torch.from_numpy(left.mean(0).ravel())
-            self.axes = torch.zeros(0, len(self.mean))
-            self.weights, self.lost = torch.zeros(len(left), 0, dtype=torch.float64), float(left.var())
+            self.axes, scores = torch.zeros(0, len(self.mean)), np.zeros((len(left), 0))
         else:
             parts = components(left, self.components)
-            self.weights = torch.from_numpy(cho_solve(self._factor, parts.scores))
-            self.axes, self.mean = torch.from_numpy(parts.axes), torch.from_numpy(parts.mean)
-            self.lost = parts.lost
+            self.axes, self.mean, scores = (
+                torch.from_numpy(parts.axes),
+                torch.from_numpy(parts.mean),
+                parts.scores,
+            )
+        weights = cho_solve(self._factor, scores)
+        self.weights = torch.from_numpy(weights)
+        spread = 1 / np.diag(
+            cho_solve(self._factor, np.eye(len(left)))
+        )  # left-out variance, over the amplitude
+        said = torch.from_numpy(scores - weights * spread[:, None]).float()
+        error, looks = np.empty(len(left)), []
+        for start in range(0, len(left), BLOCK):
+            rows = slice(start, start + BLOCK)
+            image = self._images(targets[rows]).flatten(1)
+            added = torch.addmm(self.mean, said[rows], self.axes)
+            found = (image - torch.from_numpy(left[rows]).flatten(1) + added).clamp_(0, 1)
+            error[rows] = ((found - image).square().sum(1) / image.square().sum(1).clamp_min(1e-12)).numpy()
+            looks.append(_looks(spread[rows], found, added))
+        self.doubt = learn_doubt(self.positions, error, _joined(looks))
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        space, power = self.lags(), self.powers_at(queries)
-        said = self._draw(space, torch.from_numpy(queries).float(), power).reshape(len(queries), -1)
+        space, receivers = self.lags(), torch.from_numpy(queries).float()
+        drawn = torch.zeros(len(queries), space.image[0] * space.image[1])
+        for trend in self.trends:
+            power = trend.powers_at(queries, self.positions)
+            drawn += self._draw(space, trend.sources, receivers, power).flatten(1)
         cross = self.rest.cross(queries, self.positions)
-        scores = (torch.from_numpy(cross) @ self.weights).float()
-        mean = self._decode(said + torch.addmm(self.mean, scores, self.axes))
+        added = torch.addmm(self.mean, (torch.from_numpy(cross) @ self.weights).float(), self.axes)
+        mean = self._decode(drawn.div_(len(self.trends)).add_(added))
         prior = 1 + self.rest.noise
-        left = np.clip(prior - (cross * cho_solve(self._factor, cross.T).T).sum(1), 0.0, prior)
+        left = np.clip(prior - (cross * cho_solve(self._factor, cross.T).T).sum(1), 1e-9, prior)
+        relative = torch.from_numpy(
+            self.doubt.relative_error(queries, _looks(left, mean.flatten(1), added))
+        ).float()
         return Prediction(
             mean,
-            confidence=torch.from_numpy(1 - left / prior).float(),
-            variance=torch.from_numpy(self.rest.amplitude * left + self.lost).float(),
+            confidence=1 / (1 + relative),
+            variance=relative * mean.square().flatten(1).mean(1),
         )
 
     def size(self) -> int:
-        """Number of sources."""
-        return len(self.sources)
+        """Number of sources of all searches."""
+        return sum(len(trend.sources) for trend in self.trends)
 
-    def _draw(self, space: Lags, receivers: Tensor, power: np.ndarray) -> Tensor:
-        """Images (n, H, W) of the sources' powers (n, K) at receivers (n, 3) [m]."""
-        lags = mixed(torch.from_numpy(power).float(), self._atoms(space, receivers))
+    def _draw(self, space: Lags, sources: Tensor, receivers: Tensor, power: np.ndarray) -> Tensor:
+        """Images (n, H, W) of sources of powers (n, K) at receivers (n, 3) [m]."""
+        lags = mixed(torch.from_numpy(power).float(), self._atoms(space, sources, receivers))
         image = space.spectrum(lags)
         return image.sqrt_() if self.exponent == 2 else image
 
-    def _atoms(self, space: Lags, receivers: Tensor) -> Tensor:
-        return space.atoms(bearings(self.sources, receivers, self.rotation()))
+    def _atoms(self, space: Lags, sources: Tensor, receivers: Tensor) -> Tensor:
+        return space.atoms(bearings(sources, receivers, self.rotation()))
 
     def _images(self, targets: np.ndarray) -> Tensor:
         return torch.from_numpy(to_real(targets, "spectrum")).reshape(len(targets), *targets.shape[1:])
-
-    def powers_at(self, places: np.ndarray) -> np.ndarray:
-        """Power (n, K) of every source as its trend says, at places (n, 3) [m]."""
-        return self.level + self.smooth.cross(places, self.positions) @ self.trend_weights
 
     def rotation(self) -> Tensor:
         """(3, 3) of the array, receiver to world."""
@@ -234,25 +281,21 @@ class BearingField(Interpolator):
 
     def _learned(self) -> dict[str, Any]:
         return {
-            "sources": self.sources,
+            "trends": [trend.state() for trend in self.trends],
             "exponent": self.exponent,
-            "level": torch.from_numpy(self.level),
-            "trend_weights": torch.from_numpy(self.trend_weights),
-            "smooth": [self.smooth.length, self.smooth.noise, self.smooth.amplitude],
             "rest": [self.rest.length, self.rest.noise, self.rest.amplitude],
             "positions": torch.from_numpy(self.positions),
             "mean": self.mean,
             "axes": self.axes,
             "weights": self.weights,
-            "lost": self.lost,
+            "doubt": self.doubt.state(),
         }
 
     def _relearn(self, state: dict[str, Any]) -> None:
         self._prepared = None
-        self.sources, self.exponent = state["sources"], int(state["exponent"])
-        self.level, self.trend_weights = state["level"].numpy(), state["trend_weights"].numpy()
-        self.smooth, self.rest = (Kernel(*map(float, state[name])) for name in ("smooth", "rest"))
-        self.positions, self.lost = state["positions"].numpy(), float(state["lost"])
+        self.trends = [Trend.from_state(trend) for trend in state["trends"]]
+        self.exponent, self.rest = int(state["exponent"]), Kernel(*map(float, state["rest"]))
+        self.positions, self.doubt = state["positions"].numpy(), Doubt.from_state(state["doubt"])
         self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
         self._factor = cho_factor(self.rest.gram(self.positions), lower=True)
 
@@ -282,11 +325,37 @@ def site_problem(data: Measurements) -> str | None:
     return None
 
 
-def _left_out(kernel: Kernel, positions: np.ndarray, scores: np.ndarray) -> float:
-    """Mean squared leave-one-out error of scores (n, P) under a kernel, per row."""
+def _explained(positions: np.ndarray, left: np.ndarray) -> tuple[float, Kernel]:
+    """Left-out mean square of images (n, H, W) under the kernel of largest likelihood, and that kernel.
+
+    Rasmussen and Williams (2006), eq. 5.12.
+    """
+    parts = components(left, CHOOSING)
+    kernel = choose_kernel(positions, parts.scores, len(parts.mean))
     factor = cho_factor(kernel.gram(positions), lower=True)
     inverse = cho_solve(factor, np.eye(len(positions)))
-    return float(((cho_solve(factor, scores) / np.diag(inverse)[:, None]) ** 2).sum(1).mean())
+    missed = (cho_solve(factor, parts.scores) / np.diag(inverse)[:, None]) ** 2
+    return float(missed.sum(1).mean()) / len(parts.mean) + parts.lost, kernel
+
+
+def _settled(errors: list[float]) -> bool:
+    """Whether the last searches gained next to nothing."""
+    return len(errors) > PATIENCE and errors[-1] > (1 - LEAST_GAIN) * errors[-1 - PATIENCE]
+
+
+def _looks(left: np.ndarray, image: Tensor, added: Tensor) -> Looks:
+    """Of images (n, P) and what the process added to them (n, P); `left` (n,) is its relative variance."""
+    return Looks(
+        left,
+        image.mean(1).double().numpy(),
+        image.amax(1).double().numpy(),
+        added.square().mean(1).double().numpy(),
+    )
+
+
+def _joined(parts: list[Looks]) -> Looks:
+    names = ("left", "mean", "peak", "added")
+    return Looks(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _spread(count: int, some: int) -> np.ndarray:

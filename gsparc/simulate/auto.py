@@ -18,7 +18,7 @@ from gsparc.simulate.engine import Engine
 log = logging.getLogger(__name__)
 
 TIMED = 48  # probes that times are measured on
-REPEATS = 3
+REPEATS = 2
 TIMING_NOISE = 0.1  # a competing process moves a measured time by more than this
 
 

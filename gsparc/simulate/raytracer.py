@@ -1,7 +1,8 @@
 """Sionna's ray tracer behind our interface, with a guard for each of its traps; imported only when it traces.
 
 What is guarded: candidates cut off at the shared limit (detected, and the batch is halved and traced again),
-duplicated lines of sight (refused), materials without scattering (completed), receivers inside objects.
+specular chains lost to one another (a hash table large enough for a batch), duplicated lines of sight
+(refused), materials without scattering (completed), receivers inside objects.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from gsparc.simulate.scenes.solid import Solid
 
 log = logging.getLogger(__name__)
 
-CANDIDATES_PER_RECEIVER = 20_000  # fewer lose specular chains to hash collisions before the limit is reached
+CANDIDATES_PER_RECEIVER = 20_000
+# Two tables of this, 512 MB; Sionna's own (1e6 at least) loses a tenth of the paths of 200 receivers.
+HASHES = 64_000_000
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
 MATERIALS = {  # thickness [m] and scattering coefficient, where a scene says nothing
     "concrete": (0.20, 0.20), "brick": (0.12, 0.25), "plasterboard": (0.025, 0.10), "wood": (0.03, 0.15),
@@ -154,8 +157,11 @@ class RayTracer:
     def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Paths | None:
         """Paths, or None when the solver ran into `limit` and left some out."""
         import sionna.rt as rt
+        from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         self._stand(receivers, 2 if effects.polarisation else 1)
+        # Chains of all receivers of a call share the table; what collides is dropped without a word.
+        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = HASHES
         solver = rt.PathSolver()
         watched = _Watched(solver._candidate_generator)
         solver._candidate_generator = watched

@@ -1,4 +1,4 @@
-"""What sources where bearings cross can spare: components of what they leave, pixels, the variance.
+"""What sources where bearings cross can spare: searches, components of what they leave, pixels, the variance.
 
 Sources themselves are no knob: a quarter of 48 answers 0.02 ms sooner.
 """
@@ -6,6 +6,7 @@ Sources themselves are no knob: a quarter of 48 answers 0.02 ms sooner.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -14,6 +15,7 @@ from torch import Tensor
 from gsparc.bearings.field import BearingField
 from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import bearings, mixed
+from gsparc.bearings.trend import Trend
 from gsparc.data.schema import Measurements
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
@@ -25,7 +27,7 @@ from gsparc.tradeoff.view import View
 
 def knobs(method: BearingField) -> tuple[str, ...]:
     """What can be turned."""
-    return ("keep", "stride", "confidence")
+    return ("searches", "keep", "stride", "confidence")
 
 
 def measure(method: BearingField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
@@ -35,9 +37,9 @@ def measure(method: BearingField, data: Measurements, rows: np.ndarray) -> dict[
 
 @torch.no_grad()
 def reduced(method: BearingField, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """The mean with the strongest components of what sources leave (`keep`, a share) on fewer pixels.
+    """The mean of the first `searches` with the strongest components of what sources leave (`keep`, a share).
 
-    Without its variance, which is most of a query where many receivers were learned.
+    On fewer pixels (`stride`) and without its variance, most of a query where many receivers were learned.
     """
     assert method.site is not None and method.site.grid is not None
     if set(settings) <= {"confidence"} and settings.get("confidence", True):
@@ -51,7 +53,8 @@ def reduced(method: BearingField, settings: Settings, measured: dict[str, Tensor
             part.unflatten(-1, (height, width))[..., ::stride, ::stride].flatten(-2).contiguous()
             for part in (mean, axes)
         )
-    lean = Mean(method, mean, axes, method.weights[:, kept], stride)
+    searches = int(settings.get("searches", len(method.trends)))
+    lean = Mean(method, method.trends[: max(searches, 1)], mean, axes, method.weights[:, kept], stride)
     return Filled(lean, grid, stride) if stride > 1 else lean
 
 
@@ -60,6 +63,7 @@ class Mean(View):
 
     Args:
         inner: fitted.
+        trends: of its searches, those that are asked.
         mean, axes: (P,) and (C, P), the basis of what sources leave.
         weights: (n, C), so that scores are `kernel(query, places) @ weights`.
         stride: of the pixels P.
@@ -68,6 +72,7 @@ class Mean(View):
     def __init__(
         self,
         inner: BearingField,
+        trends: Sequence[Trend],
         mean: Tensor,
         axes: Tensor,
         weights: Tensor,
@@ -80,25 +85,36 @@ class Mean(View):
         grid = coarser(site.grid, stride) if stride > 1 else site.grid
         self._space = Lags(site.array, grid, site.wavelength) if stride > 1 else inner.lags()
         self._rotation, self._exponent = inner.rotation(), inner.exponent
-        self._sources, trend = inner.sources, (inner.level, inner.trend_weights)
-        self._level, self._trend = (torch.from_numpy(part).float().contiguous() for part in trend)
+        self._sources = [trend.sources for trend in trends]
+        self._levels = [torch.from_numpy(trend.level).float() for trend in trends]
+        self._trends = [torch.from_numpy(trend.weights).float().contiguous() for trend in trends]
         self._mean, self._axes, self._weights = mean, axes, weights.float().contiguous()
         self._middle = torch.from_numpy(inner.positions.mean(0)).float()
         self._places = torch.from_numpy(inner.positions).float() - self._middle
-        self._smooth, self._rest = (math.sqrt(3) / k.length for k in (inner.smooth, inner.rest))
+        self._smooth = [math.sqrt(3) / trend.kernel.length for trend in trends]
+        self._rest = math.sqrt(3) / inner.rest.length
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; Matern-3/2 as in `gsparc.peers.gp.Kernel`."""
         where = rx.position.reshape(-1, 3).expand(len(tx), 3)
         far = torch.linalg.vector_norm((where - self._middle)[:, None] - self._places, dim=-1)
-        power = torch.addmm(self._level, _matern(far * self._smooth), self._trend)
-        atoms = self._space.atoms(bearings(self._sources, where, self._rotation))
-        image = self._space.spectrum(mixed(power, atoms))
-        image = (image.sqrt_() if self._exponent == 2 else image).flatten(1)
+        images = [
+            self._drawn(sources, where, torch.addmm(level, _matern(far * smooth), trend))
+            for sources, level, trend, smooth in zip(
+                self._sources, self._levels, self._trends, self._smooth, strict=True
+            )
+        ]
+        image = images[0] if len(images) == 1 else torch.stack(images).mean(0)
         scores = _matern(far * self._rest) @ self._weights
         found = image.add_(torch.addmm(self._mean, scores, self._axes))
         return Prediction(from_real(found, "spectrum", self._space.image))
+
+    def _drawn(self, sources: Tensor, where: Tensor, power: Tensor) -> Tensor:
+        """Image (n, P) of one search's sources."""
+        atoms = self._space.atoms(bearings(sources, where, self._rotation))
+        image = self._space.spectrum(mixed(power, atoms))
+        return (image.sqrt_() if self._exponent == 2 else image).flatten(1)
 
     def size(self) -> int:
         """Components kept."""

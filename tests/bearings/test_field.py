@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 import torch
 from boxes import ROOM, TRANSMITTER, room_of_spectra
+from scipy.optimize import nnls
 
-from gsparc.bearings.field import BearingField
+from gsparc.bearings.field import PATIENCE, BearingField
 from gsparc.bearings.lags import Lags
-from gsparc.bearings.sources import SearchSettings, find_sources
+from gsparc.bearings.sources import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.ops import SphereGrid
 from gsparc.peers.gp import GaussianProcess
 from gsparc.scoring import score
 from gsparc.simulate.shoebox import images
+from gsparc.trainer import TrainerSettings, Training
 
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
 
@@ -73,6 +75,47 @@ def test_a_stored_field_says_the_same(data, fold, fitted, tmp_path):
     one, two = (m.predict(batch.tx, batch.rx) for m in (fitted, again))
     torch.testing.assert_close(one.mean, two.mean)
     torch.testing.assert_close(one.confidence, two.confidence)
+
+
+def test_several_searches_answer_together(data, fold, fitted, tmp_path):
+    twice = BearingField(search=SEARCH, components=64, searches=2)
+    notes = twice.fit(data, fold, tmp_path).notes
+    assert "2 searches" in notes[0] and twice.size() > fitted.size() and len(twice.trends) == 2
+    assert not torch.equal(twice.trends[0].sources, twice.trends[1].sources)
+    torch.testing.assert_close(twice.trends[0].sources, fitted.trends[0].sources)
+    split = make_split(data.moving, SplitSettings(test_fraction=0.3))
+    one, two = (score((m,), data, split, "test").figures()["psnr_db"] for m in (fitted, twice))
+    assert two > one - 0.3
+
+
+def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
+    quick = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
+    method = BearingField(search=quick, components=16)
+    method.training = Training(TrainerSettings(budget_s=1e-3))
+    method.fit(data, fold, tmp_path)
+    assert len(method.trends) == 1
+    method.training = Training(TrainerSettings(budget_s=600.0))
+    seconds = method.fit(data, fold, tmp_path).seconds
+    assert len(method.trends) > PATIENCE and seconds < 300
+    method.training = Training(resume=tmp_path / "last.ckpt")
+    with pytest.raises(ValueError, match="ckpt_path"):
+        method.fit(data, fold, tmp_path)
+
+
+def test_powers_are_the_best_that_are_not_negative():
+    rng = np.random.default_rng(0)
+    atoms, lags = (torch.from_numpy(rng.normal(size=s)).float() for s in ((3, 6, 20), (3, 20)))
+    found = powers(lags, atoms, 0.1).numpy()
+    for row, one, asked in zip(found, atoms.numpy(), lags.numpy(), strict=True):
+        stacked = np.vstack([one.T, np.sqrt(0.1) * np.eye(6)])
+        np.testing.assert_allclose(row, nnls(stacked, np.r_[asked, np.zeros(6)])[0], atol=1e-3)
+
+
+def test_the_variance_is_about_the_error(data, fold, fitted):
+    split = make_split(data.moving, SplitSettings(test_fraction=0.3))
+    found = score((fitted,), data, split, "test")
+    assert 0.4 < found.variance.mean() / found.samples["mse"].mean() < 2.5
+    assert found.confidence.min() > 0 and found.confidence.max() < 1
 
 
 def test_power_spectra_are_recognised(fold, tmp_path):

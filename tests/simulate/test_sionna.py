@@ -105,6 +105,20 @@ def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
     assert np.median(np.abs(near)) < 0.2
 
 
+def test_chains_do_not_cost_each_other_their_place(places):
+    """All chains of a call share a hash table: with edges on, a tenth of the paths was lost, and single
+    reflections, which every seed finds, differed by 2e-3 for 60 receivers and 3e-2 for 100."""
+    room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, Sampling(samples=100_000, batch=100))
+    full = Effects(diffuse=False, polarisation=False, depth=3)
+    first, second = (
+        room.trace(places, full, seed)
+        .under(replace(PLAIN, depth=1))
+        .responses(CONFERENCE.frequency_hz, np.zeros((1, 3)), room.wavelength)
+        for seed in (1, 2)
+    )
+    assert (np.abs(first - second) ** 2).sum() < 1e-5 * (np.abs(first) ** 2).sum()
+
+
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
     paths = room.trace(places[:10], Effects(depth=2))
     assert paths.gain.shape[1] == 2 and np.abs(paths.gain[:, 1]).max() > 0

@@ -1,0 +1,79 @@
+"""Powers of sources as smooth trends over the floor: a Gaussian process each, one kernel for all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.linalg import cho_factor, cho_solve
+from torch import Tensor
+
+from gsparc.peers.gp import Kernel
+
+
+@dataclass(frozen=True)
+class TrendSettings:
+    """How smooth the powers of the sources are taken to be.
+
+    Attributes:
+        lengths: of the Matern kernels tried, in diagonals of the receivers' box.
+        noise: variance of what is not smooth, relative to the kernel's.
+        rows: training rows that the length and the rest's kernel are chosen on, by leaving one out.
+    """
+
+    lengths: tuple[float, ...] = (0.06, 0.12, 0.25)
+    noise: float = 1.0
+    rows: int = 600
+
+
+@dataclass(frozen=True)
+class Trend:
+    """The sources of one search and how their powers vary.
+
+    Attributes:
+        sources: (K, 3) float32 [m].
+        kernel: of the powers over the receivers' places.
+        level: (K,) mean powers.
+        weights: (n, K), one row per receiver that was learned from.
+    """
+
+    sources: Tensor
+    kernel: Kernel
+    level: np.ndarray
+    weights: np.ndarray
+
+    def powers_at(self, places: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """Power (m, K) of every source at places (m, 3) [m]; `known` (n, 3) were learned from."""
+        return self.level + self.kernel.cross(places, known) @ self.weights
+
+    def state(self) -> dict[str, Any]:
+        """Plain tensors and numbers."""
+        return {
+            "sources": self.sources,
+            "kernel": [self.kernel.length, self.kernel.noise, self.kernel.amplitude],
+            "level": torch.from_numpy(self.level),
+            "weights": torch.from_numpy(self.weights),
+        }
+
+    @staticmethod
+    def from_state(state: Mapping[str, Any]) -> Trend:
+        """Inverse of `state`."""
+        kernel = Kernel(*map(float, state["kernel"]))
+        return Trend(state["sources"], kernel, state["level"].numpy(), state["weights"].numpy())
+
+
+def learn_trend(
+    sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
+) -> tuple[Trend, np.ndarray]:
+    """The trend of powers (n, K) at places (n, 3), and what it says of each row (n, K) without that row.
+
+    Rasmussen and Williams (2006), eq. 5.12.
+    """
+    factor = cho_factor(kernel.gram(places), lower=True)
+    level = power.mean(0)
+    weights = cho_solve(factor, power - level)
+    inverse = cho_solve(factor, np.eye(len(places)))
+    return Trend(sources, kernel, level, weights), power - weights / np.diag(inverse)[:, None]
