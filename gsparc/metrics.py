@@ -146,6 +146,7 @@ class ChannelMetrics(SampleMetric):
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "nmse_scalar": _ratio(samples["scalar_error_power"], samples["target_power"]),
             "snr_db": _mean(samples["snr_db"]),
+            **{f"snr_db_p{p}": _quantile(samples["snr_db"], p / 100) for p in (10, 50, 90)},
             "mse": _mean(samples["mse"]),
             "mae": _mean(samples["mae"]),
             "power_mae_db": _mean(np.abs(samples["power_db"])),
@@ -244,6 +245,10 @@ def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
 
 def _mean(values: np.ndarray) -> float | None:
     return None if np.isnan(values).all() else float(np.nanmean(values))
+
+
+def _quantile(values: np.ndarray, share: float) -> float | None:
+    return None if np.isnan(values).all() else float(np.nanquantile(values, share))
 
 
 def _median(values: np.ndarray) -> float | None:

@@ -94,8 +94,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         "promise/bound": threshold.bound(promise.delta),
     }  # fmt: skip
     if last > 1:
-        every = channels(method, data, rows, tones)
-        facts |= beam_facts(every.true, every.predicted, accepted)
+        # Nothing of a beam was chosen on any test row, so all of them count.
+        every = channels(method, data, fold.test, tones)
+        kept = np.isin(np.arange(len(fold.test)), test[accepted])
+        facts |= beam_facts(every.true, every.predicted, kept)
     title = f"{data.site.name}, {method.name}"
     with Progress(
         *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")

@@ -31,8 +31,13 @@ class Curve:
 
 
 def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
-    """`beams/<antennas>/*`: gain of true and predicted beams, and the loss [dB]; 8 and all antennas."""
-    facts: dict[str, Any] = {}
+    """`beams/<antennas>/*`: gain of true and predicted beams, and the loss [dB]; 8 and all antennas.
+
+    Args:
+        true, predicted: (n, A, K).
+        accepted: which of the n are.
+    """
+    facts: dict[str, Any] = {"beams/positions": len(true)}
     for count in sorted({min(8, true.shape[1]), true.shape[1]}):
         there, guess = true[:, :count], predicted[:, :count]
         loss = loss_db(there, guess).numpy()
@@ -42,9 +47,12 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
             f"beams/{count}/predicted_gain_db": float(10 * gain(there, guess).mean().log10()),
             f"beams/{count}/loss_db": float(-10 * lost.log10()),
             f"beams/{count}/loss_db_mean": float(loss.mean()),
-            f"beams/{count}/loss_db_p95": float(np.quantile(loss, 0.95)),
+            f"beams/{count}/loss_db_max": float(loss.max()),
+            f"beams/{count}/share_losing_more_than_1_db": float((loss > 1).mean()),
             f"beams/{count}/loss_db_accepted": float(loss[accepted].mean()) if accepted.any() else None,
         }
+        for percent in (50, 90, 95, 99):
+            facts[f"beams/{count}/loss_db_p{percent}"] = float(np.quantile(loss, percent / 100))
     return facts
 
 

@@ -49,10 +49,21 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
                 ]
             errors.add_row(label, *cells)
         found.append(errors)
-    antennas = sorted({int(key.split("/")[1]) for key in facts if key.startswith("beams/")})
+    antennas = sorted(
+        {int(key.split("/")[1]) for key in facts if key.startswith("beams/") and key.count("/") == 2}
+    )
     if antennas:
-        beams = Table(title="maximum-ratio beams, all positions")
-        for column in ("antennas", "gain dB", "predicted", "loss dB", "mean loss", "95 %", "mean, accepted"):
+        beams = Table(title="maximum-ratio beams, all test positions")
+        for column in (
+            "antennas",
+            "gain dB",
+            "predicted",
+            "loss dB",
+            "mean loss",
+            "95 %",
+            "worst",
+            "mean, accepted",
+        ):
             beams.add_column(column, justify="right")
         for count in antennas:
             keys = (
@@ -61,6 +72,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
                 "loss_db",
                 "loss_db_mean",
                 "loss_db_p95",
+                "loss_db_max",
                 "loss_db_accepted",
             )
             beams.add_row(str(count), *(_shown(facts[f"beams/{count}/{key}"], ".2f") for key in keys))
