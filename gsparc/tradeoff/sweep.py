@@ -11,14 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import paired_differences
-from gsparc.method import Method
+from gsparc.method import Method, Prediction
 from gsparc.predictor import Predictor
-from gsparc.scoring import CHUNK, Scores, rows_of, score
+from gsparc.scoring import Scores, rows_of, score
 from gsparc.tradeoff.points import FIGURES, Point, Settings, worded
 from gsparc.tradeoff.timing import Pace, in_turns
+from gsparc.tradeoff.view import View
 
 log = logging.getLogger(__name__)
 
@@ -81,11 +82,13 @@ def sweep(
     figure = FIGURES[data.site.kind]
     split = Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
-    rows = rows_of(fold, eval_on)
-    whole = said(candidates[0].method, data, rows)
+    rows, whole = rows_of(fold, eval_on), None
     for number, candidate in enumerate(candidates):
-        there = score([candidate.method], data, split, eval_on)
-        scored.append((there, closeness(said(candidate.method, data, rows), whole)))
+        heard = Heard(candidate.method)
+        there = score([heard], data, split, eval_on)
+        said = torch.cat(heard.means)
+        whole = said if whole is None else whole
+        scored.append((there, closeness(said, whole)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Callable[[int], object]] = {
@@ -113,10 +116,22 @@ def sweep(
     return points, {name: times[name] for name in others}
 
 
-def said(method: Method, data: Measurements, rows: np.ndarray) -> Tensor:
-    """Predictions at the places of `rows`, whose targets are not looked at."""
-    parts = [data.batch(rows[i : i + CHUNK]) for i in range(0, len(rows), CHUNK)]
-    return torch.cat([method.predict(batch.tx, batch.rx).mean for batch in parts])
+class Heard(View):
+    """A method whose answers are kept while it is scored.
+
+    Attributes:
+        means: of every batch that was asked.
+    """
+
+    def __init__(self, inner: Method) -> None:
+        super().__init__(inner)
+        self.means: list[Tensor] = []
+
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`."""
+        found = self.inner.answer(batch)
+        self.means.append(found.mean)
+        return found
 
 
 def closeness(answers: Tensor, whole: Tensor) -> float:

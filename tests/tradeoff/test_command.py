@@ -16,10 +16,11 @@ from hydra.core.hydra_config import HydraConfig
 import gsparc
 from gsparc import checkpoint
 from gsparc.clock import COPY
+from gsparc.scoring import score
 from gsparc.tradeoff import choose, stored
 from gsparc.tradeoff.__main__ import task
 from gsparc.tradeoff.points import Point
-from gsparc.tradeoff.sweep import closeness, said
+from gsparc.tradeoff.sweep import Heard, closeness
 from gsparc.tradeoff.timing import Pace, in_turns
 
 
@@ -75,10 +76,13 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
         rows = [row for row in csv.DictReader(file) if row["kept_with_model"] == "1"]
     close = [float(row["closeness_db"]) for row in rows]
     assert close == sorted(close) and close[-1] == 100.0  # the last is as near as the full model itself
-    data, rows = field.data, field.split.folds[0].test
+    data = field.data
     blind = dataclasses.replace(data, target=np.zeros_like(data.target))
-    answers = said(field.methods[0], blind, rows)
-    assert torch.equal(answers, said(field.methods[0], data, rows)) and closeness(answers, answers) == 100.0
+    heard = [Heard(field.methods[0]) for _ in range(2)]
+    for one, seen in zip(heard, (blind, data), strict=True):
+        score([one], seen, field.split)
+    answers, again = (torch.cat(one.means) for one in heard)
+    assert torch.equal(answers, again) and closeness(answers, answers) == 100.0
     assert closeness(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
 
 
