@@ -12,6 +12,8 @@ from gsparc.report.tables import results, seeds
 
 BEGIN = "<!-- results: written by `make results` -->"
 END = "<!-- end of results -->"
+LEFT_OUT = ("SSIM (uniform 7)", "MSE", "p95", "Gaussians")  # columns for the report's page
+UNSAID = ("zero",)  # rows likewise
 
 
 def refresh(path: Path, runs: Sequence[Run]) -> None:
@@ -46,9 +48,13 @@ def _short(title: str, runs: Sequence[Run]) -> str:
     rows = list(table.rows)
     for row in whole.rows[len(runs) :]:  # the baselines have no seeds
         cells = dict(zip(heads, row, strict=True))
+        if cells[heads[0]] in UNSAID:
+            continue
         named = {"query ms p50": cells["query ms p50"], "seeds": None, **cells}
         rows.append([named.get(name) for name in wanted])
     load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
     facts = runs[0].facts
     note = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} threads, load {load:.1f} per core."
-    return Table(title, table.columns, rows, note).markdown()
+    kept = [i for i, name in enumerate(wanted) if name not in LEFT_OUT]
+    short = [[row[i] for i in kept] for row in rows]
+    return Table(title, [table.columns[i] for i in kept], short, note).markdown()
