@@ -21,7 +21,17 @@ from gsparc import cli
 from gsparc.baselines import platform_cache
 from gsparc.comparison import figure, table
 from gsparc.comparison.cells import Budget, Cell, contenders, plan
-from gsparc.comparison.fitting import Filled, Prepared, Room, fill, kept_in, open_rooms, prepare
+from gsparc.comparison.fitting import (
+    Filled,
+    Prepared,
+    Remembered,
+    Room,
+    fill,
+    kept_in,
+    open_rooms,
+    prepare,
+    remember,
+)
 from gsparc.comparison.latency import Latency, latencies
 from gsparc.summary import provenance, write_summary
 
@@ -37,14 +47,14 @@ def task(config: DictConfig) -> list[table.Row]:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
     methods = contenders(settings["methods"])
-    rooms = _rooms(settings)
+    kept = kept_in(settings["cells"], platform_cache())
+    rooms = _rooms(settings, kept)
     budgets = [
         Budget(float(b["seconds"]), tuple(int(s) for s in b["seeds"]), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
-    wanted = plan([(r.dataset, r.split, r.data.site.kind) for r in rooms], methods, budgets, settings["only"])
+    wanted = plan([(r.dataset, r.split, r.kind) for r in rooms], methods, budgets, settings["only"])
     by_name = {(r.dataset, r.split): r for r in rooms}
-    kept = kept_in(settings["cells"], platform_cache())
     prepared = [
         prepare(c, methods[c.method], settings["datasets"][c.dataset], by_name[c.dataset, c.split], kept)
         for c in wanted
@@ -57,20 +67,27 @@ def task(config: DictConfig) -> list[table.Row]:
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 
-def _rooms(settings: Mapping[str, Any]) -> list[Room]:
-    """Every dataset with a path under every split, splits outermost: the best-known rooms come first."""
-    absent = [name for name, paths in settings["datasets"].items() if not any((paths or {}).values())]
-    for name in absent:
-        log.warning("%s is left out: say datasets.%s.root=DIR or .file=FILE", name, name)
-    present = {name: paths for name, paths in settings["datasets"].items() if name not in absent}
-    if not present:
-        raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
+def _rooms(settings: Mapping[str, Any], kept: Path) -> list[Room | Remembered]:
+    """Every dataset under every split, splits outermost: the best-known rooms come first.
+
+    Without its path a dataset is there as far as results were kept, for the table alone.
+    """
     wanted = [str(pattern) for pattern in settings["only"]]
-    rooms: list[Room] = []
-    for name, paths in present.items():
+    rooms: list[Room | Remembered] = []
+    for name, paths in settings["datasets"].items():
         splits = [s for s in settings["splits"] if not wanted or any(_may_match(p, name, s) for p in wanted)]
-        rooms += open_rooms(name, paths, splits) if splits else []
+        if any((paths or {}).values()):
+            rooms += open_rooms(name, paths, splits) if splits else []
+            continue
+        remembered = remember(kept, name, splits)
+        rooms += remembered
+        log.warning(
+            "%s %s: say datasets.%s.root=DIR or .file=FILE",
+            name, "is here as far as results were kept" if remembered else "is left out", name,
+        )  # fmt: skip
     rooms.sort(key=lambda room: settings["splits"].index(room.split))
+    if not rooms and not any(any((paths or {}).values()) for paths in settings["datasets"].values()):
+        raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
     if not rooms:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
     return rooms
@@ -85,7 +102,7 @@ def _may_match(pattern: str, dataset: str, split: str) -> bool:
 
 def fill_all(
     prepared: Sequence[Prepared],
-    rooms: Mapping[tuple[str, str], Room],
+    rooms: Mapping[tuple[str, str], Room | Remembered],
     train: bool = True,
     limit_s: float | None = None,
 ) -> list[Filled]:
@@ -94,13 +111,14 @@ def fill_all(
     A cell that cannot be filled is said and left out; the others go on.
     """
     filled: list[Filled] = []
-    open_cells = [p for p in prepared if p.found() is None]
-    log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(open_cells))
+    open_cells = [p for p in prepared if p.found() is None and isinstance(_room(p.cell, rooms), Room)]
+    log.info("%d cells, %d of them are there", len(prepared), sum(p.found() is not None for p in prepared))
     started = time.monotonic()
     left = sum(_expected_s(p.cell, rooms) for p in open_cells) if train else 0.0
     for number, one in enumerate(prepared, 1):
         found = one.found()
-        if found is None and train:
+        room = _room(one.cell, rooms)
+        if found is None and train and isinstance(room, Room):
             expected = _expected_s(one.cell, rooms)
             if limit_s is not None and time.monotonic() - started + expected > limit_s:
                 log.warning("max_hours: %s is not started", one.cell)
@@ -109,7 +127,7 @@ def fill_all(
             log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
             left -= expected
             try:
-                found = fill(one, rooms[one.cell.dataset, one.cell.split])
+                found = fill(one, room)
             except (ValueError, RuntimeError) as error:
                 log.warning("%s cannot be filled: %s", one.cell, cli.one_line(error))
                 continue
@@ -123,20 +141,28 @@ def fill_all(
     return filled
 
 
-def _earlier(one: Prepared, rooms: Mapping[tuple[str, str], Room]) -> list[Filled]:
+def _room(cell: Cell, rooms: Mapping[tuple[str, str], Room | Remembered]) -> Room | Remembered:
+    return rooms[cell.dataset, cell.split]
+
+
+def _earlier(one: Prepared, rooms: Mapping[tuple[str, str], Room | Remembered]) -> list[Filled]:
     """What was measured with earlier program text, where nothing newer is there."""
-    found = one.found_earlier(rooms[one.cell.dataset, one.cell.split])
+    found = one.found_earlier(_room(one.cell, rooms))
     return [] if found is None else [found]
 
 
-def _expected_s(cell: Cell, rooms: Mapping[tuple[str, str], Room]) -> float:
+def _expected_s(cell: Cell, rooms: Mapping[tuple[str, str], Room | Remembered]) -> float:
     """Seconds a cell will take: its budget on every fold, and something for scoring [s]."""
-    folds = len(rooms[cell.dataset, cell.split].folds.folds)
+    room = _room(cell, rooms)
+    folds = len(room.folds.folds) if isinstance(room, Room) else 0
     return folds * ((cell.budget_s or FREE_S) + 2.0)
 
 
 def _timed(
-    filled: Sequence[Filled], rooms: Mapping[tuple[str, str], Room], kept: Path, measure: bool
+    filled: Sequence[Filled],
+    rooms: Mapping[tuple[str, str], Room | Remembered],
+    kept: Path,
+    measure: bool,
 ) -> dict[str, dict[str, Latency]]:
     """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
     found: dict[str, dict[str, Latency]] = {}
@@ -152,9 +178,9 @@ def _timed(
                 "%s: timings are kept ones; models of %s are not here (cells=EMPTY_FOLDER trains all)",
                 dataset, ", ".join(sorted(absent)),
             )  # fmt: skip
-        elif measure and present:
+        elif measure and present and isinstance(room := rooms[dataset, split], Room):
             log.info("%s: timing single queries of every method in turns", dataset)
-            found[dataset] = latencies(present, rooms[dataset, split])
+            found[dataset] = latencies(present, room)
             file.parent.mkdir(parents=True, exist_ok=True)
             rows = {name: asdict(one) for name, one in found[dataset].items()}
             file.write_text(json.dumps(rows, indent=2))

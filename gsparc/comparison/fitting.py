@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -49,6 +50,45 @@ class Room:
     split: str
     data: Measurements
     folds: Split
+
+    @property
+    def kind(self) -> str:
+        """Of the measurements."""
+        return self.data.site.kind
+
+    @property
+    def hashes(self) -> tuple[str, str]:
+        """Of measurements and folds."""
+        return self.data.site.sha256, self.folds.sha256
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A room whose measurements are not here: what its kept results say of it.
+
+    Attributes:
+        dataset, split: names.
+        kind: of the measurements.
+        hashes: of measurements and folds.
+    """
+
+    dataset: str
+    split: str
+    kind: str
+    hashes: tuple[str, str]
+
+
+def remember(kept: Path, dataset: str, splits: Sequence[str]) -> list[Remembered]:
+    """The rooms of a dataset that most kept results speak of, one per split."""
+    found = []
+    for split in splits:
+        files = sorted(kept.glob(f"{dataset}-{split}-*/{RESULT}"))
+        facts = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+        known = Counter((f["dataset/kind"], f["dataset/sha256"], f["split/sha256"]) for f in facts)
+        if known:
+            kind, *hashes = known.most_common(1)[0][0]
+            found.append(Remembered(dataset, split, kind, (hashes[0], hashes[1])))
+    return found
 
 
 def open_rooms(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Room]:
@@ -115,32 +155,34 @@ class Prepared:
             return None
         return Filled(self.cell, self.folder, facts)
 
-    def found_earlier(self, room: Room) -> Filled | None:
+    def found_earlier(self, room: Room | Remembered) -> Filled | None:
         """The latest result of other program text or settings for this cell, the same data and split.
 
         Published results outlive the code they were measured with; a table must say so, not lose them.
         """
         stem = self.folder.name.rpartition("-")[0]
         same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
-        same |= {"dataset/sha256": room.data.site.sha256, "split/sha256": room.folds.sha256}
+        same |= dict(zip(("dataset/sha256", "split/sha256"), room.hashes, strict=True))
         found = []
         for file in self.folder.parent.glob(f"{stem}-*/{RESULT}"):
             facts = json.loads(file.read_text(encoding="utf-8"))
             if all(facts.get(name) == value for name, value in same.items()):
-                found.append((str(facts.get("made")), file.parent, facts))
+                found.append((facts.get("made") or "", file.parent, facts))
         if not found:
             return None
         _, folder, facts = max(found, key=lambda entry: entry[0])
         return Filled(self.cell, folder, {**facts, EARLIER: str(facts.get("git"))[:8]})
 
 
-def prepare(cell: Cell, contender: Contender, settings: dict[str, Any], room: Room, kept: Path) -> Prepared:
+def prepare(
+    cell: Cell, contender: Contender, settings: dict[str, Any], room: Room | Remembered, kept: Path
+) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
     model = _plain(config.model)
     by_trainer = issubclass(get_class(model["_target_"]), LearnedField)
     trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks")} if by_trainer else {}
-    name = key(model, trainer, room.data.site.sha256, room.folds.sha256)
+    name = key(model, trainer, *room.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, config, folder, not contender.timed_only)
 

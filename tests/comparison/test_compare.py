@@ -6,14 +6,13 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 from campaigns import spectra
 
 from gsparc.compare import _timed
 from gsparc.comparison.cells import Cell
-from gsparc.comparison.fitting import Filled, Prepared
+from gsparc.comparison.fitting import Filled, Prepared, Remembered, remember
 
 ROOT = Path(__file__).parents[2]
 
@@ -41,10 +40,11 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     """Published cells would vanish from the table with every edit of a method."""
     cell = Cell("toy", "random", "gp", None, None)
     prepared = Prepared(cell, None, tmp_path / "toy-random-gp-today")
-    room = SimpleNamespace(
-        data=SimpleNamespace(site=SimpleNamespace(sha256="d")), folds=SimpleNamespace(sha256="s")
-    )
-    facts = {"seed": None, "budget_s": None, "dataset/sha256": "d", "split/sha256": "s", "git": "0123456789"}
+    room = Remembered("toy", "random", "spectrum", ("d", "s"))
+    facts = {
+        "seed": None, "budget_s": None, "git": "0123456789",
+        "dataset/kind": "spectrum", "dataset/sha256": "d", "split/sha256": "s",
+    }  # fmt: skip
 
     def write(name: str, **changes: str) -> None:
         (tmp_path / name).mkdir()
@@ -58,6 +58,9 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
     write("toy-random-gp-today")
     assert prepared.found().earlier is None
+    assert remember(tmp_path, "toy", ["random", "sparse"]) == [room] and not remember(
+        tmp_path, "t", ["random"]
+    )
 
 
 @pytest.mark.slow
@@ -75,6 +78,9 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     again = compare(tmp_path, only, "latency=false")
     assert "3 cells, 3 of them are there" in again.stdout
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+    absent = compare(tmp_path, only, "datasets.own.file=null", "train=false")
+    assert absent.returncode == 0 and "as far as results were kept" in absent.stdout + absent.stderr
+    assert "3 cells, 3 of them are there" in absent.stdout
     # A cell whose result is not whole does not count.
     (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")
     cell.write_text("{")
