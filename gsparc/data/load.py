@@ -136,7 +136,7 @@ def _argos_folder(folder: Path, config: Mapping[str, Any]) -> Measurements:
         folder,
         encoder_for(room, EncoderSettings(**given), file),
         antenna=config.get("antenna", 0),
-        positions=str(config.get("positions", "encoder")),
+        positions=str(config.get("positions", "encoder")).lower(),  # `true` in YAML is no text
         align=bool(config.get("align", True)),
     )
 

@@ -27,6 +27,7 @@ class Rates:
         oracle_bps, chosen_bps: (n,) throughput with the transport blocks that arrive [bit/s].
         best_bps: (n,) of the MCS that carries most, were the channel known [bit/s].
         fails: (n,) block error rate of the chosen MCS.
+        regret_bps: (n,) throughput that the choice is expected to miss; NaN where the rule knows no doubt.
         outage: (n,) bool, the oracle's transport blocks mostly fail.
         care: what the choice allowed for: a backoff [dB], or a share of `SLOW_DECIBEL`.
     """
@@ -38,6 +39,7 @@ class Rates:
     chosen_bps: np.ndarray
     best_bps: np.ndarray
     fails: np.ndarray
+    regret_bps: np.ndarray
     outage: np.ndarray
     care: float
 
@@ -95,10 +97,9 @@ class Adaptation:
         oracle = self._highest(fails)
         if rule == "target":
             chosen = self._highest(self._fails(guess - care))
+            regret = torch.full((len(chosen),), torch.nan, dtype=torch.float64)
         else:
-            loud = band.expected_power.mean(1).clamp_min(1e-30)
-            spread = care * SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()
-            chosen = self._carries_most(guess, spread)
+            chosen, regret = self._carries_most(guess, care * self._doubt_db(band))
         delivered = self.full_bps * (1 - fails.clamp_max(1))
         snr = band.true.abs().square().mean(1) / noise
 
@@ -113,9 +114,16 @@ class Adaptation:
             of(delivered, chosen),
             delivered.max(1).values.numpy(),
             of(fails.clamp_max(1), chosen),
+            regret.numpy(),
             of(fails, oracle) > OUTAGE,
             care,
         )
+
+    @staticmethod
+    def _doubt_db(band: Band) -> Tensor:
+        """`SLOW_DECIBEL` times the root of the expected relative error (n,)."""
+        loud = band.expected_power.mean(1).clamp_min(1e-30)
+        return SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()
 
     def _effective_db(self, sinr: Tensor) -> Tensor:
         """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""
@@ -141,14 +149,21 @@ class Adaptation:
         lowest = torch.where(fails.isfinite(), number, 28).min(1).values
         return torch.where(good >= 0, good, lowest)
 
-    def _carries_most(self, effective_db: Tensor, spread_db: Tensor) -> Tensor:
-        """The MCS (n,) of the largest expected throughput; of equal ones, as where all fail, the lowest."""
-        mean = torch.zeros(effective_db.shape, dtype=torch.float64)
+    def _carries_most(self, effective_db: Tensor, spread_db: Tensor) -> tuple[Tensor, Tensor]:
+        """The MCS (n,) of the largest expected throughput, and what it is expected to miss (n,) [bit/s].
+
+        Of equal ones, as where all fail, the lowest.
+        """
+        carried = torch.zeros(effective_db.shape, dtype=torch.float64)
+        most = torch.zeros(len(effective_db), dtype=torch.float64)
         for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):
-            mean += weight * self._fails(effective_db + node * spread_db[:, None]).clamp_max(1)
-        carried = self.full_bps * (1 - mean)
-        lowest = torch.where(self._fails(effective_db).isfinite(), torch.arange(28), 28).min(1).values
-        return torch.where(carried.max(1).values > 0, carried.argmax(1), lowest)
+            fails = self._fails(effective_db + node * spread_db[:, None])
+            delivered = self.full_bps * (1 - fails.clamp_max(1))
+            carried += weight * delivered
+            most += weight * delivered.max(1).values
+        lowest = torch.where(fails.isfinite(), torch.arange(28), 28).min(1).values
+        best = carried.max(1)
+        return torch.where(best.values > 0, best.indices, lowest), most - best.values
 
     @property
     def _table(self) -> dict[str, int | bool]:

@@ -67,7 +67,7 @@ def adapt(
 
     Args:
         band: of the positions to be judged.
-        aside: of others, on which a rule's care is chosen.
+        aside: of others, on which care and backoff are chosen.
         snr_db, settings: see conf/link.yaml.
         tick: called after each level.
     """
@@ -75,14 +75,18 @@ def adapt(
         float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
     )
     median = float(band.true.abs().square().mean(1).median())
-    cares: dict[Rule, list[float]] = {"expected": settings["care"], "target": settings["backoff_db"]}
-    found: dict[Rule, list[Rates]] = {rule: [] for rule in cares}
-    for level in snr_db:
-        noise = median / 10 ** (level / 10)
-        for rule, tried in cares.items():
-            carried = {care: loop.rates(aside, noise, care, rule).chosen_bps.mean() for care in tried}
-            best = max(carried, key=lambda care: carried[care])
-            found[rule].append(loop.rates(band, noise, best, rule))
+    noises = [median / 10 ** (level / 10) for level in snr_db]
+    # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
+    carried = {
+        c: sum(loop.rates(aside, n, c, "expected").chosen_bps.mean() for n in noises)
+        for c in settings["care"]
+    }
+    care = max(carried, key=lambda c: carried[c])
+    found: dict[Rule, list[Rates]] = {"expected": [], "target": []}
+    for noise in noises:
+        found["expected"].append(loop.rates(band, noise, care, "expected"))
+        backed = {b: loop.rates(aside, noise, b).chosen_bps.mean() for b in settings["backoff_db"]}
+        found["target"].append(loop.rates(band, noise, max(backed, key=lambda b: backed[b])))
         tick()
     return found
 
@@ -122,6 +126,8 @@ def _rates_of(one: Rates, room: str, accepted: np.ndarray, score: np.ndarray) ->
         surest = score >= np.quantile(score, 1 - share)
         short = 1 - one.chosen_bps[surest].mean() / one.oracle_bps[surest].mean()
         facts[f"{room}/shortfall_surest_{share:.0%}"] = short
+    if np.isfinite(one.regret_bps).all():
+        facts |= _by_regret(one, room)
     if accepted.any():
         oracle, best = one.oracle_bps[accepted].mean(), one.best_bps[accepted].mean()
         taken = one.chosen_bps[accepted].mean()
@@ -131,6 +137,22 @@ def _rates_of(one: Rates, room: str, accepted: np.ndarray, score: np.ndarray) ->
             f"{room}/tbler_accepted": float(one.fails[accepted].mean()),
             f"{room}/off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
         }
+    return facts
+
+
+def _by_regret(one: Rates, room: str) -> dict[str, float]:
+    """`shortfall_calm_<share>`: of the positions whose choice is expected to miss least; `..._fallback`: of
+    all positions when the others send pilots. What a rate needs to know is not how large an error is, but
+    whether it crosses a step."""
+    facts: dict[str, float] = {}
+    order = np.argsort(one.regret_bps, kind="stable")
+    for share in np.arange(0.3, 1.01, 0.1):
+        calm = np.zeros(len(order), bool)
+        calm[order[: round(share * len(order))]] = True
+        together = np.where(calm, one.chosen_bps, one.oracle_bps).mean()
+        taken, oracle = one.chosen_bps[calm].mean(), one.oracle_bps[calm].mean()
+        facts[f"{room}/shortfall_calm_{share:.0%}"] = 1 - taken / oracle if oracle > 0 else 0.0
+        facts[f"{room}/shortfall_calm_{share:.0%}_fallback"] = 1 - together / one.oracle_bps.mean()
     return facts
 
 

@@ -209,7 +209,6 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     config = compose(
         f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
         "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",
-        "mcs.care=[1.0]",
         "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
         config="link",
     )  # fmt: skip
