@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -60,7 +61,7 @@ class Worth:
         share_p95: its 95th percentile over the receivers.
         nmse, nmse_p95: of the channel, median and 95th percentile.
         error, error_p95: of the deliverable, likewise.
-        seconds: time of tracing the probes without it [s].
+        seconds: CPU time of tracing `TIMED` probes without it [s].
         reason: what physics says beforehand; empty where it says nothing.
         kept: whether it is simulated.
     """
@@ -103,7 +104,7 @@ class Choice:
         effects: to simulate.
         deliverable: what was promised, in words.
         table: one row per effect.
-        seconds_all, seconds_chosen: tracing `TIMED` probes with everything and with the choice, warm [s].
+        seconds_all, seconds_chosen: the same with everything and with the choice [s].
         seconds: what deciding cost in all [s].
         verdict: filled by `verify`.
     """
@@ -223,27 +224,28 @@ def _cheapest(costs: Mapping[Effects, float], holds: Callable[[Effects], bool], 
 
 
 def _timed(engine: Engine, receivers: np.ndarray, effects: Effects) -> float:
-    """Seconds of a warm trace, the best of `REPEATS`: the first compiles, any single one may be held up."""
+    """CPU seconds of a warm trace, the best of `REPEATS`; the first compiles."""
     engine.trace(receivers, effects)
     seconds = []
     for _ in range(REPEATS):
-        start = time.perf_counter()
+        start = time.process_time()
         engine.trace(receivers, effects)
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     return min(seconds)
 
 
 def _estimate(some: Effects, full: Effects, seconds: Mapping[str, float], everything: float) -> float:
-    """Seconds of a combination, as if what each removal saves multiplied; the choice itself is then timed."""
-    ratio = 1.0
+    """Seconds of a combination, as if what each removal saves multiplied; the choice itself is then timed.
+
+    Leaving something out never costs: a time that says so is noise, which once kept effects worth nothing.
+    """
+    saved = []
     if some.depth < full.depth:
-        ratio *= seconds[f"depth > {some.depth}"] / everything
-    for name in full.on:
-        if name in seconds and name not in some.on:
-            ratio *= seconds[name] / everything
+        saved.append(f"depth > {some.depth}")
+    saved += [name for name in full.on if name in seconds and name not in some.on]
     if full.polarisation and not some.polarisation and "polarisation" in seconds:
-        ratio *= seconds["polarisation"] / everything
-    return everything * ratio
+        saved.append("polarisation")
+    return everything * math.prod(min(seconds[name] / everything, 1.0) for name in saved)
 
 
 def _keeps(effects: Effects, name: str) -> bool:

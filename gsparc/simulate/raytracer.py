@@ -82,7 +82,8 @@ class RayTracer:
         self._scene = _load(source, carrier_hz, scattering)
         self.transmitter = np.asarray(transmitter, dtype=np.float64)
         self._ports = 0
-        self.retried = 0  # batches that were halved because candidates were cut off
+        self.retried = 0  # batches traced again because candidates were cut off
+        self._room: dict[Effects, int] = {}  # how much more than usual they needed
 
     def able(self, effects: Effects) -> Effects:
         """Everything."""
@@ -132,8 +133,9 @@ class RayTracer:
             progress(start)
         return join(parts)
 
-    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int, boost: int = 1) -> Paths:
+    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
+        boost = self._room.get(effects, 1)
         limit = min(CANDIDATES_PER_RECEIVER * boost * len(receivers), LARGEST_BUFFER)
         if effects.depth == 0:
             limit = max(limit, len(receivers))
@@ -143,16 +145,15 @@ class RayTracer:
         self.retried += 1
         if limit < LARGEST_BUFFER:
             log.info("candidate paths were cut off at %d; tracing %d receivers again", limit, len(receivers))
-            return self._batch(receivers, effects, seed, boost * 4)
+            self._room[effects] = boost * 4
+            return self._batch(receivers, effects, seed)
         if len(receivers) == 1:
             raise RuntimeError(
                 f"one receiver has over {LARGEST_BUFFER} candidate paths; lower sampling.samples"
             )
         half = len(receivers) // 2
         log.info("candidate paths were cut off at %d; tracing halves of %d receivers", limit, len(receivers))
-        return join(
-            [self._batch(part, effects, seed, boost) for part in (receivers[:half], receivers[half:])]
-        )
+        return join([self._batch(part, effects, seed) for part in (receivers[:half], receivers[half:])])
 
     def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Paths | None:
         """Paths, or None when the solver ran into `limit` and left some out."""

@@ -14,7 +14,7 @@ def choice_table(choice: Choice) -> Table:
     """Every effect a row: what it is worth, what it costs, why, kept or dropped."""
     table = Table(title=f"promise: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
     table.add_column("left out")
-    for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "seconds"):
+    for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "CPU s"):
         table.add_column(name, justify="right")
     table.add_column("")
     for row in choice.table:
@@ -37,8 +37,8 @@ def reasons(choice: Choice) -> list[str]:
 def verdict(choice: Choice) -> str:
     """What was chosen, what it saves, and whether the promise holds."""
     said = (
-        f"simulated: {choice.effects}; tracing takes {choice.seconds_chosen:.1f} s instead of "
-        f"{choice.seconds_all:.1f} s on the probes ({choice.saved:.0%} saved)"
+        f"simulated: {choice.effects}; tracing takes {choice.seconds_chosen:.1f} CPU s instead of "
+        f"{choice.seconds_all:.1f} on the probes ({choice.saved:.0%} saved)"
     )
     found = choice.verdict
     if found is None:

@@ -103,6 +103,9 @@ def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
     assert starved.retried > 0 and len(again) == 20
     near = 10 * np.log10(again.received_power() / enough.received_power())
     assert np.median(np.abs(near)) < 0.2
+    tries = starved.retried
+    starved.trace(places[:20], PLAIN)
+    assert starved.retried == tries  # the room they needed is remembered
 
 
 def test_chains_do_not_cost_each_other_their_place(places):
