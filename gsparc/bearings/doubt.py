@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -73,13 +74,14 @@ class Doubt:
 
         Beyond the farthest distance at which errors were seen it grows with the distance squared.
         """
-        distance, row = self._tree().query(places, k=np.arange(1, min(NEIGHBOURS, len(self.places)) + 1))
+        distance, row = self._tree.query(places, k=np.arange(1, min(NEIGHBOURS, len(self.places)) + 1))
         columns = np.column_stack([_average(distance, self.errors[row]), looks.columns()])
         columns = np.clip(columns, self.low, self.high)
         said = self.level + ((columns - self.centre) / self.scale) @ self.slope
         beyond = np.maximum(distance[:, 0] / self.farthest, 1.0) ** 2
         return np.exp(np.clip(said, np.log(LEAST), np.log(MOST))) * beyond
 
+    @cached_property
     def _tree(self) -> cKDTree:
         return cKDTree(self.places)
 
