@@ -177,7 +177,8 @@ def transmit(
     for level in levels:
         tick(f"{level:g} dB")
         some = pusch.run(true, predicted, variance, level, order[:coarse], batch)
-        if STEEP[0] < some.failed["perfect"].mean() < STEEP[1] or _floor(some):
+        falling = STEEP[0] < some.failed["perfect"].mean() < STEEP[1]
+        if fine > coarse and (falling or _floor(some)):
             rest = pusch.run(true, predicted, variance, level, order[coarse:fine], batch)
             some = _joined(some, rest)
         found.append(some)

@@ -116,6 +116,24 @@ def test_export_on_any_grid(trained) -> None:
         predictor.csi(uplink=heard[:, :8])
 
 
+def test_a_coarse_look_may_be_all_there_is() -> None:
+    """coarse = fine once asked for a second part of no blocks."""
+    from gsparc.link.pusch import Blocks
+    from gsparc.link.study import transmit
+
+    class Half:
+        def run(self, true, predicted, variance, level, order, batch):
+            assert len(order)
+            failed = np.arange(len(order)) % 2 == 0
+            both = ("perfect", "predicted")
+            return Blocks(level, order, dict.fromkeys(both, failed), dict.fromkeys(both, failed * 0.1))
+
+    nothing = torch.zeros(5, 1)
+    for fine, blocks in ((8, 8), (20, 20)):
+        found = transmit(Half(), nothing, nothing, nothing, [1.0], (8, fine, 4), lambda now: None)
+        assert len(found[0].position) == blocks
+
+
 @needs_sionna
 @pytest.mark.slow
 def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
