@@ -13,9 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import betainc
-from scipy.stats import beta
+from scipy.stats import beta, chi2
 
 LEVELS = 50
+SURE_OF_EFFECT = 0.8
 
 
 @dataclass(frozen=True)
@@ -106,14 +107,19 @@ def choose(
 
 
 def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
-    """Variance of the share of bad ones between groups over that of independent draws; at least 1."""
+    """Variance of the share of bad ones between groups over that of independent draws; at least 1.
+
+    A variance between few groups is itself uncertain: what is returned is its one-sided bound at
+    `SURE_OF_EFFECT`, as of a normal variance.
+    """
     _, which = np.unique(group, return_inverse=True)
     counts, wrong = np.bincount(which), np.bincount(which, bad)
     share, groups = wrong.sum() / counts.sum(), len(counts)
     if groups < 2 or share in (0.0, 1.0):
         return 1.0
     between = groups / (groups - 1) * ((wrong - share * counts) ** 2).sum() / counts.sum()
-    return max(1.0, float(between / (share * (1 - share))))
+    bound = (groups - 1) / chi2.ppf(1 - SURE_OF_EFFECT, groups - 1)
+    return max(1.0, float(bound * between / (share * (1 - share))))
 
 
 def _tail(wrong: float, accepted: float, alpha: float) -> float:
