@@ -72,6 +72,7 @@ class GaussianModule(L.LightningModule):
         self.pace = pace
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
+        self.log_every = 1  # steps; a figure costs as much as a kernel to log
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
 
@@ -104,8 +105,9 @@ class GaussianModule(L.LightningModule):
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
-        self.log("train/task_loss", task.detach().mean(), prog_bar=True)
-        self.log("model/num_gaussians", float(len(self.model.gaussians)), prog_bar=True)
+        if (self.global_step + 1) % self.log_every == 0:
+            self.log("train/task_loss", task.detach().mean())
+            self.log("model/num_gaussians", float(len(self.model.gaussians)))
         return loss
 
     def validation_step(self, batch: Batch, step: int) -> None:

@@ -69,3 +69,40 @@ def test_a_prime_number_of_steps_ends_exactly(tmp_path):
 
     run(tmp_path, Count(), steps=13)
     assert steps == list(range(1, 14))
+
+
+class Watching(L.Callback):
+    """Remembers the loss of every step and what a validation is told of it."""
+
+    def __init__(self) -> None:
+        self.steps: list[float] = []
+        self.logged: dict[int, float] = {}
+
+    def on_train_batch_start(self, trainer, module, *unused):
+        if not self.steps:
+            inner = module.task_loss
+
+            def spied(*given):
+                loss = inner(*given)
+                if torch.is_grad_enabled():
+                    self.steps.append(float(loss.detach().mean()))
+                return loss
+
+            module.task_loss = spied
+            self.steps.append(float("nan"))
+
+    def on_validation_start(self, trainer, module):
+        self.logged[trainer.global_step] = float(trainer.callback_metrics["train/task_loss"])
+
+
+@pytest.mark.parametrize("val_every", [4, 7, 10])
+def test_a_learning_curve_has_the_loss_of_its_own_step(tmp_path, val_every):
+    watching = Watching()
+    method = build(compose(*brief(spectra(tmp_path / "own.npz"), "model.refit=false")).model)
+    settings = TrainerSettings(max_steps=21, batch_size=8, val_every=val_every)
+    method.training = Training(settings, callbacks=lambda: [watching])
+    data = load({"name": "own", "file": str(tmp_path / "own.npz")})
+    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path / "run")
+    assert set(watching.logged) == set(range(val_every, 22, val_every))
+    for step, loss in watching.logged.items():
+        assert loss == pytest.approx(watching.steps[step], rel=1e-6)
