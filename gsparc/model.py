@@ -185,7 +185,9 @@ class GaussianModel(nn.Module):
     def distances(self, tx: Tensor) -> Tensor:
         """d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
         x, y, z = (tx[:, None, k] - self.gaussians.means[:, k] for k in range(3))  # a sum over 3 is slow
-        return (x * x + y * y + z * z + self.settings.attenuation.d_min**2).sqrt() / self.d_ref
+        # In place: fresh memory of megabytes costs more than the arithmetic.
+        square = (x * x).addcmul_(y, y).addcmul_(z, z).add_(self.settings.attenuation.d_min**2)
+        return square.mul_(1 / self.d_ref**2).sqrt_()
 
     def attenuation(self, distance: Tensor) -> Tensor | None:
         """a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""

@@ -23,7 +23,6 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.module import GaussianModule
 
-
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 
 
@@ -151,7 +150,9 @@ def run_stage(
     if pace is not None:
         stretched = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
         callbacks = [Budget(pace), *stretched]
-    module.log_every = math.gcd(LOG_EVERY, settings.val_every)  # a validation sees the figures of its own step
+    module.log_every = math.gcd(
+        LOG_EVERY, settings.val_every
+    )  # a validation sees the figures of its own step
     per_epoch = max(1, len(fold.train) // settings.batch_size)
     trainer = L.Trainer(
         accelerator=settings.accelerator,

@@ -33,17 +33,18 @@ template <class S> GSPARC_HD Gaussian<S> gaussian(const Model<S>& model, int64_t
 template <class S> struct Frame {
     S bottom, top, left, right;
 };
-template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens) {
+template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S elevation, S column, S row, S reach, const Lens<S>& lens) {
     const S margin = S(0.01), wide = reach * S(1.0001);
     if (lens.tangent) {
         const S unit = wide * lens.elevation_step * lens.elevation_step;
         const S a11 = f.k11 * unit, a12 = f.k12 * unit, a22 = f.k22 * unit;
         const Truth<S> below = f.n[2] < 0;
-        const Extent<S> up = elevation_extent(pick(below, -f.n[2], f.n[2]), f.cosine, root(a11), root(a22));
+        const Extent<S> up = elevation_extent(pick(below, -elevation, elevation), pick(below, -f.n[2], f.n[2]), f.cosine, root(a11), root(a22));
         const S bottom = pick(below, -up.high, up.low), top = pick(below, -up.low, up.high);
         const Extent<S> across = azimuth_extent(f.n[2], f.cosine, a11, a12, a22);
-        return {(bottom - lens.first_elevation) / lens.elevation_step - margin, (top - lens.first_elevation) / lens.elevation_step + margin,
-                column + across.low / lens.azimuth_step - margin, column + across.high / lens.azimuth_step + margin};
+        const S per_row = 1 / lens.elevation_step, per_column = 1 / lens.azimuth_step;
+        return {(bottom - lens.first_elevation) * per_row - margin, (top - lens.first_elevation) * per_row + margin,
+                column + across.low * per_column - margin, column + across.high * per_column + margin};
     }
     const S half = root(wide * f.k22), across = root(wide * f.k11);
     return {row - half - margin, row + half + margin, column - across - margin, column + across + margin};
@@ -104,10 +105,10 @@ template <class S> GSPARC_HD Sight<S> sight_of(const Gaussian<S>& g, S opacity, 
     const Footprint<S> f = project(g, position, rotation, lens);
     s.depth = f.r;
     const S azimuth = pick(f.cosine > 0, angle(f.n[1], f.n[0]), S(0)), elevation = angle(f.n[2], f.cosine);
-    s.column = pick(f.present, (azimuth - lens.first_azimuth) / lens.azimuth_step, S(0));
-    s.row = pick(f.present, (elevation - lens.first_elevation) / lens.elevation_step, S(0));
+    s.column = pick(f.present, (azimuth - lens.first_azimuth) * (1 / lens.azimuth_step), S(0));
+    s.row = pick(f.present, (elevation - lens.first_elevation) * (1 / lens.elevation_step), S(0));
     s.reach = pick(f.present, reach2(f, opacity, lens), S(-1));
-    s.frame = frame_of(f, s.column, s.row, s.reach, lens);
+    s.frame = frame_of(f, elevation, s.column, s.row, s.reach, lens);
     const S middle = (f.k11 + f.k22) / 2, half = (f.k11 - f.k22) / 2;
     s.radius = root(s.reach * (middle + root(half * half + f.k12 * f.k12)));
     write_record(f, s.column, s.row, s.reach, lens, s.record);

@@ -104,19 +104,21 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     for (int k = 0; k < 3; ++k) x[k] = rotation[k] * d[0] + rotation[3 + k] * d[1] + rotation[6 + k] * d[2];
     f.r = root(dot(x, x));
     f.present = f.r > lens.near;  // of one that is not present the rest means nothing
-    for (int k = 0; k < 3; ++k) f.n[k] = x[k] / f.r;
+    const S per_r = 1 / f.r;  // one division instead of many: they take longest
+    for (int k = 0; k < 3; ++k) f.n[k] = x[k] * per_r;
     f.cosine = root(f.n[0] * f.n[0] + f.n[1] * f.n[1]);
-    const S c0 = pick(f.cosine > 0, f.n[0] / f.cosine, S(1)), c1 = pick(f.cosine > 0, f.n[1] / f.cosine, S(0));
+    const S per_cosine = 1 / f.cosine, c0 = pick(f.cosine > 0, f.n[0] * per_cosine, S(1)), c1 = pick(f.cosine > 0, f.n[1] * per_cosine, S(0));
     f.e1[0] = -c1, f.e1[1] = c0, f.e1[2] = S(0);
     f.e2[0] = -f.n[2] * c0, f.e2[1] = -f.n[2] * c1, f.e2[2] = f.cosine;
 
     S longest = 0, square = 0;  // by the longest component first: squares of 1e-20 and 1e20 are no float32 numbers
     for (int k = 0; k < 4; ++k) longest = largest_of(longest, pick(g.quat[k] < 0, -g.quat[k], g.quat[k]));
     const Truth<S> usable = longest > S(kShortestQuaternion);
-    for (int k = 0; k < 4; ++k) f.unit[k] = g.quat[k] / longest, square += f.unit[k] * f.unit[k];
-    const S length = root(square);
+    const S per_longest = 1 / longest;
+    for (int k = 0; k < 4; ++k) f.unit[k] = g.quat[k] * per_longest, square += f.unit[k] * f.unit[k];
+    const S length = root(square), per_length = 1 / length;
     f.norm = pick(usable, longest * length, S(0));
-    for (int k = 0; k < 4; ++k) f.unit[k] = pick(usable, f.unit[k] / length, S(k == 0));
+    for (int k = 0; k < 4; ++k) f.unit[k] = pick(usable, f.unit[k] * per_length, S(k == 0));
     S turn[9];
     rotation_of(f.unit, turn);
     for (int i = 0; i < 3; ++i)
@@ -129,7 +131,7 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     f.k11 = lens.low_pass, f.k12 = S(0), f.k22 = lens.low_pass;
     S spread = 0;
     for (int i = 0; i < 3; ++i) {
-        f.sigma[i] = g.scale[i] / f.r;
+        f.sigma[i] = g.scale[i] * per_r;
         f.along1[i] = dot(f.e1, f.axis[i]), f.along2[i] = dot(f.e2, f.axis[i]), f.b[i] = dot(f.n, f.axis[i]);
         const S v1 = f.stretch1 * f.along1[i] * f.sigma[i], v2 = f.stretch2 * f.along2[i] * f.sigma[i];
         f.k11 += v1 * v1, f.k12 += v1 * v2, f.k22 += v2 * v2;
@@ -141,9 +143,10 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     f.area = f.stretch1 * f.stretch2 * f.length_y;
     f.det = f.area * f.area + lens.low_pass * spread + lens.low_pass * lens.low_pass;
     f.present = f.present & (f.det > smallest(S())) & (f.k22 > smallest(S()));
-    f.root_a = root(f.k22 / f.det), f.root_b = 1 / root(f.k22), f.rho = f.k12 / f.k22;
+    const S b = 1 / f.k22;
+    f.root_a = root(f.k22 / f.det), f.root_b = root(b), f.rho = f.k12 * b;
 
-    const S near = clamped((f.r - lens.near) / lens.near, S(0), S(1));
+    const S near = clamped((f.r - lens.near) * (1 / lens.near), S(0), S(1));
     f.fade = near * near * (3 - 2 * near);
     f.compensation = lens.compensate ? f.area / root(f.det) : S(1);
     f.gain = f.fade * f.compensation;
@@ -251,18 +254,19 @@ template <class S> struct Extent {
     S low, high;
 };
 
-// Elevations [rad] that a footprint of tangent half widths (p, q) around elevation (sine >= 0, cosine) can reach:
+// Elevations [rad] that a footprint of tangent half widths (p, q) around elevation >= 0 (with its sine, cosine) can reach:
 // a bound, exact upwards. Along p = const the elevation rises with q and then falls, so its least is at an end.
-template <class S> GSPARC_HD Extent<S> elevation_extent(S sine, S cosine, S p, S q) {
+template <class S> GSPARC_HD Extent<S> elevation_extent(S elevation, S sine, S cosine, S p, S q) {
     const S half_turn = S(1.5707963267948966);
-    S low = half_turn;
-    for (int side = -1; side <= 1; side += 2) {
-        const S z = sine + side * q * cosine, horizontal2 = (cosine - side * q * sine) * (cosine - side * q * sine);
-        const S here = angle(z, root(pick(z > 0, horizontal2 + p * p, horizontal2)));
-        low = pick(here < low, here, low);
+    S z[2], across[2];
+    for (int k = 0; k < 2; ++k) {
+        const S away = k ? q : -q, forward = cosine - away * sine;
+        z[k] = sine + away * cosine;
+        across[k] = root(pick(z[k] > 0, forward * forward + p * p, forward * forward));
     }
-    const S top = angle(sine, cosine) + angle(q, S(1));
-    return {low, pick(top < half_turn, top, half_turn)};
+    const Truth<S> first = z[0] * across[1] < z[1] * across[0];  // the lower of the two, without their angles
+    const S low = angle(pick(first, z[0], z[1]), pick(first, across[0], across[1])), top = elevation + angle(q, S(1));
+    return {pick(low < half_turn, low, half_turn), pick(top < half_turn, top, half_turn)};
 }
 
 // Azimuths [rad] relative to the centre that a `tangent` footprint reaches: tangent lines from the axis.

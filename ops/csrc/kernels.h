@@ -117,6 +117,7 @@ template <class S> struct Kernels {
     void (*mark_exponentials)(int tasks, int threads, float* sums);  // see yardstick.h
     void (*mark_copy)(const char* from, char* to, int64_t bytes, int threads);
     int64_t (*mark_pairs)(const PlanView<S>&, const Lens<S>&, int threads);
+    void (*bin_strip)(const int16_t* first, const int16_t* last, int count, int strip, int32_t* to);  // see bins.h; may be null
 };
 
 template <class S> const Kernels<S>& kernels();  // the fastest set this machine has

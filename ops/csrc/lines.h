@@ -58,6 +58,8 @@ template <class S> struct Lines {
         : width(padded(kFeatures + per_pose(plan, samples, channels))), rows(int64_t(plan.poses) * plan.count * width, false) {
         constexpr int chunk = 512;
         const int chunks = (plan.count + chunk - 1) / chunk;
+        S units[kRecord];  // of a record's numbers
+        for (int k = 0; k < kRecord; ++k) units[k] = k == kReach ? S(kHalvings) : k < 6 && (lens.tangent || k > 1) ? S(1 / kOffset) : S(1);
         auto fill = [&](int task, int) {
             const int pose = task / chunks, begin = task % chunks * chunk;
             const int end = begin + chunk < plan.shown[pose] ? begin + chunk : plan.shown[pose];
@@ -72,10 +74,8 @@ template <class S> struct Lines {
                     if (features) __builtin_prefetch(features + (int64_t(first) * plan.count + later) * channels);
                 }
                 const S* record = plan.records + (int64_t(pose) * plan.count + i) * kRecord;
-                memcpy(row, record, kReach * sizeof(S));
-                for (int k = lens.tangent ? 0 : 2; k < 6; ++k) row[k] *= S(1 / kOffset);
+                for (int k = 0; k < kRecord; ++k) row[k] = units[k] * record[k];
                 if (!lens.tangent) row[3] = -row[2] * record[3];
-                row[kReach] = record[kReach] * S(kHalvings);
                 row[kOpacity] = record[kGain] * model.opacities[i];
                 row[kExtinction] = model.extinctions ? record[kGain] * model.extinctions[i] : row[kOpacity];
                 const Range range = range_of(plan.boxes[at], lens.width);

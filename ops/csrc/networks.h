@@ -12,6 +12,26 @@ namespace GSPARC_ISA {
 
 constexpr int kNetworkChunk = 64, kSamplesAtOnce = 4;
 
+// Rows of C numbers, n of them, as C rows of n.
+template <class S> GSPARC_INLINE void turn_rows(const S* rows, int outputs, S* to) {
+    constexpr int n = Lanes<S>::n;
+    for (int c = 0; c < outputs; ++c)
+        for (int h = 0; h < n; ++h) to[c * n + h] = rows[h * outputs + c];
+}
+#if defined(__AVX512F__)
+template <> GSPARC_INLINE void turn_rows<float>(const float* rows, int outputs, float* to) {
+    if (outputs == 1) return _mm512_storeu_ps(to, _mm512_loadu_ps(rows));
+    if (outputs == 2) {
+        const __m512 a = _mm512_loadu_ps(rows), b = _mm512_loadu_ps(rows + 16);
+        const __m512i even = _mm512_set_epi32(30, 28, 26, 24, 22, 20, 18, 16, 14, 12, 10, 8, 6, 4, 2, 0);
+        _mm512_storeu_ps(to, _mm512_permutex2var_ps(a, even, b));
+        return _mm512_storeu_ps(to + 16, _mm512_permutex2var_ps(a, _mm512_add_epi32(even, _mm512_set1_epi32(1)), b));
+    }
+    for (int c = 0; c < outputs; ++c)
+        for (int h = 0; h < 16; ++h) to[c * 16 + h] = rows[h * outputs + c];
+}
+#endif
+
 // One Gaussian's weights for a block of lanes of hidden units: first layer, bias, and the second layer by output.
 // Lanes past the last hidden unit are zero.
 template <class S> struct HiddenBlock {
@@ -24,13 +44,14 @@ template <class S> struct HiddenBlock {
         constexpr int n = Lanes<S>::n;
         const int some = a.hidden - hidden < n ? a.hidden - hidden : n;
         const S* weight2 = a.weight2 + (i * a.hidden + hidden) * a.outputs;
-        for (int c = 0; c < a.outputs; ++c)
-            for (int h = 0; h < n; ++h) second[c * n + h] = h < some ? weight2[h * a.outputs + c] : S(0);
         const S *weight1 = a.weight1 + i * a.inputs * a.hidden + hidden, *bias1 = a.bias1 + i * a.hidden + hidden;
         if (some == n) {
+            turn_rows(weight2, a.outputs, second);
             first = weight1, stride = a.hidden, bias = load(bias1);
             return;
         }
+        for (int c = 0; c < a.outputs; ++c)
+            for (int h = 0; h < n; ++h) second[c * n + h] = h < some ? weight2[h * a.outputs + c] : S(0);
         S* copy = scratch + a.outputs * n;
         S last[n] = {};
         for (int e = 0; e < a.inputs; ++e)
@@ -67,7 +88,8 @@ template <class S> void networks(const NetworkArgs<S>& a) {
     auto run = [&](int task, int worker) {
         const int64_t begin = int64_t(task) * kNetworkChunk, end = begin + kNetworkChunk < a.count ? begin + kNetworkChunk : a.count;
         for (int64_t i = begin; i < end; ++i) {
-            for (int b = 0; b < a.samples; ++b) memcpy(a.out + (int64_t(b) * a.count + i) * a.outputs, a.bias2 + i * a.outputs, a.outputs * sizeof(S));
+            for (int b = 0; b < a.samples; ++b)
+                for (int c = 0; c < a.outputs; ++c) a.out[(int64_t(b) * a.count + i) * a.outputs + c] = a.bias2[i * a.outputs + c];
             for (int hidden = 0; hidden < a.hidden; hidden += n) {
                 const HiddenBlock<S> block(a, i, hidden, memory.data + worker * each);
                 int sample = 0;

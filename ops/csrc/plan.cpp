@@ -31,7 +31,6 @@ struct Part {
 // are visible. A radix sort in as many passes as the spread of the depths needs; each part of the items counts and
 // moves its own, so that the order does not depend on how many parts there are.
 template <class S> int arrange(const S* depths, const bool* visible, const int32_t* by_id, int64_t count, int threads, int32_t* order) {
-    constexpr int digit = 12, buckets = 1 << digit;
     const Workspace<Item<S>> one(count + 1), two(count + 1);
     Bits<S> base = ~Bits<S>(0), top = 0;
     int64_t total = 0, hidden = 0;
@@ -41,16 +40,21 @@ template <class S> int arrange(const S* depths, const bool* visible, const int32
         Bits<S> key;
         std::memcpy(&key, depths + i, sizeof key);
         one[total] = {key, i}, order[hidden] = i;  // without a branch: what is not counted is written over
-        base = seen && key < base ? key : base, top = seen && key > top ? key : top;
+        const Bits<S> all = Bits<S>(0) - Bits<S>(seen);
+        base = std::min(base, Bits<S>(key | ~all)), top = std::max(top, Bits<S>(key & all));
         total += seen, hidden += !seen;
     }
     if (hidden) std::memmove(order + total, order, hidden * sizeof *order);
     if (total == 0) return 0;
     const Bits<S> spread = top - base;
     const int parts = total >= 8192 && threads > 1 ? std::min(threads, 8) : 1;
+    int bits = 0;
+    while (bits < int(8 * sizeof(S)) && spread >> bits != 0) ++bits;
+    const int most = total >= 16384 ? 14 : 12, passes = (bits + most - 1) / most;  // more buckets than items only cost
+    const int digit = passes ? (bits + passes - 1) / passes : 1, buckets = 1 << digit;
     Item<S>*from = one.data, *to = two.data;
     std::vector<uint32_t> counts(int64_t(parts) * buckets);
-    for (int shift = 0; shift < int(8 * sizeof(S)) && spread >> shift != 0; shift += digit) {
+    for (int shift = 0; shift < bits; shift += digit) {
         auto bucket = [&](const Item<S>& item) { return (item.key - base) >> shift & (buckets - 1); };
         auto tally = [&](int k, int) {
             const Part part(total, k, parts);
@@ -179,8 +183,33 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     return -1;
 }
 
+constexpr int kMostSearched = 64;  // strips that each look at all footprints; of more, footprints look for their strips
+
+// Each strip picks its footprints.
+template <class S> void search_entries(const PlanView<S>& plan, int threads, int32_t* entries) {
+    const int64_t room = (int64_t(plan.count) + kLanes - 1) / kLanes * kLanes;
+    const Workspace<int16_t> first(plan.poses * room), last(plan.poses * room);
+    const int chunks = int((plan.count + kBinned - 1) / kBinned);
+    auto note = [&](int task, int) {
+        const int64_t pose = task / chunks, begin = int64_t(task % chunks) * kBinned, shown = plan.shown[pose];
+        const Box* boxes = plan.boxes + pose * plan.count;
+        for (int64_t rank = begin; rank < std::min(begin + kBinned, room); ++rank) {
+            const bool seen = rank < shown;
+            first[pose * room + rank] = int16_t(seen ? boxes[rank].row0 / kStripRows : kMostSearched);
+            last[pose * room + rank] = int16_t(seen ? (boxes[rank].row1 - 1) / kStripRows : 0);
+        }
+    };
+    parallel_for(plan.poses * chunks, threads, note);
+    auto pick = [&](int task, int) {
+        const int64_t pose = task / plan.strips, base = pose * room;
+        kernels<S>().bin_strip(first.data + base, last.data + base, plan.shown[pose], task % plan.strips, entries + plan.strip_starts[task]);
+    };
+    parallel_for(plan.poses * plan.strips, threads, pick);
+}
+
 // Each chunk of ranks writes its own stretch of every strip, so ranks stay in order whoever writes.
 template <class S> void fill_entries(const PlanView<S>& plan, int threads, int32_t* entries) {
+    if (kernels<S>().bin_strip && plan.strips <= kMostSearched) return search_entries(plan, threads, entries);
     const Bins bins(plan.poses, plan.count, plan.strips);
     std::vector<int32_t> counts(bins.size());
     auto each = [&](int task, auto visit) {

@@ -113,10 +113,10 @@ template <class S> inline Gaussian<Pack<S>> gaussians(const Model<S>& model, int
 // Whether `unsound` has nothing to say.
 template <class S> inline Which<S> all_sound(const Gaussian<Pack<S>>& g, Pack<S> opacity) {
     const Pack<S> big = sizeof(S) == 4 ? S(3.4e38) : S(1.7e308), far = S(kFarthest), wide = S(kWidest), zero = S(0);
-    Which<S> fine = (opacity >= zero) & (opacity <= Pack<S>(S(1)));
-    for (int k = 0; k < 3; ++k) fine = fine & (g.mean[k] <= far) & (g.mean[k] >= -far) & (g.scale[k] <= wide) & (g.scale[k] >= zero);
-    for (int k = 0; k < 4; ++k) fine = fine & (g.quat[k] <= big) & (g.quat[k] >= -big);
-    return fine;
+    Which<S> fine = (opacity >= zero) & (opacity <= Pack<S>(S(1))), mean = fine, quat = fine;  // three chains: masks come late
+    for (int k = 0; k < 3; ++k) mean = mean & (g.mean[k] <= far) & (g.mean[k] >= -far), fine = fine & (g.scale[k] <= wide) & (g.scale[k] >= zero);
+    for (int k = 0; k < 4; ++k) quat = quat & (g.quat[k] <= big) & (g.quat[k] >= -big);
+    return fine & mean & quat;
 }
 
 // A receiver's pose in all lanes.

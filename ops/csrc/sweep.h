@@ -53,15 +53,16 @@ struct Bits {
 
 // A vector of columns that a footprint may reach; a tile of it that it may, and where the numbers of its columns lie.
 struct Quad {
-    int32_t tile;
-    uint32_t lit;  // bits of tiles
-    int32_t owner, rank;
+    uint16_t tile;
+    uint8_t lit, owner;  // lit: bits of tiles
+    int32_t rank;
 };
 struct Hit {
     int32_t tile, at;
 };
 
-constexpr int kBatch = 64;  // footprints found before their tiles are visited
+constexpr int kBatch = 64;     // footprints found before their tiles are visited
+constexpr int kFewQuads = 4;  // most footprints have at most so many: found without a branch
 
 // One worker's memory for batches.
 template <class S, bool kTangent> struct Batch {
@@ -75,7 +76,7 @@ template <class S, bool kTangent> struct Batch {
     int32_t ranks[kBatch + 1], ends[kBatch + 1];  // of each owner: its rank, the end of its hits
 
     explicit Batch(int tiles)
-        : most(3 * kBatch + tiles / kQuad + 8), quads(most, false), columns(int64_t(most) * kStride, false), hits(int64_t(most + 1) * kQuad, false), words(Bits::size(tiles), false) {}
+        : most(3 * kBatch + tiles / kQuad + 2 * kFewQuads), quads(most, false), columns(int64_t(most) * kStride, false), hits(int64_t(most + 1) * kQuad, false), words(Bits::size(tiles), false) {}
 };
 
 // Appends the tiles of a quad that are set in a mask.
@@ -94,21 +95,30 @@ template <> GSPARC_INLINE Hit* append<float>(Hit* hit, int tile, int at, unsigne
 }
 #endif
 
-// Appends the quads of tiles [first, last] that are lit: most footprints have at most `few`, found without a branch.
-GSPARC_INLINE Quad* append(Quad* quad, Bits bits, int rank, int owner, int first, int last) {
-    constexpr int few = 4;
-    for (; last - first >= few * kQuad; first += kQuad) {
-        const uint32_t lit = bits.from(first) & 15;
-        *quad = {first, lit, owner, rank};
-        quad += lit != 0;
-    }
-    const uint32_t all = bits.from(first) & ((2u << (last - first)) - 1);
-    for (int k = 0; k < few; ++k) {
-        const uint32_t lit = all >> (k * kQuad) & 15;
-        *quad = {first + k * kQuad, lit, owner, rank};
-        quad += lit != 0;
+// Appends those of the quads of 16 tiles from `first` on that are lit.
+GSPARC_INLINE Quad* append_few(Quad* quad, uint32_t lit, int rank, int owner, int first) {
+#if defined(__AVX512F__)
+    const __m256i parts = _mm256_and_si256(_mm256_srlv_epi64(_mm256_set1_epi64x(lit), _mm256_set_epi64x(12, 8, 4, 0)), _mm256_set1_epi64x(15));
+    const __m256i same = _mm256_set1_epi64x(int64_t(uint64_t(uint32_t(rank)) << 32 | uint32_t(owner) << 24 | uint32_t(first)));
+    const __m256i all = _mm256_add_epi64(_mm256_add_epi64(same, _mm256_set_epi64x(12, 8, 4, 0)), _mm256_slli_epi64(parts, 16));
+    const __mmask8 some = _mm256_test_epi64_mask(parts, parts);
+    _mm256_storeu_si256(reinterpret_cast<__m256i*>(quad), _mm256_maskz_compress_epi64(some, all));
+    return quad + __builtin_popcount(some);
+#else
+    for (int k = 0; k < kFewQuads; ++k) {
+        const uint32_t part = lit >> (k * kQuad) & 15;
+        *quad = {uint16_t(first + k * kQuad), uint8_t(part), uint8_t(owner), rank};
+        quad += part != 0;
     }
     return quad;
+#endif
+}
+
+// Appends the quads of tiles [first, last] that are lit.
+GSPARC_INLINE Quad* append(Quad* quad, Bits bits, int rank, int owner, int first, int last) {
+    constexpr int many = kFewQuads * kQuad;
+    for (; last - first >= many; first += many) quad = append_few(quad, bits.from(first) & 0xffff, rank, owner, first);
+    return append_few(quad, bits.from(first) & ((2u << (last - first)) - 1), rank, owner, first);
 }
 
 // Finds the tiles of the next footprints of a strip; returns the first that is left over.
