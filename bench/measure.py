@@ -18,8 +18,8 @@ from gsparc.ops import (
     freeze,
     make_plan,
     mean_weights,
-    native,
     networks,
+    operators,
     rasterize,
 )
 
@@ -190,11 +190,11 @@ def pipeline(count: int, limits: dict[str, float]) -> dict[str, Any]:
 def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     """The backward operator alone, for an upstream gradient of noise."""
     raster = composite(plan, *model, features)
-    numbers = native._numbers(plan.grid, plan.optics)
+    numbers = operators.numbers(plan.grid, plan.optics)
     upstream = torch.randn_like(raster.image)
     inputs = (upstream, None, raster.image, raster.transmittance, *model, None, features)
     place = (plan.pose.position, plan.pose.rotation, list(plan.buffers))
-    return lambda: native.composite_backward_op(*inputs, *place, *numbers)
+    return lambda: operators.composite_backward_op(*inputs, *place, *numbers)
 
 
 def by_kernel(function: Callable[[], Any]) -> dict[str, float]:

@@ -1,41 +1,24 @@
-"""The `cuda` backend: the operators of native.py with the kernels of cuda_kernels.py."""
+"""The `cuda` backend: the operators on the CUDA kernels, and views frozen by them."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import cuda_kernels, cuda_library, native
+from gsparc.ops import cuda_kernels, cuda_library, operators
 from gsparc.ops.cuda_kernels import TILE_HEIGHT, TILE_WIDTH
-from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.geometry import SphereGrid
+from gsparc.ops.operators import check_memory, composite, make_plan, mean_weights, model_of, numbers
 from gsparc.ops.plan import Plan
-from gsparc.ops.settings import Optics
 
-composite = native.composite
-mean_weights = native.mean_weights
+__all__ = ["composite", "freeze", "load", "make_plan", "mean_weights", "thaw"]
 
 
 def load() -> None:
     """Build or find the kernels and let them serve CUDA tensors (cuda_library.LibraryUnavailable)."""
     if "cuda" not in cuda_kernels.libraries:
         cuda_kernels.libraries["cuda"] = cuda_library.load()
-        cuda_kernels.register("cuda")
-
-
-def make_plan(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    strongest: Tensor,
-    ids: Tensor | None,
-    pose: Pose,
-    grid: SphereGrid,
-    optics: Optics,
-) -> Plan:
-    """Project, cull, order and bin."""
-    return replace(native.make_plan(means, quats, scales, strongest, ids, pose, grid, optics), backend="cuda")
+        operators.KERNELS["cuda"] = cuda_kernels
 
 
 def freeze(
@@ -47,17 +30,15 @@ def freeze(
     extinctions: Tensor | None,
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Order (V,) of the visible Gaussians; tiles' starts and ends, each entry's rank and 32 weights."""
-    whole, real = native._numbers(plan.grid, plan.optics)
+    whole, real = numbers(plan.grid, plan.optics)
     buffers, tiles, n = plan.buffers, cuda_kernels.tiles(whole), means.shape[0]
     capacity = cuda_kernels.capacity_of(buffers, 1, whole)
-    native._check_memory(capacity, TILE_WIDTH * TILE_HEIGHT * means.element_size())
+    check_memory(capacity, TILE_WIDTH * TILE_HEIGHT * means.element_size())
     blocks = means.new_zeros(capacity, TILE_WIDTH * TILE_HEIGHT)
     starts = buffers[6][: tiles + 1].clone()
     ends = starts[:-1].clone()
     if n > 0:
-        model = native._model(
-            means, quats, scales, opacities, extinctions, plan.pose.position, plan.pose.rotation
-        )
+        model = model_of(means, quats, scales, opacities, extinctions, plan.pose.position, plan.pose.rotation)
         tensors = [*cuda_kernels.view_of(means, buffers, whole, real), *model, None, blocks, ends]
         sizes = {"poses": 1, "count": n, "capacity": capacity}
         cuda_kernels.run("weights", means, *tensors, whole=whole, real=real, sizes=sizes)

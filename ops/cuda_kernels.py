@@ -1,4 +1,4 @@
-"""CUDA kernels for the operators that native.py and networks.py define, on torch's current stream.
+"""The operators of operators.py and networks.py by the CUDA kernels, on torch's current stream.
 
 A plan's buffers have the shapes of the CPU's, with contents of their own: records, boxes and entries go by
 Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
@@ -17,7 +17,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from gsparc.ops import cuda_library, door, native, networks
+from gsparc.ops import cuda_library, door
+from gsparc.ops.operators import check_memory, filled, gradients, layout, model_of, plan_tensors
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 BYTES_PER_ENTRY = 28  # entries and what sorting them takes
@@ -100,7 +101,7 @@ def plan(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """`gsparc::plan`."""
     poses, n = positions.shape[0], means.shape[0]
-    tensors = native._plan_tensors(means, poses, whole[0])
+    tensors = plan_tensors(means, poses, whole[0])
     starts = poses * tiles(whole) + 1
     if n == 0:
         return (*(t.zero_() for t in tensors[:6]), tensors[3].new_zeros(starts), *tensors[6:])  # type: ignore[return-value]
@@ -134,7 +135,7 @@ def plan(
         if wrong >= 0:
             door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)
         _capacities[key] = max(capacity, _capacities.get(key, 0))
-    native._check_memory(capacity, BYTES_PER_ENTRY)
+    check_memory(capacity, BYTES_PER_ENTRY)
     buffers.append(means.new_empty(starts + 2 * capacity, dtype=torch.int32))
     sizes["capacity"] = capacity
     run("bin", means, *view_of(means, buffers, whole, real), whole=whole, real=real, sizes=sizes)
@@ -171,7 +172,7 @@ def composite(
     poses = positions.shape[0]
     image = features.new_empty(features.shape[0], features.shape[2], *whole[:2])
     transmittance = means.new_empty(poses, *whole[:2])
-    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
+    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
     rows = _by_gaussian(features, poses)
     tensors = [*view_of(means, buffers, whole, real), *model, rows, image, transmittance]
     sizes = {"poses": poses, "count": means.shape[0], "channels": _channels(features, poses)}
@@ -200,9 +201,9 @@ def composite_backward(
     """`gsparc::composite_backward`."""
     poses, n, capacity = positions.shape[0], means.shape[0], capacity_of(buffers, positions.shape[0], whole)
     channels = _channels(features, poses)
-    native._check_memory(capacity, means.element_size() * (native._native.MOMENTS + channels))
-    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
-    grads = native._gradients(means, quats, scales, opacities, extinctions)
+    check_memory(capacity, means.element_size() * (layout().MOMENTS + channels))
+    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
+    grads = gradients(means, quats, scales, opacities, extinctions)
     rows = _by_gaussian(features, poses)
     slopes, screen = torch.empty_like(rows), means.new_empty(poses, n, 2)
     behind = None if grad_transmittance is None else grad_transmittance.contiguous()
@@ -214,7 +215,7 @@ def composite_backward(
     if poses == 1:
         samples, _, width = features.shape
         slopes = slopes.reshape(n, samples, width).permute(1, 0, 2).contiguous()
-    return (*native._filled(grads, means), slopes, screen)
+    return (*filled(grads, means), slopes, screen)
 
 
 def weights(
@@ -232,7 +233,7 @@ def weights(
     """`gsparc::weights`."""
     poses, n = positions.shape[0], means.shape[0]
     sums = means.new_empty(poses, n, 2)
-    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
+    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
     tensors = [*view_of(means, buffers, whole, real), *model, sums, None, None]
     if n > 0:
         sizes = {"poses": poses, "count": n, "capacity": capacity_of(buffers, poses, whole)}
@@ -256,18 +257,18 @@ def weights_backward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """`gsparc::weights_backward`."""
     poses, n, capacity = positions.shape[0], means.shape[0], capacity_of(buffers, positions.shape[0], whole)
-    native._check_memory(capacity, means.element_size() * (native._native.MOMENTS + 1))
-    model = native._model(means, quats, scales, opacities, extinctions, positions, rotations)
-    grads = native._gradients(means, quats, scales, opacities, extinctions)
+    check_memory(capacity, means.element_size() * (layout().MOMENTS + 1))
+    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
+    grads = gradients(means, quats, scales, opacities, extinctions)
     slopes = [grad_seen.contiguous(), grad_total.contiguous()]
     tensors = [*view_of(means, buffers, whole, real), *model, *slopes, *grads]
     if n > 0:
         sizes = {"poses": poses, "count": n, "channels": 1, "capacity": capacity}
         run("weights_backward", means, *tensors, whole=whole, real=real, sizes=sizes)
-    return native._filled(grads, means)
+    return filled(grads, means)
 
 
-def evaluate(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
     """`gsparc::networks`."""
     inputs = [t.contiguous() for t in (encoded, weight1, bias1, weight2, bias2)]
     samples, (count, width, hidden), channels = encoded.shape[0], weight1.shape, weight2.shape[2]
@@ -278,7 +279,7 @@ def evaluate(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     return out
 
 
-def evaluate_backward(
+def networks_backward(
     slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """`gsparc::networks_backward`."""
@@ -289,21 +290,3 @@ def evaluate_backward(
     if slope.numel():
         run("networks_backward", encoded, *inputs, *grads, whole=(width, hidden), sizes=sizes)
     return grads[0], grads[1], grads[2], grads[3]
-
-
-KERNELS = (
-    (native.plan_op, plan),
-    (native.composite_op, composite),
-    (native.composite_backward_op, composite_backward),
-    (native.weights_op, weights),
-    (native.weights_backward_op, weights_backward),
-    (networks.networks_op, evaluate),
-    (networks.networks_backward_op, evaluate_backward),
-)
-"""Operators and what computes them here."""
-
-
-def register(device: str) -> None:
-    """Let these kernels serve tensors on `device`."""
-    for operator, kernel in KERNELS:
-        operator.register_kernel(device)(kernel)

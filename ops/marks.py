@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import _native
-from gsparc.ops.native import _addresses, _numbers
+from gsparc.ops.cpu_kernels import addresses
+from gsparc.ops.operators import numbers
 from gsparc.ops.plan import Plan
 
 
@@ -28,7 +29,7 @@ def pairs(plan: Plan) -> int:
     """Pixel-Gaussian pairs inside the exact footprints of a CPU plan, over all its poses."""
     if plan.backend != "cpu":
         raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
-    whole, real = _numbers(plan.grid, plan.optics)
+    whole, real = numbers(plan.grid, plan.optics)
     twice = plan.means2d.dtype == torch.float64
     sizes = (plan.num_poses, plan.num_gaussians, torch.get_num_threads())
-    return _native.mark_pairs(twice, *sizes, whole, real, _addresses(*plan.buffers))
+    return _native.mark_pairs(twice, *sizes, whole, real, addresses(*plan.buffers))

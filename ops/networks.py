@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 from torch.library import custom_op
 
-from gsparc.ops import built
+from gsparc.ops import backends, built
+from gsparc.ops.operators import KERNELS
 
 MOST_INPUTS, MOST_OUTPUTS = 256, 4  # of the CUDA kernels, whose weights pass through registers
 
@@ -21,14 +22,12 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     """
     if encoded.requires_grad or encoded.dtype != weight1.dtype:
         return products(encoded, weight1, bias1, weight2, bias2)
+    fits = encoded.dtype in (torch.float32, torch.float64) and built.kernels() is not None
     if encoded.is_cuda:
-        single = encoded.dtype == torch.float32
-        if single and weight1.shape[1] <= MOST_INPUTS and weight2.shape[2] <= MOST_OUTPUTS:
-            from gsparc.ops import backends
-
-            backends.named("cuda")
-            return networks_op(encoded, weight1, bias1, weight2, bias2)
-    elif encoded.dtype in (torch.float32, torch.float64) and built.kernels() is not None:
+        fits = encoded.dtype == torch.float32
+        fits &= weight1.shape[1] <= MOST_INPUTS and weight2.shape[2] <= MOST_OUTPUTS
+    if fits:
+        backends.named(encoded.device.type)  # its kernels are then in the table
         return networks_op(encoded, weight1, bias1, weight2, bias2)
     return products(encoded, weight1, bias1, weight2, bias2)
 
@@ -43,12 +42,10 @@ def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     return torch.einsum("bnh,nhc->bnc", torch.relu(inner + bias1), weight2) + bias2
 
 
-@custom_op("gsparc::networks", mutates_args=(), device_types="cpu")
+@custom_op("gsparc::networks", mutates_args=())
 def networks_op(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
     """`networks`, without a gradient for `encoded`."""
-    out = encoded.new_empty(encoded.shape[0], weight1.shape[0], weight2.shape[2])
-    _run("networks", *_contiguous(encoded, weight1, bias1, weight2, bias2), out)
-    return out
+    return KERNELS[encoded.device.type].networks(encoded, weight1, bias1, weight2, bias2)
 
 
 @networks_op.register_fake
@@ -56,35 +53,18 @@ def _(encoded, weight1, bias1, weight2, bias2):
     return encoded.new_empty(encoded.shape[0], weight1.shape[0], weight2.shape[2])
 
 
-@custom_op("gsparc::networks_backward", mutates_args=(), device_types="cpu")
+@custom_op("gsparc::networks_backward", mutates_args=())
 def networks_backward_op(
     slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Gradients of weight1, bias1, weight2, bias2 for the gradient `slope` (B, N, C) of the outputs."""
-    inputs = _contiguous(encoded, weight1, bias1, weight2, bias2)
-    grads = tuple(torch.empty_like(tensor) for tensor in inputs[1:])
-    _run("networks_backward", *inputs, None, *_contiguous(slope), *grads)
-    return grads[0], grads[1], grads[2], grads[3]
+    return KERNELS[encoded.device.type].networks_backward(slope, encoded, weight1, bias1, weight2, bias2)
 
 
 @networks_backward_op.register_fake
 def _(slope, encoded, weight1, bias1, weight2, bias2):
     shapes = (weight1.shape, bias1.shape, weight2.shape, bias2.shape)
     return tuple(slope.new_empty(shape) for shape in shapes)
-
-
-def _contiguous(*tensors: Tensor) -> list[Tensor]:
-    return [tensor.contiguous() for tensor in tensors]
-
-
-def _run(name: str, encoded: Tensor, weight1: Tensor, *rest: Tensor | None) -> None:
-    """Call a CPU kernel on contiguous tensors; rest is bias1, weight2 and what else it takes."""
-    (samples, inputs), (count, _, hidden) = encoded.shape, weight1.shape
-    weight2 = rest[1]
-    assert weight2 is not None
-    sizes = (samples, count, inputs, hidden, weight2.shape[2])
-    tensors = [0 if t is None else t.data_ptr() for t in (encoded, weight1, *rest)]
-    getattr(built.kernels(), name)(encoded.dtype == torch.float64, sizes, torch.get_num_threads(), tensors)
 
 
 def _setup(ctx, inputs, output):

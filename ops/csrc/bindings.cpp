@@ -1,4 +1,4 @@
-// The Python face of the kernels. Tensors arrive as addresses: native.py, the only caller, has checked shape,
+// The Python face of the kernels. Tensors arrive as addresses: cpu_kernels.py and native.py, the only callers, have checked shape,
 // dtype and contiguity, and keeps them alive. An address of 0 is an absent tensor.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/vector.h>
@@ -261,7 +261,7 @@ int64_t mark_pairs(bool twice, int poses, int count, int threads, const Ints& wh
 }  // namespace
 
 NB_MODULE(_native, module) {
-    module.doc() = "GSpaRC CPU kernels; see native.py for their arguments";
+    module.doc() = "GSpaRC CPU kernels; see cpu_kernels.py for their arguments";
     module.attr("RECORD") = kRecord;
     module.attr("MOMENTS") = kMoments;
     module.attr("STRIP_ROWS") = kStripRows;

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsparc.ops import backends, cuda, cuda_kernels, cuda_library
+from gsparc.ops import backends, cuda, cuda_kernels, cuda_library, operators
 
 KEPT = Path(__file__).parents[2] / "build" / "shim"
 FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-x", "c++")
@@ -54,18 +54,13 @@ def on_gpu(run: Callable) -> Callable:
 def serving(where: str) -> Iterator[cuda_library.Library]:
     """CPU tensors go through the CUDA kernels, on the `shim` or on the `gpu`."""
     kernels = library() if where == "shim" else gpu()
-    before = [operator._backend_fns["cpu"] for operator, _ in cuda_kernels.KERNELS]
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(cuda_kernels.libraries, "cpu", kernels)
+        patch.setitem(operators.KERNELS, "cpu", cuda_kernels)
         patch.setattr(backends, "_cpu", lambda: cuda)
         patch.setattr(backends, "_cuda", lambda: cuda)
         if where == "gpu":
             patch.setattr(cuda_kernels, "run", on_gpu(cuda_kernels.run))
         cuda_kernels._tables.cache_clear()
-        cuda_kernels.register("cpu")
-        try:
-            yield kernels
-        finally:
-            for (operator, _), kernel in zip(cuda_kernels.KERNELS, before, strict=True):
-                operator.register_kernel("cpu")(kernel)
-            cuda_kernels._tables.cache_clear()
+        yield kernels
+    cuda_kernels._tables.cache_clear()

@@ -9,7 +9,7 @@ import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
-from gsparc.ops import SphereGrid, cuda_kernels, freeze, make_plan, native, networks, rasterize
+from gsparc.ops import SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 
@@ -115,9 +115,9 @@ def test_unsound_input_is_named(where):
         wrong = [tensor.clone() for tensor in model]
         wrong[part][row] = math.nan
         with pytest.raises(ValueError, match=f"Gaussian {row} has {name}"):
-            native.plan_op(*wrong, None, place, turn, *optics)
+            operators.plan_op(*wrong, None, place, turn, *optics)
     with pytest.raises(ValueError, match="pose is not finite"):
-        native.plan_op(*model, None, place * math.nan, turn, *optics)
+        operators.plan_op(*model, None, place * math.nan, turn, *optics)
 
 
 def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
@@ -126,7 +126,7 @@ def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
     plan = make_plan(*model, origin(), GRIDS["patch"])
     leaf = scene.means.clone().requires_grad_()
     image = rasterize(leaf, *model[1:], scene.features, origin(), GRIDS["patch"]).image
-    monkeypatch.setattr(native, "MEMORY_BOUND", plan.buffers[6].numel())
+    monkeypatch.setattr(operators, "MEMORY_BOUND", plan.buffers[6].numel())
     with pytest.raises(MemoryError, match="use fewer or smaller Gaussians"):
         image.sum().backward()
     with pytest.raises(MemoryError, match="footprint entries need"):

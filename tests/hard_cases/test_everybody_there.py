@@ -1,7 +1,7 @@
 """Everybody there: a Gaussian that covers every strip, and a million of them.
 
 Remedy: entries are counted before they are allocated, and refused with a clear line beyond a bound
-(native.py). Shown: one giant costs one entry per strip; a million huge ones stay within the stated bytes:
+(operators.py). Shown: one giant costs one entry per strip; a million huge ones stay within the stated bytes:
 entries (4 B each) + records, boxes and orders (under 200 B each) + as much again while planning.
 """
 
@@ -11,7 +11,7 @@ import pytest
 import torch
 from rasters import assert_equals_float64, one, origin, random_scene, render
 
-from gsparc.ops import SphereGrid, composite, make_plan, native
+from gsparc.ops import SphereGrid, composite, make_plan, operators
 
 GRID = SphereGrid.hemisphere()
 SMALL = SphereGrid.full_sphere(20, 40)
@@ -27,7 +27,7 @@ def test_a_giant_equals_float64(backend, projection, sigma):
 def test_one_giant_covers_every_strip():
     scene = one([1.0, 0.0, 1.0], sigma=40.0, opacity=0.5)
     plan = make_plan(scene.means, scene.quats, scene.scales, scene.opacities, origin(), GRID)
-    assert plan.buffers[6].numel() == native._strips(GRID.height)
+    assert plan.buffers[6].numel() == operators.strips(GRID.height)
     image = render(scene, origin(), GRID)["image"]
     assert torch.isfinite(image).all() and (image > 0.1).double().mean() > 0.8
 
@@ -37,7 +37,7 @@ def test_too_many_entries_are_refused_before_allocation(monkeypatch):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, origin(), GRID)
     entries = plan.buffers[6].numel()
-    monkeypatch.setattr(native, "MEMORY_BOUND", entries * 8 * 10)
+    monkeypatch.setattr(operators, "MEMORY_BOUND", entries * 8 * 10)
     leaf = scene.means.clone().requires_grad_()
     raster = composite(plan, leaf, *model[1:], scene.features)
     with pytest.raises(MemoryError, match="use fewer or smaller Gaussians"):
@@ -46,8 +46,8 @@ def test_too_many_entries_are_refused_before_allocation(monkeypatch):
 
 def test_room_for_all_that_could_be_breaks():
     """Naive: a slot of gradients for every strip that a Gaussian might touch, a million of them, 16 poses."""
-    naive = 16 * 1_000_000 * native._strips(GRID.height) * native._native.MOMENTS * 4
-    assert naive > native.MEMORY_BOUND
+    naive = 16 * 1_000_000 * operators.strips(GRID.height) * operators.layout().MOMENTS * 4
+    assert naive > operators.MEMORY_BOUND
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """The operators obey torch.library's rules and exist once; the package has one name."""
 
+import inspect
 import subprocess
 import sys
 from pathlib import Path
@@ -9,7 +10,7 @@ import torch
 from rasters import poses, random_scene
 from torch.library import opcheck
 
-from gsparc.ops import SphereGrid, composite, make_plan, native
+from gsparc.ops import SphereGrid, composite, cpu_kernels, cuda_kernels, make_plan, networks, operators
 
 ROOT = Path(__file__).parents[2]
 GRID = SphereGrid.hemisphere(10, 40)
@@ -21,14 +22,14 @@ def test_opcheck(hides):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
     view = (pose.position, pose.rotation)
-    numbers = native._numbers(GRID, plan.optics)
+    numbers = operators.numbers(GRID, plan.optics)
     leaves = [tensor.clone().requires_grad_() for tensor in model]
     hidden = scene.extinctions.clone().requires_grad_() if hides else None
     features, means2d = scene.features.clone().requires_grad_(), plan.means2d.clone().requires_grad_()
     buffers = list(plan.buffers)
-    opcheck(native.plan_op, (*model, None, *view, *numbers))
-    opcheck(native.composite_op, (*leaves, hidden, features, means2d, *view, buffers, *numbers))
-    opcheck(native.weights_op, (*leaves, hidden, *view, buffers, *numbers))
+    opcheck(operators.plan_op, (*model, None, *view, *numbers))
+    opcheck(operators.composite_op, (*leaves, hidden, features, means2d, *view, buffers, *numbers))
+    opcheck(operators.weights_op, (*leaves, hidden, *view, buffers, *numbers))
 
 
 @pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
@@ -38,14 +39,14 @@ def test_opcheck_of_the_gradients(hides, behind):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
     common = (*model, scene.extinctions)
-    view = (pose.position, pose.rotation, list(plan.buffers), *native._numbers(GRID, plan.optics))
+    view = (pose.position, pose.rotation, list(plan.buffers), *operators.numbers(GRID, plan.optics))
     before, buffers = (pose.position, pose.rotation), list(plan.buffers)
     raster = composite(plan, *model, scene.features, extinctions=scene.extinctions)
     light = torch.ones_like(raster.transmittance) if behind else None
     images = (torch.ones_like(raster.image), light, raster.image, raster.transmittance)
-    opcheck(native.composite_backward_op, (*images, *common, scene.features, *view))
-    seen = native.weights_op(*common, *before, buffers, *native._numbers(GRID, plan.optics))
-    opcheck(native.weights_backward_op, (*[torch.ones_like(part) for part in seen], *common, *view))
+    opcheck(operators.composite_backward_op, (*images, *common, scene.features, *view))
+    seen = operators.weights_op(*common, *before, buffers, *operators.numbers(GRID, plan.optics))
+    opcheck(operators.weights_backward_op, (*[torch.ones_like(part) for part in seen], *common, *view))
 
 
 def test_bare_import_is_refused_with_a_reason():
@@ -69,7 +70,7 @@ def test_importing_twice_registers_once():
 def test_plan_allocates_nothing_it_may_not(monkeypatch):
     scene = random_scene(n=50, size=4.0)
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
-    monkeypatch.setattr(native, "MEMORY_BOUND", 100)
+    monkeypatch.setattr(operators, "MEMORY_BOUND", 100)
     with pytest.raises(MemoryError, match="footprint entries need"):
         make_plan(*model, poses(0), GRID)
 
@@ -84,3 +85,13 @@ def test_inputs_on_strides_are_understood():
         assert torch.equal(a, b)
     rest = (scene.quats, scene.scales, scene.opacities, scene.features)
     assert torch.equal(composite(plain, scene.means, *rest).image, composite(strided, wide, *rest).image)
+
+
+def test_every_device_has_every_operator_with_the_same_signature():
+    defined = {**vars(operators), **vars(networks)}
+    names = [name.removesuffix("_op") for name in defined if name.endswith("_op") and name != "custom_op"]
+    assert len(names) == 7
+    for name in names:
+        expected = list(inspect.signature(defined[f"{name}_op"]._init_fn).parameters)
+        for kernels in (cpu_kernels, cuda_kernels):
+            assert list(inspect.signature(getattr(kernels, name)).parameters) == expected, (name, kernels)
