@@ -1,5 +1,5 @@
-// The Python face of the kernels. Tensors arrive as addresses: cpu_kernels.py and native.py, the only callers, have checked shape,
-// dtype and contiguity, and keeps them alive. An address of 0 is an absent tensor.
+// The Python face of the kernels. Tensors arrive as addresses: cpu_kernels.py and its like, the only callers, have checked
+// shape, dtype and contiguity, and keep them alive. An address of 0 is an absent tensor.
 #include <nanobind/nanobind.h>
 #include <nanobind/stl/vector.h>
 
