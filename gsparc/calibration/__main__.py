@@ -117,6 +117,7 @@ def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[st
             f"trial/{trial.how}/broken": trial.broken,
             f"trial/{trial.how}/broken_low": None if trial.interval is None else trial.interval[0],
             f"trial/{trial.how}/broken_high": None if trial.interval is None else trial.interval[1],
+            f"trial/{trial.how}/broken_of_all": trial.broken_of_all,
             f"trial/{trial.how}/silent": trial.silent,
             f"trial/{trial.how}/realised": trial.mean_realised,
             f"trial/{trial.how}/coverage": float(trial.coverage.mean()),
@@ -164,10 +165,12 @@ def task(config: DictConfig) -> dict[str, Any]:
         how = Settled(promise, config.confidence, bool(config.spatial), int(config.seed))
         for path in paths:
             told = store(path, settings["dataset"], settings["split"], how)
-            facts["stored/kind"], facts["stored/threshold"] = told.kind, told.threshold
-            console.print(
-                f"{path}: confidence={told.kind}, accepted from {told.threshold:.4g}", highlight=False
+            speaks = bool(np.isfinite(told.threshold))
+            facts["stored/kind"], facts["stored/threshold"] = told.kind, told.threshold if speaks else None
+            since = (
+                f"accepted from {told.threshold:.4g}" if speaks else "nothing can be promised: none accepted"
             )
+            console.print(f"{path}: confidence={told.kind}, {since}", highlight=False)
         write_summary(run_dir / "summary.json", facts)
     console.print(f"written to {run_dir}", highlight=False)
     return facts
@@ -191,6 +194,7 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
         "accepted",
         "bad among them",
         "broken",
+        "of all draws",
         "promised",
         "accepted nobody",
     ):
@@ -203,6 +207,7 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
             f"{trial.coverage.mean():.0%}",
             bad,
             _broken(trial),
+            f"{trial.broken_of_all:.1%}",
             f"{trial.delta:.0%}",
             f"{trial.silent:.0%}",
         )
@@ -213,7 +218,7 @@ def _broken(trial: Trial) -> str:
     if trial.broken is None or trial.interval is None:
         return "-"
     low, high = trial.interval
-    return f"{trial.broken:.1%} ({low:.0%} to {high:.0%})"
+    return f"{trial.broken:.1%}, {low:.0%} to {high:.0%}"
 
 
 def main() -> None:

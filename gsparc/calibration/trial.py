@@ -45,10 +45,16 @@ class Trial:
     def broken(self) -> float | None:
         """Share of draws in which more than alpha were bad, of those that accepted anybody; None of none.
 
-        The promise is at most delta.
+        The promise is delta of *all* draws (`broken_of_all`). Where most accept nobody, those that do are
+        the ones that chance flattered, and this share is larger.
         """
         spoke = self.realised[~np.isnan(self.realised)]
         return float((spoke > self.alpha).mean()) if len(spoke) else None
+
+    @property
+    def broken_of_all(self) -> float:
+        """Share of all draws in which more than alpha of the accepted were bad: what delta bounds."""
+        return float((self.realised > self.alpha).mean())  # NaN > alpha is False
 
     @property
     def interval(self) -> tuple[float, float] | None:

@@ -126,7 +126,7 @@ def test_impossible_promises_are_refused() -> None:
 def test_nobody_accepted_is_no_promise_kept() -> None:
     """A draw that accepts nobody says nothing: it is counted by itself, not among the kept."""
     trial = Trial("learned", "random", np.array([np.nan, 0.05, 0.2]), np.array([0.0, 0.5, 0.5]), 0.1, 0.1)
-    assert trial.silent == 1 / 3 and trial.broken == 0.5
+    assert trial.silent == 1 / 3 and trial.broken == 0.5 and trial.broken_of_all == 1 / 3
     low, high = trial.interval
     assert low < 0.5 < high
     mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
