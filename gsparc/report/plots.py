@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
@@ -132,6 +133,7 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     for axes, name in zip(panels, names, strict=False):
         if name in ("mse", "error_power"):
             axes.set_xscale("log")
+            axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
     for axes in panels:
         axes.grid(alpha=0.3)
     panels[0].set_ylabel("share")

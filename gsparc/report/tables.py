@@ -45,7 +45,8 @@ def results(runs: Sequence[Run]) -> Table:
             Column("effects"), Column("load", ".2f", "1-minute load per core while measured"),
             Column("data"), Column("commit"),
         ],
-        note="Brackets: 95 % intervals over test samples (independent samples assumed).",
+        note="Brackets: 95 % intervals over test samples (independent samples assumed). Baselines are timed "
+        "in turns within a run, the models of a sweep alone after it.",
     )  # fmt: skip
     for run in runs:
         p50, p95 = run.latency
