@@ -50,7 +50,11 @@ class Sources:
         count = self.gain.shape[1]
         whole = Columns.of(self.direction, self.delay, aperture).gram()
         own = (whole[:, :count, :count] * self.gain_spread.transpose(1, 2)).sum((1, 2)).real
-        loud = torch.diag_embed(self.gain.repeat(1, 3))
-        moved = torch.cat([self.follow, loud], 1)
-        placed = ((moved.transpose(1, 2).conj() @ whole @ moved).real * self.place_spread).sum((1, 2))
+        # The places' columns are the gains following, and the slopes made loud: a Gram matrix of those.
+        loud = self.gain.repeat(1, 3)
+        slopes = whole[:, count:, count:] * loud[:, None] * loud.conj()[..., None]
+        mixed = self.follow.mH @ (whole[:, :count, count:] * loud[:, None])
+        followed = self.follow.mH @ (whole[:, :count, :count] @ self.follow)
+        placed = (slopes + followed).real + 2 * mixed.real
+        placed = (placed * self.place_spread).sum((1, 2))
         return (own + placed).clamp_min(0) / (len(aperture.places) * len(aperture.tones))

@@ -38,7 +38,7 @@ class SearchSettings:
     rounds: int = 6
     picks: int = 3
     refinements: int = 1
-    final: int = 3
+    final: int = 2
     oversampling: float = 1.5
     delay_window: tuple[float, float] = (-0.12, 0.30)
     leakage: float = 3e-4
@@ -97,17 +97,15 @@ class SourceSearch:
         n = delay.shape[1]
         columns = Columns.of(direction, delay, self.aperture)
         whole, heard = columns.gram(), columns.inner(y)
-        own, cross = whole[:, :n, :n], whole[:, n:, :n]
-        inverse = torch.linalg.inv(own + torch.diag_embed((noise[:, None] / prior).to(y.dtype)))
+        torch.diagonal(whole, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
+        cross, inverse = whole[:, n:, :n], torch.linalg.inv(whole[:, :n, :n])
         gain = (inverse @ heard[:, :n, None])[..., 0]
         loud = gain.repeat(1, 3)
         slope = ((heard[:, n:] - (cross @ gain[..., None])[..., 0]) * loud.conj()).real
         follow = cross @ inverse
         projected = whole[:, n:, n:] - follow @ cross.mH
-        return _Fit(
-            columns, gain, inverse, slope, (projected * loud[:, None] * loud.conj()[..., None]).real,
-            -(follow.mH * loud[:, None]),
-        )  # fmt: skip
+        curvature = (projected * loud[:, None] * loud.conj()[..., None]).real
+        return _Fit(columns, gain, inverse, slope, curvature, follow)
 
     def _step(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
         """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on what the best gains leave."""
@@ -121,13 +119,14 @@ class SourceSearch:
     def _scaled(self, fit: _Fit, noise: Tensor) -> Tensor:
         """Curvature (B, 3 N, 3 N) in units of `_reach`, with the prior of a small step."""
         reach = self._reach(fit.gain.shape[1])
-        return fit.curvature * (reach[:, None] * reach) + torch.diag_embed(
-            noise[:, None].expand(-1, len(reach))
-        )
+        scaled = fit.curvature * (reach[:, None] * reach)
+        torch.diagonal(scaled, dim1=1, dim2=2).add_(noise[:, None])
+        return scaled
 
     def _found(self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor) -> Sources:
         """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
         reach = self._reach(fit.gain.shape[1])
+        loud = (fit.gain * scale[:, None]).repeat(1, 3)
         spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
         return Sources(
             direction,
@@ -135,7 +134,7 @@ class SourceSearch:
             fit.gain * scale[:, None],
             fit.inverse * (noise * scale**2)[:, None, None],
             spread * (noise / 2)[:, None, None],
-            fit.follow * scale[:, None, None],
+            -(fit.follow.mH * loud[:, None]),
         )
 
     def _reach(self, count: int) -> Tensor:
@@ -153,7 +152,7 @@ class _Fit:
         inverse: (B, N, N) of the regularised Gram matrix of the atoms.
         slope: (B, 3 N) downhill.
         curvature: (B, 3 N, 3 N).
-        follow: (B, N, 3 N) how gains move with places.
+        follow: (B, 3 N, N) what the slopes of unit gains have in common with the gains' inverse.
     """
 
     columns: Columns
