@@ -12,6 +12,7 @@ import matplotlib
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.comparison.table import SCORE, Row
 
@@ -51,6 +52,11 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
         for axis in line:
             axis.set_xscale("log")
             axis.grid(alpha=0.3)
+        line[1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        line[1].xaxis.set_major_formatter("{x:g}")
+        line[1].xaxis.set_minor_formatter(NullFormatter())
+        if not any(r.query_ms for r in here):
+            line[1].set_visible(False)
     handles: dict[str, Artist] = {}
     for axis in grid.flat:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))

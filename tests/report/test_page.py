@@ -89,7 +89,7 @@ def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
     refresh(document, find_runs(three))
     text = document.read_text()
     assert text.startswith("before\n") and text.endswith("after\n") and "old" not in text
-    assert "28.20 [28.00, 28.40]" in text and "| gp |" in text and "a processor, 1 threads" in text
+    assert "28.20 [28.00, 28.40]" in text and "| gp |" in text and "a processor, 1 thread(s)" in text
     document.write_text("no marks")
     with pytest.raises(ValueError, match="are needed, in this order"):
         refresh(document, find_runs(three))
