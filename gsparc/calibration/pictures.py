@@ -37,7 +37,7 @@ def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> Non
     for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
         right.scatter(
             trial.coverage, trial.realised, s=9, alpha=0.4, color=colour,
-            label=f"{trial.how}: broken in {trial.broken:.0%} of {len(trial.realised)} draws",
+            label=f"{trial.how}: broken in {trial.broken_of_all:.0%} of {len(trial.realised)} draws",
         )  # fmt: skip
     if trials:
         right.axhline(trials[0].alpha, color="black", linewidth=1)

@@ -131,3 +131,12 @@ def test_nobody_accepted_is_no_promise_kept() -> None:
     assert low < 0.5 < high
     mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
     assert mute.broken is None and mute.interval is None and mute.silent == 1
+
+
+def test_a_picture_of_nobody_accepted(tmp_path) -> None:
+    """Nothing to divide by is no reason to draw nothing."""
+    from gsparc.calibration.pictures import draw
+
+    mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
+    draw(_evidence(), [mute], "silent", tmp_path / "confidence.png")
+    assert (tmp_path / "confidence.png").stat().st_size > 1000
