@@ -95,10 +95,8 @@ def warnings(runs: Sequence[Run]) -> list[str]:
     said = [remark for run in runs for remark in remarks({**run.facts, "machine/load": None})]
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
     if loads and max(loads) > BUSY:
-        said.append(
-            f"the machine was busy (load {min(loads):.1f} to {max(loads):.1f} per core): times are inflated, "
-            "ratios less so"
-        )
+        ends = " to ".join(dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads))))
+        said.append(f"the machine was busy (load {ends} per core): times are inflated, ratios less so")
     return list(dict.fromkeys(said))
 
 
