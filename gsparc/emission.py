@@ -85,9 +85,9 @@ class Emission(nn.Module):
         """Emission (B, N, C) at position (B, 3) [m]; distance (B, N) is d_i / d_ref, without unit (eq. 1)."""
         logits = self.logits(position)
         if self.settings.log_distance:
-            logits = logits - distance.log().unsqueeze(-1)
+            logits = logits.sub_(distance.log().unsqueeze(-1))
         if self.settings.activation == "sigmoid":
-            return torch.sigmoid(logits)
+            return logits.sigmoid_()
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
 
     def inverse(self, emission: Tensor, distance: Tensor) -> Tensor:

@@ -46,8 +46,6 @@ class FrozenPlan:
             )
         batch = features if features.dim() == 3 else features.unsqueeze(0)
         samples, _, channels = batch.shape
-        columns = (
-            batch.index_select(1, self.order).transpose(0, 1).reshape(len(self.order), samples * channels)
-        )
+        columns = batch.transpose(0, 1).index_select(0, self.order).reshape(-1, samples * channels)
         image = backends.named(self.backend).thaw(self.grid, self.buffers, columns)
         return image.unflatten(0, (samples, channels)) if features.dim() == 3 else image

@@ -61,31 +61,32 @@ template <class S> int freeze(const FreezeArgs<S>& a) {
     return Lanes<S>::n;
 }
 
-// Channels [first, first + kMany) of a strip: sums of a tile stay in registers, because its blocks lie together.
-template <class S, int kMany> GSPARC_INLINE void thaw_channels(const ThawArgs<S>& a, int task, int first, S* cells) {
+// Channels [first, first + kMany) of the tile whose blocks begin at `block`, up to `past` at most; returns where they end.
+// Sums stay in registers.
+template <class S, int kMany> GSPARC_INLINE int64_t thaw_channels(const ThawArgs<S>& a, int64_t block, int64_t past, int first, S* cells) {
     constexpr int n = Lanes<S>::n;
-    int64_t block = a.starts[task];
-    const int64_t end = a.starts[task + 1], cell = int64_t(a.channels) * n;
-    while (block < end) {
-        const int32_t tile = a.heads[2 * block + 1];
-        Vec<S> sums[kMany] = {};
-        for (; block < end && a.heads[2 * block + 1] == tile; ++block) {
-            const S* feature = a.features + int64_t(a.heads[2 * block]) * a.channels + first;
-            const Vec<S> weight = load(a.weights + block * n);
-            for (int k = 0; k < kMany; ++k) sums[k] = fma(splat(feature[k]), weight, sums[k]);
-        }
-        for (int k = 0; k < kMany; ++k) store(cells + tile * cell + (first + k) * n, sums[k]);
+    const int32_t tile = a.heads[2 * block + 1];
+    Vec<S> sums[kMany] = {};
+    for (; block < past && a.heads[2 * block + 1] == tile; ++block) {
+        const S* feature = a.features + int64_t(a.heads[2 * block]) * a.channels + first;
+        const Vec<S> weight = load(a.weights + block * n);
+        for (int k = 0; k < kMany; ++k) sums[k] = fma(splat(feature[k]), weight, sums[k]);
     }
+    for (int k = 0; k < kMany; ++k) store(cells + (int64_t(tile) * a.channels + first + k) * n, sums[k]);
+    return block;
 }
 
 template <class S> void thaw_strip(const ThawArgs<S>& a, int task, S* cells) {
     constexpr int n = Lanes<S>::n, many = 16;
     const int k_count = a.channels, cell = k_count * n, row0 = task * kStripRows;
     fill(cells, int64_t(tiles_across<S>(a.width)) * cell, S(0));
-    int done = 0;
-    for (; done + many <= k_count; done += many) thaw_channels<S, many>(a, task, done, cells);
-    for (; done + 2 <= k_count; done += 2) thaw_channels<S, 2>(a, task, done, cells);
-    if (done < k_count) thaw_channels<S, 1>(a, task, done, cells);
+    const int64_t past = a.starts[task + 1];
+    for (int64_t block = a.starts[task], end = block; block < past && k_count > 0; block = end) {
+        int done = 0;  // all channels of a tile before the next: its weights stay near
+        for (; done + many <= k_count; done += many) end = thaw_channels<S, many>(a, block, past, done, cells);
+        for (; done + 2 <= k_count; done += 2) end = thaw_channels<S, 2>(a, block, past, done, cells);
+        if (done < k_count) end = thaw_channels<S, 1>(a, block, past, done, cells);
+    }
     Strip<S> strip;
     strip.row0 = row0, strip.row1 = row0 + kStripRows < a.height ? row0 + kStripRows : a.height;
     const int64_t pixels = int64_t(a.height) * a.width;
