@@ -1,0 +1,118 @@
+"""What a training step is made of, beside the rasterizer: Lightning's loop, its logging, Adam, SSIM.
+
+    python bench/step.py dataset=rfid dataset.root=FOLDER [overrides of train.py]
+
+Steps of the configured model in turns: bare (a loop of a few lines around the same module), under Lightning
+with figures logged every tenth step, and every step; the bare loop with Adam's three forms, and without SSIM.
+Medians of the steps of each turn, then of the turns, in milliseconds of the processor: what a neighbour takes
+is not counted.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import lightning.pytorch as L
+import torch
+from hydra import compose, initialize_config_module
+
+from gsparc import trainer
+from gsparc.data.load import load, split_for
+from gsparc.data.splits import Fold
+from gsparc.module import GaussianModule
+from gsparc.registry import build
+from gsparc.trainer import Training
+
+STEPS, TURNS = 40, 4
+
+
+class Watch(L.Callback):
+    """Notes when steps end, and keeps the module that takes them."""
+
+    def __init__(self) -> None:
+        self.ends: list[float] = []
+        self.module: GaussianModule | None = None
+
+    def on_train_batch_end(self, trainer, module, *unused):
+        """One more."""
+        self.ends.append(time.process_time())
+        self.module = module
+
+
+def median_step(ends: list[float]) -> float:
+    """Milliseconds between neighbouring ends."""
+    return 1e3 * statistics.median(after - before for before, after in pairwise(ends))
+
+
+class Steps:
+    """Steps of one configuration, under Lightning or bare."""
+
+    def __init__(self, overrides: list[str]) -> None:
+        with initialize_config_module("gsparc.conf", version_base="1.3"):
+            config = compose("train", overrides=["model.refit=false", *overrides])
+        torch.set_num_threads(config.threads or 1)
+        self.config, self.data = config, load(config.dataset)
+        fold = split_for(config.split, self.data).folds[0]
+        self.fold = Fold(fold.train, fold.val[:0], fold.test)  # a validation is no step
+        self.module = self.under_lightning(10)[1]
+
+    def under_lightning(self, log_every: int) -> tuple[float, GaussianModule]:
+        """Milliseconds of a step, and the module."""
+        method, watch = build(self.config.model), Watch()
+        settings = trainer.TrainerSettings(max_steps=STEPS, val_every=STEPS, checkpoint_every=10 * STEPS)
+        trainer.LOG_EVERY = log_every
+        method.training = Training(settings, callbacks=lambda: [watch])
+        with tempfile.TemporaryDirectory() as folder:
+            method.fit(self.data, self.fold, Path(folder))
+        assert watch.module is not None
+        return median_step(watch.ends), watch.module
+
+    def bare(self, adam: Callable, ssim: bool = True) -> float:
+        """Milliseconds of a step of a loop that does nothing else."""
+        module, ends = self.module, []
+        batch = self.data.batch(self.fold.train[: self.config.trainer.batch_size])
+        module.log = lambda *a, **k: None
+        module.loss = type(module.loss)(0.2 if ssim else 0.0)
+        optimizer = adam([{"params": [p]} for p in module.parameters() if p.requires_grad])
+        for _ in range(STEPS):
+            optimizer.zero_grad(set_to_none=True)
+            module.training_step(batch, 0).backward()
+            optimizer.step()
+            ends.append(time.process_time())
+        return median_step(ends)
+
+
+def main() -> None:
+    """Print the table."""
+    steps = Steps(sys.argv[1:])
+    adam = {
+        form: lambda groups, f=form: torch.optim.Adam(groups, lr=0, **{f: True})
+        for form in ("fused", "foreach")
+    }
+    contenders = {
+        "bare": lambda: steps.bare(adam["fused"]),
+        "bare, foreach Adam": lambda: steps.bare(adam["foreach"]),
+        "bare, looped Adam": lambda: steps.bare(lambda g: torch.optim.Adam(g, lr=0, foreach=False)),
+        "bare, L1 alone": lambda: steps.bare(adam["fused"], ssim=False),
+        "Lightning, logging every 10th step": lambda: steps.under_lightning(10)[0],
+        "Lightning, logging every step": lambda: steps.under_lightning(1)[0],
+    }
+    times: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(TURNS):
+        for name, call in contenders.items():
+            times[name].append(call())
+    load = os.getloadavg()[0] / (os.cpu_count() or 1)
+    rows = [f"{name:36s} {statistics.median(found):7.2f} ms" for name, found in times.items()]
+    title = f"{torch.get_num_threads()} threads, load {load:.1f} per core"
+    sys.stdout.write("\n".join([title, *rows, ""]))
+
+
+if __name__ == "__main__":
+    main()
