@@ -44,12 +44,13 @@ LAST = 0.8  # share of a budget after which no search may end
 class BearingField(Interpolator):
     """Sources seen through the receiver's array.
 
-    With `trainer.budget_s` it searches until that is spent or nothing is gained.
+    With `trainer.budget_s` it searches while that is not spent and helps.
 
     Args:
         search: how sources are found.
         trend: how smooth their powers are.
         searches: how often, without a budget.
+        rest_rows: that the kernel of the rest is chosen on; seconds grow with their cube.
         components: largest number of principal components of what the trends leave; 0: the trends alone.
         seed: of the first search; the others have the next ones.
         name: as it appears in tables.
@@ -62,15 +63,19 @@ class BearingField(Interpolator):
         search: SearchSettings | None = None,
         trend: TrendSettings | None = None,
         searches: int = 1,
+        rest_rows: int = 1500,
         components: int = 512,
         seed: int = 0,
         name: str = "bearings",
     ) -> None:
         super().__init__()
-        if searches < 1:
-            raise ValueError(f"{name}: model.searches={searches}: expected at least 1")
+        if searches < 1 or rest_rows < 3:
+            raise ValueError(
+                f"{name}: model.searches={searches}, model.rest_rows={rest_rows}: expected at least 1 and 3"
+            )
         self.search, self.trend = search or SearchSettings(), trend or TrendSettings()
-        self.searches, self.components, self.seed, self.name = searches, components, seed, name
+        self.searches, self.rest_rows, self.components = searches, rest_rows, components
+        self.seed, self.name = seed, name
         self.training = Training()
         self.trends: list[Trend] = []
 
@@ -100,24 +105,27 @@ class BearingField(Interpolator):
             trend, left_out = self._search(space, lags, positions, targets)
             self._add(space, trend.sources, left_out, drawn)
             self.trends.append(trend)
-            error, self.rest = self._judge(positions, targets, drawn)
-            errors.append(error)
+            errors.append(self._judge(positions, targets, drawn))
             now = time.perf_counter()
             longest = max(longest, now - start)
             log.info(
                 "%s: search %d, %d sources, trend %.3g m, left-out error %.4g, %.0f s",
-                self.name, len(errors), len(trend.sources), trend.kernel.length, error, now - begin,
+                self.name, len(errors), len(trend.sources), trend.kernel.length, errors[-1], now - begin,
             )  # fmt: skip
             if budget_s is None and len(errors) == self.searches:
                 break
             if budget_s is not None and (now - begin + longest > LAST * budget_s or _settled(errors)):
                 break
         drawn /= -len(self.trends)
-        self._learn_rest(self._images_less(targets, drawn), targets)
+        left = self._images_less(targets, drawn)
+        rows = _spread(len(left), self.rest_rows)
+        self.rest = _explained(positions[rows], left[rows])[1]
+        self._learn_rest(left, targets)
         note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, left-out error " + " ".join(
             f"{error:.4g}" for error in errors
         )
-        return (note, f"{self.name}: rest {self.rest.length:.3g} m and noise {self.rest.noise:.3g}")
+        rest = f"{self.rest.length:.3g} m and noise {self.rest.noise:.3g}, chosen on {len(rows)} rows"
+        return (note, f"{self.name}: rest {rest}")
 
     def _search(
         self, space: Lags, lags: Tensor, positions: np.ndarray, targets: np.ndarray
@@ -171,10 +179,11 @@ class BearingField(Interpolator):
             errors[kernel] = _explained(positions[rows], self._images_less(targets[rows], -drawn))[0]
         return min(errors, key=lambda kernel: errors[kernel])
 
-    def _judge(self, positions: np.ndarray, targets: np.ndarray, drawn: np.ndarray) -> tuple[float, Kernel]:
-        """Left-out error (mean square) of all searches so far together, and the kernel of what they leave."""
+    def _judge(self, positions: np.ndarray, targets: np.ndarray, drawn: np.ndarray) -> float:
+        """Left-out error (mean square) of all searches so far together."""
         rows = _spread(len(positions), self.trend.rows)
-        return _explained(positions[rows], self._images_less(targets[rows], drawn[rows] / -len(self.trends)))
+        left = self._images_less(targets[rows], drawn[rows] / -len(self.trends))
+        return _explained(positions[rows], left)[0]
 
     def _add(
         self,
@@ -339,8 +348,8 @@ def _explained(positions: np.ndarray, left: np.ndarray) -> tuple[float, Kernel]:
 
 
 def _settled(errors: list[float]) -> bool:
-    """Whether the last searches gained next to nothing."""
-    return len(errors) > PATIENCE and errors[-1] > (1 - LEAST_GAIN) * errors[-1 - PATIENCE]
+    """Whether the last search gained next to nothing."""
+    return len(errors) > 1 and errors[-1] > (1 - LEAST_GAIN) * errors[-2]
 
 
 def _looks(left: np.ndarray, image: Tensor, added: Tensor) -> Looks:

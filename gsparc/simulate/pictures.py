@@ -37,8 +37,16 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     )
     if changed is not None:
         known = heard[changed.rows]
-        label = "error by what was dropped, held-back receivers"
-        _map(panels[2], places[changed.rows][known], changed.errors[known], label, 40.0, robust=False)
+        errors = changed.errors[known]
+        label = "error by what was dropped" if np.ptp(errors) > 0 else "nothing dropped, no error"
+        _map(
+            panels[2],
+            places[changed.rows][known],
+            errors,
+            f"{label}: held-back receivers",
+            40.0,
+            robust=False,
+        )
     for panel in panels:
         if (~heard).any():
             x, y = places[~heard, 0], places[~heard, 1]

@@ -8,7 +8,7 @@ import torch
 from boxes import ROOM, TRANSMITTER, room_of_spectra
 from scipy.optimize import nnls
 
-from gsparc.bearings.field import PATIENCE, BearingField
+from gsparc.bearings.field import BearingField
 from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
@@ -96,7 +96,7 @@ def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
     assert len(method.trends) == 1
     method.training = Training(TrainerSettings(budget_s=600.0))
     seconds = method.fit(data, fold, tmp_path).seconds
-    assert len(method.trends) > PATIENCE and seconds < 300
+    assert len(method.trends) > 1 and seconds < 300
     method.training = Training(resume=tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match="ckpt_path"):
         method.fit(data, fold, tmp_path)
