@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
+from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
@@ -130,6 +130,9 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
             _cdf(panels[-1], np.concatenate(every), label, number)
             panels[-1].set_xlabel("one query, alone [ms]")
             panels[-1].set_xscale("log")
+            panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            panels[-1].xaxis.set_major_formatter("{x:g}")
+            panels[-1].xaxis.set_minor_formatter(NullFormatter())
     for axes, name in zip(panels, names, strict=False):
         if name in ("mse", "error_power"):
             axes.set_xscale("log")
@@ -320,4 +323,9 @@ def _legend(axes: Axes) -> None:
 
 
 def _short(text: str, most: int = 32) -> str:
+    """Overrides by the last part of their names, then cut: `inverse_distance=True` says enough."""
+    words = [word.partition("=") for word in text.split()]
+    text = " ".join(
+        (key.rpartition(".")[2] if equals else key) + equals + value for key, equals, value in words
+    )
     return text if len(text) <= most else text[: most - 1] + "…"

@@ -11,6 +11,7 @@ import pytest
 
 from gsparc.report import effects, learning, tables
 from gsparc.report.intervals import Interval, bootstrap, interval
+from gsparc.report.plots import _short
 from gsparc.report.runs import columns, find_runs, told_apart
 from gsparc.report.table import Column, Table
 
@@ -151,3 +152,10 @@ def test_a_simulation_among_the_directories_is_on_the_bill(three):
     assert cells(table, 0)["seconds simulated"] == 62.0 and len(table.rows) == 1
     with pytest.raises(ValueError, match="give the directory of a run too"):
         find_runs([folder])
+
+
+def test_labels_keep_the_value_that_tells_settings_apart():
+    """Cut at 40 letters, `attenuation.inverse_distance=True` and `=False` read the same."""
+    said = [_short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
+    assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
+    assert _short("gsparc trainer.budget_s=0.5") == "gsparc budget_s=0.5" and _short("gp") == "gp"
