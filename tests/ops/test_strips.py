@@ -37,6 +37,14 @@ def test_more_tiles_than_a_word_has_bits(projection):
     assert_close(render(scene, origin(), grid, projection=projection), want, 1e-9)
 
 
+@pytest.mark.parametrize("height", [256, 257])
+def test_more_strips_than_search_for_their_footprints(height):
+    """Up to 64 strips pick their footprints; in a taller image each footprint is handed to its strips."""
+    scene, grid = random_scene(n=1100, seed=15), SphereGrid.hemisphere(height, 8)  # more ranks than a chunk
+    want = render(scene, poses(3), grid, "reference")
+    assert_close(render(scene, poses(3), grid), want, 1e-9)
+
+
 @pytest.mark.parametrize("height,width", [(1, 1), (3, 5), (5, 17), (4, 16), (7, 63)])
 @PROJECTIONS
 def test_grids_that_no_tile_divides(height, width, projection):
