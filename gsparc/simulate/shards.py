@@ -29,6 +29,8 @@ class Shards:
 
     def __init__(self, out: Path, plan: Mapping[str, Any]) -> None:
         self.folder = out.with_name(out.name + ".parts")
+        self._gone = out.with_name(out.name + ".gone")
+        self._sweep()
         self.resumed = self.folder.exists()
         text = json.dumps(plan, sort_keys=True, indent=1, default=str)
         stored = self.folder / "plan.json"
@@ -73,7 +75,14 @@ class Shards:
 
     def remove(self) -> None:
         """After the dataset is written."""
-        shutil.rmtree(self.folder)
+        # Renamed first: a kill amid the removal would leave shards without the plan that they belong to.
+        self._sweep()
+        os.replace(self.folder, self._gone)
+        self._sweep()
+
+    def _sweep(self) -> None:
+        if self._gone.exists():
+            shutil.rmtree(self._gone)
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -1,7 +1,9 @@
 """Whole campaigns on our own engine: no ray tracer needed."""
 
 import json
+import shutil
 import time
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -141,6 +143,23 @@ def test_parts_of_another_simulation_are_refused(tmp_path, monkeypatch):
         simulate(plan(), tmp_path / "box.h5")
     with pytest.raises(ValueError, match="different simulation"):
         simulate(plan(shard=20), tmp_path / "box.h5")
+
+
+def test_a_kill_amid_the_removal_leaves_no_shards_without_their_plan(tmp_path, monkeypatch):
+    """Shards whose plan was removed first would pass for those of any other simulation."""
+
+    def dies(folder):
+        next(Path(folder).glob("*plan.json")).unlink()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", dies)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(plan(), tmp_path / "box.h5")
+    (tmp_path / "box.h5").unlink()
+    simulate(plan(csi=CsiSettings(rows=2, columns=2)), tmp_path / "box.h5")
+    assert arrays(tmp_path / "box.h5")[0]["csi"].shape[1:] == (4, 4)
+    assert {path.name for path in tmp_path.iterdir()} == {"box.h5"}
 
 
 def test_an_existing_file_is_not_overwritten(tmp_path):
