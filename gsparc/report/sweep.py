@@ -57,7 +57,7 @@ class SweepReport(Callback):
         folder = Path(config.hydra.sweep.dir)
         failed = sorted(folder.rglob(FAILURE))
         console = Console(soft_wrap=True)
-        if any((path / "summary.json").is_file() for path in folder.iterdir()):
+        if any(path.parent != folder for path in folder.rglob("summary.json")):
             report(folder, str(config.get("title") or folder.name), console, self)
         if failed:
             names = ", ".join(path.parent.name for path in failed)

@@ -68,6 +68,15 @@ def test_one_table_one_figure_and_a_page(three, tmp_path, capsys):
     assert "28.00 to" in said and "28.40" in said and "29.50" in said
 
 
+def test_jobs_named_after_a_path_still_end_in_a_table(three, tmp_path):
+    """A path among the overrides puts a job's folder some levels down."""
+    (tmp_path / "0_file-").mkdir()
+    for number, run in enumerate(sorted(path for path in tmp_path.iterdir() if path.name != "0_file-")):
+        run.rename(tmp_path / "0_file-" / str(number))
+    SweepReport(retime=False).on_multirun_end(of_sweep(tmp_path))
+    assert (tmp_path / "sweep.csv").is_file()
+
+
 def test_a_sweep_with_a_failed_job_ends_with_status_1(three, tmp_path, capsys):
     (tmp_path / "c0").mkdir()
     (tmp_path / "c0" / FAILURE).write_text("it broke\n")
