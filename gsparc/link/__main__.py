@@ -53,7 +53,7 @@ def need_sionna() -> None:
 
 
 def band(found: Channels) -> Band:
-    """One antenna's channels, for rate adaptation."""
+    """One antenna's channels, for rate adaptation, which takes what states no variance for exact."""
     return Band(found.true[:, 0], found.predicted[:, 0], found.variance.nan_to_num(0.0))
 
 
@@ -99,6 +99,12 @@ def task(config: DictConfig) -> dict[str, Any]:
         kept = np.isin(np.arange(len(fold.test)), test[accepted])
         facts |= beam_facts(every.true, every.predicted, kept)
     title = f"{data.site.name}, {method.name}"
+    stated = bool(grid.variance.isfinite().all())
+    if not stated:
+        log.warning(
+            "%s states no error variance: rates are adapted as if its predictions were exact", method.name
+        )
+    facts["model/states_variance"] = stated
     with Progress(
         *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
     ) as bar:
@@ -120,7 +126,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         known = frequency_correlation(data.targets(fold.train)[:, antenna], tones, spacing, count)
         facts["pusch/truth"], grid = grid.source, grid.of(test)
         unsaid = [name for name in NEED_VARIANCE if name in receivers]
-        if unsaid and not grid.variance.isfinite().all():
+        if unsaid and not stated:
             log.warning("%s states no error variance: left out are %s", method.name, ", ".join(unsaid))
             receivers = [name for name in receivers if name not in unsaid]
         drawn, trades = {}, {}

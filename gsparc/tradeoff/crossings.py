@@ -26,8 +26,9 @@ from gsparc.tradeoff.view import View
 
 
 def knobs(method: BearingField) -> tuple[str, ...]:
-    """What can be turned."""
-    return ("searches", "keep", "stride", "confidence")
+    """What can be turned; searches where there are several."""
+    own = ("keep", "stride", "confidence")
+    return ("searches", *own) if len(method.trends) > 1 else own
 
 
 def measure(method: BearingField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:

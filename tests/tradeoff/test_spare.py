@@ -149,6 +149,18 @@ def crossings(tmp_path_factory):
     return method, data, fold
 
 
+def test_one_search_is_not_swept_as_two(crossings):
+    method, trends = crossings[0], crossings[0].trends
+    assert ("searches" in spare.knobs(method)) == (len(trends) > 1)
+    try:
+        method.trends = trends[:1] * 2
+        assert "searches" in spare.knobs(method)
+        method.trends = trends[:1]
+        assert "searches" not in spare.knobs(method)
+    finally:
+        method.trends = trends
+
+
 def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
     method, data, fold = crossings
     measured = spare.measure(method, data, fold.train)
