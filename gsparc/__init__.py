@@ -1,5 +1,6 @@
 """GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map."""
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +9,10 @@ if TYPE_CHECKING:
     from gsparc.ops import SphereGrid as SphereGrid
     from gsparc.predictor import Predictor as Predictor
     from gsparc.predictor import load as load
+
+# Torch's threads would otherwise spin for one another and against our kernels' own: up to twice slower, and
+# twenty times beside another busy process. It works where gsparc is imported before torch.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # Looked up on first use: `import gsparc` costs nothing.
 _PUBLIC = {

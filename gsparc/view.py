@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from gsparc import surgery
 from gsparc.model import GaussianModel
 from gsparc.ops import FrozenPlan, Pose, StalePlan
 from gsparc.response import ArrayResponse
@@ -21,10 +23,13 @@ class FrozenView:
     Attributes:
         version: the field's counter at the time.
         plan: pixels by Gaussians.
+        seen: the model with those Gaussians alone that the receiver sees, in the plan's order: nobody else
+            needs to emit.
     """
 
     version: int
     plan: FrozenPlan
+    seen: GaussianModel
 
     @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
@@ -33,7 +38,8 @@ class FrozenView:
         Raises:
             StalePlan: the field has changed since.
         """
-        return self.plan.render(model.features(tx, rx), int(model.gaussians.version)).squeeze(1)
+        _still(self.version, model)
+        return self.plan.compose(self.seen.features(tx, rx)).squeeze(1)
 
 
 @dataclass(frozen=True)
@@ -53,11 +59,7 @@ class FrozenArray:
     @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
         """See `FrozenView.render`."""
-        if int(model.gaussians.version) != self.version:
-            raise StalePlan(
-                f"this view was frozen at version {self.version}, the field is at "
-                f"{int(model.gaussians.version)}: freeze again"
-            )
+        _still(self.version, model)
         assert isinstance(model.response, ArrayResponse)
         if self.offset is None:
             emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
@@ -71,12 +73,27 @@ def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
     """Freeze what a static receiver sees of a model of spectra."""
     version = int(model.gaussians.version)
     if not isinstance(model.response, ArrayResponse):
-        return FrozenView(version, model.freeze(rx))
+        plan = model.freeze(rx)
+        return FrozenView(version, plan, _only(plan.order, model))
     matrix, emission = seen_by_array(model, rx), model.emission
     if emission.settings.hidden or model.settings.attenuation.inverse_distance:
         return FrozenArray(version, matrix, None)
     weight, bias = (torch.view_as_complex(part.contiguous()) for part in (emission.weight2, emission.bias2))
     return FrozenArray(version, weight.T @ matrix, bias @ matrix)
+
+
+def _still(version: int, model: GaussianModel) -> None:
+    now = int(model.gaussians.version)
+    if now != version:
+        raise StalePlan(f"this view was frozen at version {version}, the field is at {now}: freeze again")
+
+
+def _only(rows: Tensor, model: GaussianModel) -> GaussianModel:
+    """A copy with these Gaussians alone, in this order."""
+    copy = deepcopy(model)
+    nobody = torch.zeros(len(model.gaussians), dtype=torch.bool, device=rows.device)
+    surgery.apply(surgery.Edit(nobody, rows), copy, copy.gaussians)
+    return copy
 
 
 @torch.no_grad()

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 RECORD: int
 MOMENTS: int
 STRIP_ROWS: int
+UNSOUND_POSE: int
 
 Ints = Sequence[int]
 Reals = Sequence[float]

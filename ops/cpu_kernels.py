@@ -45,6 +45,8 @@ def plan(
         *(twice, poses, n, threads, whole, real),
         addresses(*inputs, None, positions.contiguous(), rotations.contiguous(), ids, *outputs),
     )
+    if wrong == _native.UNSOUND_POSE:
+        door.raise_for_pose()
     if wrong >= 0:
         door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)
     count = int(buffers[-1][-1])

@@ -22,7 +22,7 @@ def make_plan(
     optics: Optics,
 ) -> Plan:
     """Order and radii; the footprints themselves are formed again, differentiably, when compositing."""
-    door.finite(means, quats, scales, strongest)
+    door.finite(means, quats, scales, strongest, pose)
     orders, centers, reaches, seen_at_all = [], [], [], []
     for index in range(len(pose)):
         seen = reference.project(means, quats, scales, pose[index], grid, optics)

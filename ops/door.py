@@ -47,8 +47,10 @@ def gaussians(
         raise ValueError(f"ids must be ({n},) int64 on {means.device}, got {tuple(ids.shape)} {ids.dtype}")
 
 
-def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor) -> None:
-    """Refuse what no footprint can be made of (ValueError), naming the first Gaussian."""
+def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor, pose: Pose) -> None:
+    """Refuse what no footprint can be made of (ValueError), naming the first Gaussian, or a pose."""
+    if not all(bool(torch.isfinite(part).all()) for part in (pose.position, pose.rotation)):
+        raise_for_pose()
     sound = {
         "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
@@ -93,13 +95,9 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
 
 
 def poses(pose: Pose, means: Tensor) -> Pose:
-    """Poses (P,) in the Gaussians' dtype and on their device, always batched; ValueError if not finite."""
+    """Poses (P,) in the Gaussians' dtype and on their device, always batched; plans look if finite."""
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
-    if position.is_cuda:  # looking would wait for the GPU; the plan looks there
-        return Pose(position, rotation)
-    if not bool(torch.isfinite(position).all()) or not bool(torch.isfinite(rotation).all()):
-        raise_for_pose()
     return Pose(position, rotation)
 
 

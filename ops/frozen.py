@@ -44,8 +44,13 @@ class FrozenPlan:
             raise StalePlan(
                 f"this view was frozen at version {self.version}, the field is at {version}: freeze again"
             )
-        batch = features if features.dim() == 3 else features.unsqueeze(0)
-        samples, _, channels = batch.shape
-        columns = batch.transpose(0, 1).index_select(0, self.order).reshape(-1, samples * channels)
+        return self.compose(features.index_select(-2, self.order))
+
+    @torch.no_grad()
+    def compose(self, seen: Tensor) -> Tensor:
+        """The same of the features (V, C) or (B, V, C) of those in `order` alone, whoever else there is."""
+        batch = seen if seen.dim() == 3 else seen.unsqueeze(0)
+        samples, count, channels = batch.shape
+        columns = batch.transpose(0, 1).reshape(count, samples * channels)
         image = backends.named(self.backend).thaw(self.grid, self.buffers, columns)
-        return image.unflatten(0, (samples, channels)) if features.dim() == 3 else image
+        return image.unflatten(0, (samples, channels)) if seen.dim() == 3 else image

@@ -76,7 +76,7 @@ def composite(
         raise ValueError(f"this plan holds {plan.num_gaussians} Gaussians, got {means.shape[0]}; plan again")
     trained = (means, quats, scales, opacities, features, *([] if extinctions is None else [extinctions]))
     wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in trained)
-    means2d = plan.means2d.detach().clone().requires_grad_(wanted)
+    means2d = plan.means2d.clone().requires_grad_() if wanted else plan.means2d
     image, transmittance = backends.named(plan.backend).composite(
         plan, means, quats, scales, opacities, extinctions, values, means2d
     )

@@ -9,6 +9,7 @@ from gsparc.encoding import EncodingSettings
 from gsparc.field import FieldSettings
 from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.ops import Pose, StalePlan
+from gsparc.view import frozen_view
 
 RAW = EncodingSettings("raw")
 LINEAR = EmissionSettings(RAW, hidden=3, activation="linear", log_distance=False)
@@ -86,6 +87,23 @@ def test_a_frozen_view_equals_the_forward_pass_until_the_next_edit(campaign):
         field.gaussians.version += 1
     with pytest.raises(StalePlan):
         frozen.render(field.features(batch.tx, batch.rx).detach(), int(field.gaussians.version))
+
+
+def test_only_the_gaussians_that_a_static_receiver_sees_emit(campaign):
+    data = campaign("spectrum")
+    batch = data.batch(np.arange(6))
+    field = model(data, field=FieldSettings(count=60, init="uniform", margin=4.0))
+    want = field(batch.tx, batch.rx)
+    view = frozen_view(field, batch.rx)
+    seen = int(want.raster.visible.sum())
+    assert 0 < seen < 60 and len(view.seen.gaussians) == seen
+    for some in (batch.tx, batch.tx[:1]):
+        assert torch.allclose(view.render(field, some, batch.rx), want.mean[: len(some)], atol=1e-5)
+    assert len(field.gaussians) == 60  # the field itself is left as it was
+    with torch.no_grad():
+        field.gaussians.version += 1
+    with pytest.raises(StalePlan, match="freeze again"):
+        view.render(field, batch.tx, batch.rx)
 
 
 def test_poses_of_a_batch_are_seen_each_for_itself(campaign):

@@ -9,6 +9,7 @@ from gsparc.benchmark.case import Call, Case, Work, size
 from gsparc.benchmark.scene import COMPLEX, GRID, Scene, places, receiver, receivers
 from gsparc.ops import composite, freeze, marks, mean_weights
 from gsparc.ops.geometry import Pose
+from gsparc.view import frozen_view
 
 REFERENCE_BYTES = 3 * 2**30  # of one forward pass in dense tensors
 DENSE_TENSORS = 12  # (N, H W) tensors alive at once in the reference
@@ -66,16 +67,17 @@ def static(scene: Scene, batch: int) -> Case:
 
 
 def frozen(scene: Scene, batch: int) -> Case:
-    """A static receiver's weights as a sparse matrix: multiply (kernel); emission too (whole)."""
+    """A static receiver's weights as a sparse matrix: multiply (kernel); its emissions too (whole)."""
     pose = receiver()
     view = freeze(scene.plan(pose), *scene.geometry, version=0)
+    whole = frozen_view(scene.model, pose)
     features = scene.features.expand(batch, -1, -1).contiguous()
     tx, rx = places(batch) + 1, Pose.identity(places(batch))
     return Case(
         *("forward, frozen", scene.projection, len(scene), batch),
         work=Work(size(view.buffers) + features.nbytes + _image_bytes(batch * COMPLEX)),
         kernel=lambda: view.render(features, version=0),
-        whole=lambda: view.render(scene.model.features(tx, rx), version=0),
+        whole=lambda: whole.render(scene.model, tx, rx),
         unaffordable="a dense matrix",
     )
 

@@ -265,6 +265,7 @@ NB_MODULE(_native, module) {
     module.attr("RECORD") = kRecord;
     module.attr("MOMENTS") = kMoments;
     module.attr("STRIP_ROWS") = kStripRows;
+    module.attr("UNSOUND_POSE") = kUnsoundPose;
     module.def("plan", &plan);
     module.def("entries", &entries);
     module.def("composite", &composite);

@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstring>
 #include <type_traits>
 #include <utility>
@@ -107,6 +108,10 @@ private:
 
 template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     const int64_t count = a.count;
+    const auto finite = [](S x) { return std::isfinite(x); };
+    if (!std::all_of(a.model.positions, a.model.positions + 3 * a.poses, finite) ||
+        !std::all_of(a.model.rotations, a.model.rotations + 9 * a.poses, finite))
+        return kUnsoundPose;
     const Workspace<S> depths(a.poses * count);
     const Workspace<Box> boxes(a.poses * count);
     constexpr int chunk = kBinned;
