@@ -56,7 +56,7 @@ def build(file: Path) -> None:
     """Compile the library anew and say how long it took."""
     from gsparc.ops import cuda_library
 
-    path = cuda_library.library_path(cuda_library.architecture())
+    path = cuda_library.library_path(*cuda_library.architectures())
     path.unlink(missing_ok=True)
     started = time.perf_counter()
     cuda_library.load()

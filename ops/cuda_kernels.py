@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from functools import lru_cache
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -21,7 +21,8 @@ from gsparc.ops import cuda_library, door
 from gsparc.ops.operators import check_memory, filled, gradients, layout, model_of, plan_tensors
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
-BYTES_PER_ENTRY = 28  # entries and what sorting them takes
+BYTES_PER_ENTRY = 36  # entries and what sorting them takes
+MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
 
 libraries: dict[str, cuda_library.Library] = {}
 """By device type; tests put the host shim under "cpu"."""
@@ -53,7 +54,7 @@ def run(
 ) -> None:
     """Call a kernel with addresses of tensors and scratch memory, on the stream of `like`'s device."""
     library, device = libraries[like.device.type], like.device
-    call = cuda_library.Call(twice=like.dtype == torch.float64, **sizes)
+    call = cuda_library.Call(twice=like.dtype == torch.float64, device=device.index or 0, **sizes)
     call.whole[: len(whole)], call.real[: len(real)] = list(whole), list(real)
     addresses = [0 if t is None else t.data_ptr() for t in tensors]
     call.tensors[: len(addresses)] = addresses
@@ -65,9 +66,9 @@ def run(
         library.run(name, call)
 
 
-@lru_cache(maxsize=32)
+@cache
 def _tables(device: torch.device, dtype: torch.dtype, whole: tuple, real: tuple) -> Tensor:
-    """Sines and cosines of the grid's rows and columns."""
+    """Sines and cosines of the grid's rows and columns, kept for good: captured graphs hold their address."""
     library = libraries[device.type]
     call = cuda_library.Call(twice=dtype == torch.float64)
     call.whole[:], call.real[:] = list(whole), list(real)
@@ -101,6 +102,10 @@ def plan(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
     """`gsparc::plan`."""
     poses, n = positions.shape[0], means.shape[0]
+    if poses * n >= MOST_PAIRS:
+        raise MemoryError(
+            f"{poses} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
+        )
     tensors = plan_tensors(means, poses, whole[0])
     starts = poses * tiles(whole) + 1
     if n == 0:

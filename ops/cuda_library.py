@@ -9,6 +9,7 @@ import ctypes
 import hashlib
 import logging
 import os
+import re
 import shutil
 import subprocess
 import time
@@ -36,6 +37,7 @@ class Call(ctypes.Structure):
         ("samples", ctypes.c_int32),
         ("channels", ctypes.c_int32),
         ("capacity", ctypes.c_int32),
+        ("device", ctypes.c_int32),
         ("whole", ctypes.c_int32 * 6),
         ("real", ctypes.c_double * 10),
         ("tensors", ctypes.c_uint64 * 32),
@@ -68,16 +70,35 @@ class Library:
             raise RuntimeError(f"CUDA kernel {name}: {self._loaded.gsparc_error(-result).decode()}")
         return result
 
+    def check(self) -> None:
+        """Ask the driver whether it can run these kernels on the current GPU (LibraryUnavailable)."""
+        call = Call(device=torch.cuda.current_device())
+        try:
+            self.run("check", call)
+        except RuntimeError as error:
+            built, driver = (f"{version // 1000}.{version % 1000 // 10}" for version in call.whole[:2])
+            raise LibraryUnavailable(
+                f"{error}; the kernels were built with CUDA {built} and the driver is of CUDA {driver}: "
+                "update the driver, or set CUDA_HOME to a toolkit no newer than it"
+            ) from error
+
 
 def load() -> Library:
-    """The library for the current GPU, built if need be (LibraryUnavailable)."""
+    """The library for this machine's GPUs, built if need be (LibraryUnavailable)."""
     reason = missing_device()
     if reason:
         raise LibraryUnavailable(reason)
-    path = library_path(architecture())
+    wanted = architectures()
+    path = library_path(*wanted)
     if not path.exists():
-        build(path, architecture())
-    return Library(path)
+        build(path, *wanted)
+    library = Library(path)
+    try:
+        library.check()
+    except LibraryUnavailable:
+        path.unlink(missing_ok=True)  # so that another toolkit is asked next time
+        raise
+    return library
 
 
 def missing_device() -> str | None:
@@ -93,9 +114,10 @@ def missing_device() -> str | None:
     return "PyTorch finds no usable NVIDIA GPU"
 
 
-def architecture() -> str:
-    """Compute capability of the current GPU, as in `sm_90` without the prefix."""
-    return "{}{}".format(*torch.cuda.get_device_capability())
+def architectures() -> list[str]:
+    """Compute capabilities of all GPUs here, as in `sm_90` without the prefix."""
+    devices = range(torch.cuda.device_count())
+    return sorted({"{}{}".format(*torch.cuda.get_device_capability(device)) for device in devices}, key=int)
 
 
 def compiler() -> str | None:
@@ -107,10 +129,10 @@ def compiler() -> str | None:
     return shutil.which("nvcc")
 
 
-def library_path(arch: str) -> Path:
-    """Where the library of these sources for `arch` is kept between runs."""
+def library_path(*architectures: str) -> Path:
+    """Where the library of these sources for these GPUs is kept between runs."""
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return cache / "gsparc" / f"cuda-{arch}-{fingerprint(*FLAGS)}.so"
+    return cache / "gsparc" / f"cuda-{'-'.join(architectures)}-{fingerprint(*FLAGS)}.so"
 
 
 def fingerprint(*also: str) -> str:
@@ -134,16 +156,36 @@ def build(path: Path, *architectures: str) -> None:
             "the CUDA kernels are not built and there is no nvcc to build them; install the CUDA toolkit or "
             "set CUDA_HOME"
         )
-    targets = [f"-gencode=arch=compute_{arch},code=sm_{arch}" for arch in architectures]
+    targets = [target(nvcc, arch) for arch in architectures]
     LOG.info("building the CUDA kernels for sm_%s (about a minute, once)", ", sm_".join(architectures))
     started = time.perf_counter()
     compile_to(path, [nvcc, *FLAGS, *targets, f"-I{SOURCES}", *units()])
     LOG.info("built in %.0f s: %s", time.perf_counter() - started, path)
 
 
+def target(nvcc: str, arch: str) -> str:
+    """What nvcc is told for a GPU: its own code, or for one newer than nvcc what the driver translates."""
+    told = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
+    known = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", told)})
+    if not known or int(arch) in known:
+        return f"-gencode=arch=compute_{arch},code=sm_{arch}"
+    older = [number for number in known if number < int(arch)]
+    if not older:
+        raise LibraryUnavailable(
+            f"this GPU is sm_{arch} and {nvcc} builds for sm_{known[0]} and newer; "
+            "set CUDA_HOME to an older CUDA toolkit"
+        )
+    return f"-gencode=arch=compute_{older[-1]},code=compute_{older[-1]}"
+
+
 def compile_to(path: Path, command: list[str]) -> None:
     """Run a compiler whose output appears at `path` whole or not at all (LibraryUnavailable)."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LibraryUnavailable(
+            f"no folder for the kernels: {error}; set XDG_CACHE_HOME to one that can be written"
+        ) from error
     unfinished = path.with_suffix(f".{os.getpid()}")
     done = subprocess.run([*command, "-o", str(unfinished)], capture_output=True, text=True, check=False)
     if done.returncode:

@@ -77,6 +77,45 @@ def test_networks_equal_matrix_products(where, samples, inputs, hidden, channels
         assert (a.double() - b).abs().max() < 1e-5 * (1 + b.abs().max())
 
 
+@BOTH
+def test_nothing_is_read_before_it_is_written(where, dtype):
+    """Scratch and outputs that start as NaN and the largest integers change nothing."""
+    scene = random_scene(n=40, hides=True).to(dtype)
+    want = [render(scene, poses(count), GRIDS["patch"]) for count in (0, 3)]
+    torch.use_deterministic_algorithms(True)
+    try:
+        got = [render(scene, poses(count), GRIDS["patch"]) for count in (0, 3)]
+    finally:
+        torch.use_deterministic_algorithms(False)
+    for a, b in zip(want, got, strict=True):
+        assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_more_positions_than_a_grid_has_rows(where):
+    """Blocks go on to further positions; the shim takes two rows of 16, a GPU 65535."""
+    count = (2 if where == "shim" else 65535) * 16 + 5
+    weights = [torch.ones(shape) for shape in ((1, 1, 1), (1, 1), (1, 1, 1), (1, 1))]
+    encoded = torch.arange(count, dtype=torch.float32)[:, None]
+    assert torch.equal(networks.networks_op(encoded, *weights)[:, 0, 0], encoded[:, 0] + 2)
+
+
+def test_too_many_pairs_for_one_plan_are_refused(where, monkeypatch):
+    scene = random_scene(n=40)
+    monkeypatch.setattr(cuda_kernels, "MOST_PAIRS", 100)
+    with pytest.raises(MemoryError, match="3 poses of 40 Gaussians are too many for a plan"):
+        make_plan(scene.means, scene.quats, scene.scales, scene.opacities, poses(3), GRIDS["patch"])
+
+
+def test_tables_that_a_graph_holds_are_never_freed(where):
+    scene = random_scene(n=4)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    tables = []
+    for height in [20, *range(21, 60), 20]:
+        make_plan(*model, origin(), SphereGrid(height, 8, -0.3, 2.5, 0.01, 0.05))
+        tables.append(cuda_kernels._tables.cache_info().misses)
+    assert tables[-1] == tables[-2]
+
+
 def test_captured_plan_with_headroom_is_the_plan(where, monkeypatch):
     scene = random_scene(n=40).to(torch.float32)
     want = render(scene, poses(3), GRIDS["hemisphere"])
@@ -134,4 +173,4 @@ def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
 
 
 def test_call_has_the_layout_of_the_kernels(where):
-    assert ctypes.sizeof(cuda_kernels.cuda_library.Call) == 6 * 4 + 6 * 4 + 10 * 8 + 32 * 8 + 2 * 8
+    assert ctypes.sizeof(cuda_kernels.cuda_library.Call) == 7 * 4 + 6 * 4 + 4 + 10 * 8 + 32 * 8 + 2 * 8

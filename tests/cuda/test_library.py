@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,9 @@ UNMET = """
 using namespace gsparc::device;
 void kernel(int) { if (threadIdx.x != 7) warp_sync(); }
 extern "C" int64_t gsparc_unmet() { return launch(kernel, 1, 1, 32, nullptr, 0); }
+void idle(int) {}
+extern "C" int64_t gsparc_rows(int64_t rows) { return launch(idle, 1, rows, 32, nullptr, 0); }
+extern "C" int64_t gsparc_blocks(int64_t blocks) { return launch(idle, blocks, 1, 32, nullptr, 0); }
 """
 
 
@@ -57,7 +61,7 @@ def test_no_device_or_the_wrong_driver(monkeypatch, nothing_loaded, said):
 
 def test_no_compiler(monkeypatch, nothing_loaded, tmp_path):
     monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
-    monkeypatch.setattr(cuda_library, "architecture", lambda: "90")
+    monkeypatch.setattr(cuda_library, "architectures", lambda: ["90"])
     monkeypatch.setattr(cuda_library, "compiler", lambda: None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert "there is no nvcc to build them" in explained(monkeypatch)
@@ -68,14 +72,70 @@ def test_a_compiler_that_fails_is_quoted_and_leaves_nothing(monkeypatch, nothing
     nvcc.write_text("#!/bin/sh\necho 'x.cu(3): error: no such thing' >&2\nexit 1\n")
     nvcc.chmod(0o755)
     monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
-    monkeypatch.setattr(cuda_library, "architecture", lambda: "90")
+    monkeypatch.setattr(cuda_library, "architectures", lambda: ["90"])
     monkeypatch.setattr(cuda_library, "compiler", lambda: str(nvcc))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert "no such thing" in explained(monkeypatch)
     assert not list((tmp_path / "gsparc").iterdir())
 
 
-def test_the_shim_reports_a_barrier_that_not_all_threads_meet(tmp_path):
+def nvcc_of(folder: Path, *knows: str) -> str:
+    """A compiler that knows some architectures, as `--list-gpu-arch` prints them."""
+    path = folder / "nvcc"
+    path.write_text("#!/bin/sh\n" + "".join(f"echo {name}\n" for name in knows))
+    path.chmod(0o755)
+    return str(path)
+
+
+def test_a_gpu_newer_than_the_compiler_gets_code_that_the_driver_translates(tmp_path):
+    nvcc = nvcc_of(tmp_path, "compute_75", "compute_90", "compute_90a", "compute_100")
+    assert cuda_library.target(nvcc, "90") == "-gencode=arch=compute_90,code=sm_90"
+    assert cuda_library.target(nvcc, "120") == "-gencode=arch=compute_100,code=compute_100"
+    with pytest.raises(cuda_library.LibraryUnavailable, match=r"sm_70 and .* builds for sm_75 and newer"):
+        cuda_library.target(nvcc, "70")
+    assert cuda_library.target(nvcc_of(tmp_path), "61") == "-gencode=arch=compute_61,code=sm_61"
+
+
+def test_every_gpu_of_the_machine_is_built_for(monkeypatch):
+    capabilities = [(9, 0), (7, 5), (9, 0), (12, 0)]
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: len(capabilities))
+    monkeypatch.setattr(torch.cuda, "get_device_capability", capabilities.__getitem__)
+    assert cuda_library.architectures() == ["75", "90", "120"]
+    assert cuda_library.library_path("75", "90").name.startswith("cuda-75-90-")
+
+
+def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(
+    monkeypatch, nothing_loaded, tmp_path
+):
+    class Old(cuda_library.Library):
+        def __init__(self, path: Path) -> None:
+            pass
+
+        def run(self, name: str, call: cuda_library.Call) -> int:
+            call.whole[:2] = [13000, 12080]
+            raise RuntimeError("CUDA driver version is insufficient for CUDA runtime version")
+
+    monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
+    monkeypatch.setattr(cuda_library, "architectures", lambda: ["90"])
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(cuda_library, "Library", Old)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    kept = cuda_library.library_path("90")
+    kept.parent.mkdir()
+    kept.touch()
+    assert "built with CUDA 13.0 and the driver is of CUDA 12.8: update the driver" in explained(monkeypatch)
+    assert not kept.exists()  # another toolkit is asked next time
+
+
+def test_a_cache_that_cannot_be_written(monkeypatch, tmp_path):
+    (tmp_path / "cache").touch()
+    with pytest.raises(
+        cuda_library.LibraryUnavailable, match="set XDG_CACHE_HOME to one that can be written"
+    ):
+        cuda_library.compile_to(tmp_path / "cache" / "gsparc" / "x.so", ["true"])
+
+
+def test_the_shim_reports_barriers_that_not_all_threads_meet_and_grids_that_no_gpu_takes(tmp_path):
     source = tmp_path / "unmet.cpp"
     source.write_text(UNMET)
     library = tmp_path / "unmet.so"
@@ -85,6 +145,10 @@ def test_the_shim_reports_a_barrier_that_not_all_threads_meet(tmp_path):
     code = f"import ctypes; print(ctypes.CDLL({str(library)!r}).gsparc_unmet())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1"
+    loaded = ctypes.CDLL(str(library))  # grids that no GPU takes
+    for function in (loaded.gsparc_rows, loaded.gsparc_blocks):
+        function.argtypes, function.restype = [ctypes.c_int64], ctypes.c_int64
+    assert loaded.gsparc_rows(65535) == 0 and loaded.gsparc_rows(65536) == 2 == loaded.gsparc_blocks(2**31)
 
 
 @pytest.mark.slow

@@ -38,7 +38,6 @@ __global__ void __launch_bounds__(kBlock) composite_kernel(View<S> v, Model<S> m
             }
         if (!walk.next(light, false)) break;
     }
-    block_sync();
     static_assert(kChannels <= kBatch<S>, "the sums take the place of the shapes");
     for (int k = 0; k < kChannels; ++k) desk.forms[walk.warp][k][walk.lane] = sums[k];
     block_sync();
@@ -165,13 +164,15 @@ __global__ void __launch_bounds__(kBlock) weigh_kernel(View<S> v, Model<S> model
 }
 
 // Adds the rows of each Gaussian: value k of a row goes to first (.., split) or, from split on, to second (.., rest).
+// A block takes as many ranks as have room, a thread one value; of int64 divisions there are none: they take longest.
+GSPARC_HD int ranks_of_block(int width) { return kThreads / width; }
 template <class S>
-__global__ void add_rows(View<S> v, const S* rows, int width, int chunks, int split, S* first, S* second, int rest) {
-    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, all = int64_t(v.poses) * v.count;
-    if (at >= all * width * chunks) return;
-    const int k = int(at % width), chunk = int(at / width / all);
-    const int64_t ranked = at / width % all;
-    const int pose = int(ranked / v.count), rank = int(ranked % v.count), value = chunk * (width - split) + k - split;
+__global__ void add_rows(View<S> v, const S* rows, int width, int split, S* first, S* second, int rest) {
+    const uint32_t together = ranks_of_block(width), within = threadIdx.x / width, all = uint32_t(v.poses) * v.count;
+    const uint32_t ranked = blockIdx.x * together + within;
+    if (within >= together || ranked >= all) return;
+    const int k = threadIdx.x % width, chunk = blockIdx.y, pose = ranked / v.count, rank = ranked % v.count;
+    const int value = chunk * (width - split) + k - split;
     if (k >= split && value >= rest) return;
     const bool broken = v.overflows();
     const int64_t begin = broken ? 0 : v.first_slot(pose, rank), end = broken ? 0 : v.first_slot(pose, rank + 1);
@@ -243,6 +244,12 @@ template <class S> int64_t blend(const View<S>& v, const Model<S>& model, const 
     return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, picture);
 }
 
+template <class S>
+int64_t add(const View<S>& v, int chunks, void* stream, const S* rows, int width, int split, S* first, S* second, int rest) {
+    const int64_t together = ranks_of_block(width), all = int64_t(v.poses) * v.count;
+    return launch(add_rows<S>, (all + together - 1) / together, chunks, kThreads, stream, v, rows, width, split, first, second, rest);
+}
+
 template <class S> int64_t composite(const Call& call) {
     Reader in{call};
     const View<S> v = read_view<S>(in);
@@ -287,8 +294,7 @@ template <class S> int64_t backward(const Call& call, bool weights) {
     if (weights) steps.then(blend(v, model, forward, stream));
     const auto kernel = v.lens.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
     steps.then(launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up));
-    steps.then(launch(add_rows<S>, blocks_for(all * row * chunks), 1, kThreads, stream, v, up.rows, row, chunks, kMoments, sums, features,
-                      weights ? 0 : call.channels));
+    steps.then(add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : call.channels));
     steps.then(launch(chain_kernel<S>, blocks_for(v.count), 1, kThreads, stream, v, model, sums, chunks, out));
     return steps.result();
 }
@@ -309,7 +315,7 @@ template <class S> int64_t weigh(const Call& call) {
     const auto kernel = v.lens.tangent ? weigh_kernel<S, true> : weigh_kernel<S, false>;
     steps.then(launch(kernel, int64_t(v.poses) * v.tiles, 1, kBlock, stream, v, model, out));
     if (sums)
-        steps.then(launch(add_rows<S>, blocks_for(int64_t(v.poses) * v.count * 2), 1, kThreads, stream, v, out.rows, 2, 1, 2, sums, nullptr, 0));
+        steps.then(add<S>(v, 1, stream, out.rows, 2, 2, sums, nullptr, 0));
     return steps.result();
 }
 

@@ -57,14 +57,18 @@ template <class S, int kCount> __device__ __forceinline__ S warp_sums(S (&values
     return total;
 }
 
+// This library's runtime is its own (linked statically), so what torch made current must be said to it as well.
+inline int64_t use_device(int device) { return cudaSetDevice(device); }
+
 inline int64_t clear(void* at, int value, size_t bytes, void* stream) {
     return bytes ? cudaMemsetAsync(at, value, bytes, static_cast<cudaStream_t>(stream)) : 0;
 }
 
 // Launches blocks x rows blocks; returns the error of the launch, 0 if there is none or nothing to do.
 template <class... P, class... A>
-int64_t launch(void (*kernel)(P...), int64_t blocks, int rows, int threads, void* stream, A... args) {
+int64_t launch(void (*kernel)(P...), int64_t blocks, int64_t rows, int threads, void* stream, A... args) {
     if (blocks <= 0 || rows <= 0) return 0;
+    if (blocks > INT32_MAX || rows > 65535) return cudaErrorInvalidConfiguration;  // a cast would cut them off
     kernel<<<dim3(unsigned(blocks), unsigned(rows)), threads, 0, static_cast<cudaStream_t>(stream)>>>(P(args)...);
     return cudaGetLastError();
 }

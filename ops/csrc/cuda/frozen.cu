@@ -46,7 +46,10 @@ template <class S> __global__ void __launch_bounds__(kBlock) thaw_few(Frozen<S> 
 
 // Many images: a product of a (kImages x entries) and an (entries x 32) matrix, 4 x 4 outputs a thread.
 constexpr int kImages = 64, kDepth = 16, kSide = 4;
-template <class S> __global__ void __launch_bounds__(kBlock) thaw_many(Frozen<S> f) {
+template <class S> struct alignas(16) Side {
+    S pixels[kSide];
+};
+template <class S> __global__ void __launch_bounds__(kBlock, 8) thaw_many(Frozen<S> f) {
     alignas(16) __shared__ S features[kDepth][kImages];
     alignas(16) __shared__ S weights[kDepth][kWarp];
     const int tile = blockIdx.x, from = blockIdx.y * kImages, end = f.ends[tile];
@@ -73,14 +76,22 @@ template <class S> __global__ void __launch_bounds__(kBlock) thaw_many(Frozen<S>
         }
         block_sync();
     }
+    const int64_t plane = int64_t(f.width) * f.height;
+    const int first = from + part * kSide, left = f.columns - first;
+    if (f.width % kSide == 0) {  // then its four pixels lie in the image or none does, and their address is even
+        S* to = f.pixel(tile, group * kSide);
+        if (!to) return;
+        GSPARC_UNROLL
+        for (int a = 0; a < kSide; ++a)
+            if (a < left) *reinterpret_cast<Side<S>*>(to + (first + a) * plane) = {{sums[a][0], sums[a][1], sums[a][2], sums[a][3]}};
+        return;
+    }
     GSPARC_UNROLL
     for (int b = 0; b < kSide; ++b) {
         S* to = f.pixel(tile, group * kSide + b);
         GSPARC_UNROLL
-        for (int a = 0; a < kSide; ++a) {
-            const int k = from + part * kSide + a;
-            if (to && k < f.columns) to[int64_t(k) * f.width * f.height] = sums[a][b];
-        }
+        for (int a = 0; a < kSide; ++a)
+            if (to && a < left) to[(first + a) * plane] = sums[a][b];
     }
 }
 

@@ -1,6 +1,7 @@
 // The part of CUDA that the kernels use, on one CPU thread: the threads of a block are fibers, a barrier switches
 // to the next one, blocks run one after the other. It executes the kernels' logic and checks that whole warps and
-// blocks meet at their barriers; it says nothing about speed, memory consistency, or the GPU's own rounding.
+// blocks meet at the same kind of barrier and that grids are of a size GPUs take; built with ThreadSanitizer it finds
+// memory that two threads of a block share without a barrier between. It says nothing about speed or rounding.
 #pragma once
 #include <algorithm>
 #include <cstddef>
@@ -22,17 +23,25 @@ namespace shim {
 struct Index {
     unsigned x, y;
 };
-extern Index thread_index, block_index, block_size;
+extern Index thread_index, block_index, block_size, grid_size;
 
-enum class Meeting { none, warp, block };
+// What a thread waits for. A shuffle needs the whole warp, too, but orders no memory.
+enum class Meeting { none, warp, shuffle, block };
 // Gives up the CPU until all threads of the warp or block have come here. `what` must be the same for all.
 void meet(Meeting what);
-// The place where lane `lane` of this thread's warp leaves something for the others between two meetings.
-const void*& left_by(unsigned lane);
-bool& raised();  // a flag of the block, used by block_any
+// A thread shows something to its warp, and looks at what lane `lane` shows, between two meetings.
+void show(const void* mine);
+const void* shown_by(unsigned lane);
+// A flag of the block: any of its threads may raise it.
+void raise(bool up);
+bool raised();
 
-// Runs `body` for every thread of blocks x rows blocks; returns 0, or 1 if a barrier was not met by all.
-int64_t run(int64_t blocks, int rows, int threads, const std::function<void()>& body);
+// Reads what another thread holds in registers: no memory on a GPU, so nobody watches.
+template <class S> __attribute__((noinline, no_sanitize("thread"))) S peek(const S* at) { return *at; }
+
+constexpr int64_t kUnmet = 1, kTooLarge = 2;  // errors of a launch
+// Runs `body` for every thread of blocks x rows blocks; returns 0 or an error.
+int64_t run(int64_t blocks, int64_t rows, int threads, const std::function<void()>& body);
 
 }  // namespace shim
 }  // namespace gsparc
@@ -40,13 +49,13 @@ int64_t run(int64_t blocks, int rows, int threads, const std::function<void()>& 
 #define threadIdx gsparc::shim::thread_index
 #define blockIdx gsparc::shim::block_index
 #define blockDim gsparc::shim::block_size
+#define gridDim gsparc::shim::grid_size
 
 inline unsigned long long atomicMin(unsigned long long* at, unsigned long long value) {
-    const unsigned long long before = *at;
-    *at = std::min(before, value);
+    const unsigned long long before = __atomic_load_n(at, __ATOMIC_RELAXED);
+    if (value < before) __atomic_store_n(at, value, __ATOMIC_RELAXED);
     return before;
 }
-inline int atomicAdd(int* at, int value) { return (*at += value) - value; }
 
 namespace gsparc {
 namespace GSPARC_ISA {
@@ -56,11 +65,11 @@ inline void block_sync() { shim::meet(shim::Meeting::block); }
 
 template <class S, int kCount> S warp_sums(S (&values)[kCount]) {
     const unsigned lane = shim::thread_index.x % 32;
-    shim::left_by(lane) = values;
-    warp_sync();
+    shim::show(values);
+    shim::meet(shim::Meeting::shuffle);
     S total = 0;
-    for (unsigned other = 0; other < 32; ++other) total += static_cast<const S*>(shim::left_by(other))[lane % kCount];
-    warp_sync();
+    for (unsigned other = 0; other < 32; ++other) total += shim::peek(static_cast<const S*>(shim::shown_by(other)) + lane % kCount);
+    shim::meet(shim::Meeting::shuffle);
     return total;
 }
 
@@ -71,12 +80,14 @@ inline bool warp_any(bool x) {
 
 inline bool block_any(bool x) {
     block_sync();
-    shim::raised() = false;
+    shim::raise(false);
     block_sync();
-    if (x) shim::raised() = true;
+    if (x) shim::raise(true);
     block_sync();
     return shim::raised();
 }
+
+inline int64_t use_device(int) { return 0; }
 
 inline int64_t clear(void* at, int value, size_t bytes, void*) {
     if (bytes) std::memset(at, value, bytes);
@@ -84,7 +95,7 @@ inline int64_t clear(void* at, int value, size_t bytes, void*) {
 }
 
 template <class... P, class... A>
-int64_t launch(void (*kernel)(P...), int64_t blocks, int rows, int threads, void*, A... args) {
+int64_t launch(void (*kernel)(P...), int64_t blocks, int64_t rows, int threads, void*, A... args) {
     return shim::run(blocks, rows, threads, [&] { kernel(P(args)...); });
 }
 

@@ -6,7 +6,12 @@ namespace gsparc {
 namespace GSPARC_ISA {
 namespace {
 
-constexpr int kInputs = 256, kOutputs = 4, kMany = 16;  // the most this kernel takes; cuda.py refuses more
+constexpr int kInputs = 256, kOutputs = 4, kMany = 16;  // the most this kernel takes; networks.py refuses more
+#ifdef __CUDACC__
+constexpr int64_t kMostRows = 65535;  // of a grid; blocks go on to further positions
+#else
+constexpr int64_t kMostRows = 2;  // few, so that tests do as well
+#endif
 
 struct Networks {
     int samples, count, inputs, hidden, outputs;
@@ -18,7 +23,7 @@ template <int kSamples> __device__ void read_inputs(const Networks& n, int from,
     block_sync();
     for (int at = threadIdx.x; at < n.inputs * kSamples; at += kBlock) {
         const int e = at / kSamples, b = at % kSamples;
-        x[e][b] = from + b < n.samples ? n.x[int64_t(from + b) * n.inputs + e] : 0.0f;
+        x[e][b] = b < n.samples - from ? n.x[int64_t(from + b) * n.inputs + e] : 0.0f;
     }
     block_sync();
 }
@@ -38,21 +43,24 @@ template <int kSamples> __device__ void hidden_unit(const Networks& n, int64_t i
 
 template <int kSamples> __global__ void __launch_bounds__(kBlock) networks_kernel(Networks n, float* out) {
     alignas(16) __shared__ float x[kInputs][kSamples];
-    const int lane = threadIdx.x % kWarp, from = blockIdx.y * kSamples;
+    const int lane = threadIdx.x % kWarp;
     const int64_t i = int64_t(blockIdx.x) * kWarps + threadIdx.x / kWarp;
-    read_inputs(n, from, x);
-    if (i >= n.count) return;
-    for (int c = 0; c < n.outputs; ++c) {
-        float parts[kSamples] = {};
-        for (int h = lane; h < n.hidden; h += kWarp) {
-            float sums[kSamples];
-            hidden_unit(n, i, h, x, sums);
-            const float w = n.weight2[(i * n.hidden + h) * n.outputs + c];
-            GSPARC_UNROLL
-            for (int b = 0; b < kSamples; ++b) parts[b] = fma(sums[b] > 0 ? sums[b] : 0.0f, w, parts[b]);
+    for (int64_t start = int64_t(blockIdx.y) * kSamples; start < n.samples; start += int64_t(gridDim.y) * kSamples) {
+        const int from = int(start);
+        read_inputs(n, from, x);
+        if (i >= n.count) continue;  // it only meets at the barriers
+        for (int c = 0; c < n.outputs; ++c) {
+            float parts[kSamples] = {};
+            for (int h = lane; h < n.hidden; h += kWarp) {
+                float sums[kSamples];
+                hidden_unit(n, i, h, x, sums);
+                const float w = n.weight2[(i * n.hidden + h) * n.outputs + c];
+                GSPARC_UNROLL
+                for (int b = 0; b < kSamples; ++b) parts[b] = fma(sums[b] > 0 ? sums[b] : 0.0f, w, parts[b]);
+            }
+            const float total = warp_sums(parts) + n.bias2[i * n.outputs + c];
+            if (lane < kSamples && lane < n.samples - from) out[(int64_t(from + lane) * n.count + i) * n.outputs + c] = total;
         }
-        const float total = warp_sums(parts) + n.bias2[i * n.outputs + c];
-        if (lane < kSamples && from + lane < n.samples) out[(int64_t(from + lane) * n.count + i) * n.outputs + c] = total;
     }
 }
 
@@ -132,10 +140,12 @@ int64_t gsparc_networks(const gsparc::GSPARC_ISA::Call* call) {
     const Networks n = read_networks(in);
     float* out = in.next<float>();
     if (!call->scratch) return 1;
+    if (const int64_t error = use_device(call->device)) return -error;
     void* stream = reinterpret_cast<void*>(uintptr_t(call->stream));
     const int64_t blocks = (n.count + kWarps - 1) / kWarps;
     if (n.samples == 1) return -launch(networks_kernel<1>, blocks, 1, kBlock, stream, n, out);
-    return -launch(networks_kernel<kMany>, blocks, (n.samples + kMany - 1) / kMany, kBlock, stream, n, out);
+    const int64_t rows = (int64_t(n.samples) + kMany - 1) / kMany;
+    return -launch(networks_kernel<kMany>, blocks, int(rows < kMostRows ? rows : kMostRows), kBlock, stream, n, out);
 }
 
 int64_t gsparc_networks_backward(const gsparc::GSPARC_ISA::Call* call) {
@@ -146,6 +156,7 @@ int64_t gsparc_networks_backward(const gsparc::GSPARC_ISA::Call* call) {
     d.out = in.next<const float>(), d.weight1 = in.next<float>(), d.bias1 = in.next<float>();
     d.weight2 = in.next<float>(), d.bias2 = in.next<float>();
     if (!call->scratch) return 1;
+    if (const int64_t error = use_device(call->device)) return -error;
     void* stream = reinterpret_cast<void*>(uintptr_t(call->stream));
     return -launch(networks_backward_kernel, (n.count + kWarps - 1) / kWarps, 1, kBlock, stream, n, d);
 }

@@ -35,9 +35,9 @@ template <class S> struct Outputs {
 };
 
 template <class S> __global__ void project_kernel(View<S> v, Model<S> model, Outputs<S> out) {
-    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-    if (at >= int64_t(v.poses) * v.count) return;
-    const int pose = int(at / v.count);
+    const uint32_t at = blockIdx.x * kThreads + threadIdx.x;
+    if (at >= uint32_t(v.poses) * v.count) return;
+    const int pose = at / v.count;
     const int64_t i = at % v.count, base = int64_t(pose) * v.count;
     const ProjectArgs<S> one = {model, v.count, v.lens, v.records + base * kRecord, out.depths + base, out.means2d + 2 * base,
                                 out.radii + base, v.boxes + base, out.visible + base, pose};
@@ -52,16 +52,15 @@ template <class S> __global__ void project_kernel(View<S> v, Model<S> model, Out
         for (int k = 0; k < 9; ++k) finite &= fabs(model.rotations[9 * pose + k]) <= S(3e38);
         if (!finite) atomicMin(out.wrong, kUnsoundPose);
     }
-    if (one.visible[i])
-        atomicAdd(v.shown + pose, 1);
-    else
-        v.boxes[at] = {0, 0, 0, 0};
+    if (!one.visible[i]) v.boxes[at] = {0, 0, 0, 0};
     out.keys[at] = depth_key<S>(pose, one.visible[i], one.depths[i]), out.values[at] = int32_t(i);
 }
 
-__global__ void look_for_disorder(const int64_t* ids, int count, int* unsorted) {
+// Makes `sorted` 0 where an id is smaller than that before it: once a warp, for atomics on one address queue up.
+__global__ void look_for_disorder(const int64_t* ids, int count, unsigned long long* sorted) {
     const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-    if (i > 0 && i < count && ids[i] < ids[i - 1]) *unsorted = 1;
+    const bool smaller = i > 0 && i < count && ids[i] < ids[i - 1];
+    if (warp_any(smaller) && threadIdx.x % kWarp == 0) atomicMin(sorted, 0ull);
 }
 
 // Heap sort of a run of equal depths by id: rare, so one thread does it, in place.
@@ -85,12 +84,12 @@ GSPARC_HD void sort_run(int32_t* run, int64_t length, const int64_t* ids) {
 }
 
 // The sort was stable by row; where ids are not in the order of the rows, equal depths go by id.
-template <class S> __global__ void break_ties(int32_t* order, const uint64_t* keys, const int64_t* ids, const int* unsorted, int poses, int count) {
-    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-    if (at >= int64_t(poses) * count || !*unsorted) return;
+template <class S> __global__ void break_ties(int32_t* order, const uint64_t* keys, const int64_t* ids, const unsigned long long* sorted, int poses, int count) {
+    const uint32_t at = blockIdx.x * kThreads + threadIdx.x;
+    if (at >= uint32_t(poses) * count || *sorted) return;
     const int64_t base = at / count * count, end = base + count;
     if (hidden_key<S>(keys[at]) || (at > base && keys[at - 1] == keys[at])) return;
-    int64_t last = at + 1;
+    int64_t last = int64_t(at) + 1;
     while (last < end && keys[last] == keys[at]) ++last;
     if (last - at > 1) sort_run(order + at, last - at, ids);
 }
@@ -98,57 +97,61 @@ template <class S> __global__ void break_ties(int32_t* order, const uint64_t* ke
 // Tiles that a box touches, each once: a box that would wrap into its own first tile was widened to the circle.
 static_assert(kTileWidth < kLanes, "set_columns widens boxes within kLanes of the full circle");
 struct TileRange {
-    int row0, rows, column0, columns, wrap;
+    int row0, rows, column0, columns;
 
     template <class S> GSPARC_HD TileRange(const Box& box, const View<S>& v) {
         row0 = box.row0 / kTileHeight;
         rows = box.row1 > box.row0 ? (box.row1 - 1) / kTileHeight - row0 + 1 : 0;
-        column0 = box.column0 / kTileWidth, wrap = v.tiles_x;
+        column0 = box.column0 / kTileWidth;
         const int end = box.column0 + box.columns;
         if (end <= v.lens.width)
             columns = (end - 1) / kTileWidth - column0 + 1;
         else
             columns = v.tiles_x - column0 + (end - v.lens.width - 1) / kTileWidth + 1;
     }
-    GSPARC_HD int count() const { return rows * columns; }
-    GSPARC_HD int tile(int k) const { return (row0 + k / columns) * wrap + (column0 + k % columns) % wrap; }
 };
 
-// A tile counts if at least one of its pixels lies inside the footprint: the test the compositing will make.
-// Writing is a second run of the same: `first` null counts.
+// A tile counts if at least one of its pixels lies inside the footprint: the test the compositing will make. A warp
+// holds one Gaussian. Writing is a second run of counting, which takes who is visible from the sorted keys.
 template <class S, bool kTangent>
-__global__ void list_tiles(View<S> v, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
+__global__ void list_tiles(View<S> v, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
     const int lane = threadIdx.x % kWarp;
-    const int64_t at = int64_t(blockIdx.x) * (kThreads / kWarp) + threadIdx.x / kWarp;
-    if (at >= int64_t(v.poses) * v.count) return;
-    const int pose = int(at / v.count), rank = int(at % v.count);
+    const uint32_t at = blockIdx.x * (kThreads / kWarp) + threadIdx.x / kWarp;
+    if (at >= uint32_t(v.poses) * v.count) return;
+    const int pose = at / v.count, rank = at % v.count;
     int64_t found = 0;
-    if (rank < v.shown[pose]) {
+    if (counts ? !hidden_key<S>(sorted[at]) : rank < v.shown[pose]) {
         const int32_t i = v.order[at];
         const int64_t row = int64_t(pose) * v.count + i;
-        const S* record = v.records + row * kRecord;
+        S record[kRecord];  // a copy: what is written below might be the records, for all the compiler knows
+        memcpy(record, v.records + row * kRecord, sizeof record);
         const TileRange range(v.boxes[row], v);
         const int64_t slot = counts ? 0 : v.slots[int64_t(pose) * (v.count + 1) + rank];
-        for (int k = 0; k < range.count(); ++k) {
-            const int tile = range.tile(k);
-            const Pixel<S, kTangent> pixel(v, tile, lane);
-            S tau1, tau2, form;
-            if (!warp_any(pixel.offsets(record, v.lens, tau1, tau2, form))) continue;
-            if (!counts && lane == 0 && slot + found < v.capacity)
-                keys[slot + found] = uint32_t(pose) * v.tiles + tile, gaussians[slot + found] = i;
-            ++found;
-        }
+        for (int row = range.row0; row < range.row0 + range.rows; ++row)
+            for (int k = 0, column = range.column0; k < range.columns; ++k, ++column) {
+                if (column == v.tiles_x) column = 0;
+                const Pixel<S, kTangent> pixel(v, row, column, lane);
+                S tau1, tau2, form;
+                if (!warp_any(pixel.offsets(record, v.lens, tau1, tau2, form))) continue;
+                if (!counts && lane == 0 && slot + found < v.capacity)
+                    keys[slot + found] = uint32_t(pose) * v.tiles + row * v.tiles_x + column, gaussians[slot + found] = i;
+                ++found;
+            }
     }
     if (counts && lane == 0) counts[at] = found;
 }
 
-// slots (P, N + 1) from the running sums; the total, or more than any capacity where something is unsound.
-__global__ void write_slots(const int64_t* sums, const unsigned long long* wrong, int poses, int count, int64_t* slots,
-                            int64_t* total, int64_t* verdict) {
-    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, all = int64_t(poses) * count;
-    if (at >= int64_t(poses) * (count + 1)) return;
-    const int64_t before = at / (count + 1) * count + at % (count + 1);  // ranks before this one, over all poses
+// slots (P, N + 1) from the running sums, shown (P,) from the sorted keys: the first hidden rank; the total, or more
+// than any capacity where something is unsound.
+template <class S>
+__global__ void write_slots(const int64_t* sums, const uint64_t* sorted, const unsigned long long* wrong, int poses, int count,
+                            int64_t* slots, int32_t* shown, int64_t* total, int64_t* verdict) {
+    const uint32_t at = blockIdx.x * kThreads + threadIdx.x, all = uint32_t(poses) * count;
+    if (at >= all + poses) return;
+    const uint32_t pose = at / (count + 1), rank = at % (count + 1), before = pose * count + rank;  // ranks before this one, over all poses
     slots[at] = before ? sums[before - 1] : 0;
+    const bool here = rank < uint32_t(count) && !hidden_key<S>(sorted[before]);
+    if (!here && (rank == 0 || !hidden_key<S>(sorted[before - 1]))) shown[pose] = rank;
     if (at > 0) return;
     verdict[0] = *wrong == kSound ? -1 : int64_t(*wrong), verdict[1] = sums[all - 1];
     *total = *wrong == kSound ? sums[all - 1] : INT64_MAX;
@@ -186,10 +189,10 @@ template <class S> int64_t plan(const Call& call) {
     const int64_t all = int64_t(v.poses) * v.count;
     const bool together = sizeof(S) == 4;
     const int64_t sorted_at_once = together ? all : v.count;
-    const int bits = together ? 32 + bits_for(v.poses - 1) : 64, sorts = together ? 1 : v.poses;
+    const int bits = together ? 32 + (v.poses > 1 ? bits_for(v.poses - 1) : 0) : 64, sorts = together ? 1 : v.poses;
     Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
-    out.wrong = arena.take<unsigned long long>(1);
-    int* unsorted = arena.take<int>(1);
+    out.wrong = arena.take<unsigned long long>(2);
+    unsigned long long* sorted = out.wrong + 1;
     out.depths = arena.take<S>(all), out.keys = arena.take<uint64_t>(all), out.values = arena.take<int32_t>(all);
     uint64_t* keys = arena.take<uint64_t>(all);
     int64_t *counts = arena.take<int64_t>(all), *sums = arena.take<int64_t>(all);
@@ -202,21 +205,21 @@ template <class S> int64_t plan(const Call& call) {
     if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
-    steps.then(clear(out.wrong, 0xff, sizeof *out.wrong, stream)).then(clear(unsorted, 0, sizeof *unsorted, stream));
-    steps.then(clear(v.shown, 0, v.poses * sizeof *v.shown, stream));
+    steps.then(clear(out.wrong, 0xff, 2 * sizeof *out.wrong, stream));  // sound, and sorted
     steps.then(launch(project_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, out));
     for (int pose = 0; pose < sorts; ++pose) {
         const int64_t at = pose * sorted_at_once;
         steps.then(sort_pairs<uint64_t>(temp, sort_bytes, out.keys + at, keys + at, out.values + at, v.order + at, sorted_at_once, bits, stream));
     }
     if (ids) {
-        steps.then(launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, unsorted));
-        steps.then(launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, unsorted, v.poses, v.count));
+        steps.then(launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, sorted));
+        steps.then(launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, sorted, v.poses, v.count));
     }
     const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
-    steps.then(launch(list, blocks_for(all * kWarp), 1, kThreads, stream, v, counts, nullptr, nullptr));
+    steps.then(launch(list, blocks_for(all * kWarp), 1, kThreads, stream, v, keys, counts, nullptr, nullptr));
     steps.then(running_sums(temp, sum_bytes, counts, sums, all, stream));
-    steps.then(launch(write_slots, blocks_for(all + v.poses), 1, kThreads, stream, sums, out.wrong, v.poses, v.count, v.slots, v.total, verdict));
+    steps.then(launch(write_slots<S>, blocks_for(all + v.poses), 1, kThreads, stream, sums, keys, out.wrong, v.poses, v.count, v.slots, v.shown,
+                      v.total, verdict));
     return steps.result();
 }
 
@@ -237,7 +240,7 @@ template <class S> int64_t bin(const Call& call) {
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
     steps.then(launch(number_slots, blocks_for(capacity), 1, kThreads, stream, numbers, keys, v.total, v.capacity, tiles));
-    steps.then(launch(list, blocks_for(int64_t(v.poses) * v.count * kWarp), 1, kThreads, stream, v, nullptr, keys, gaussians));
+    steps.then(launch(list, blocks_for(int64_t(v.poses) * v.count * kWarp), 1, kThreads, stream, v, nullptr, nullptr, keys, gaussians));
     if (capacity > 0) steps.then(sort_pairs<uint32_t>(temp, bytes, keys, sorted_keys, numbers, slots, capacity, bits, stream));
     steps.then(launch(write_entries, blocks_for(capacity + 1), 1, kThreads, stream, sorted_keys, slots, gaussians, v.capacity, tiles,
                       v.starts, v.gaussians, v.slot_of));
@@ -271,11 +274,26 @@ int64_t gsparc_tables(const gsparc::GSPARC_ISA::Call* call) {
     });
 }
 
+// Whether the driver can run these kernels on the call's device; whole[0] and whole[1] receive the CUDA versions of the
+// build and of the driver.
+int64_t gsparc_check(gsparc::GSPARC_ISA::Call* call) {
+#ifdef __CUDACC__
+    using namespace gsparc::GSPARC_ISA;
+    cudaFuncAttributes known;
+    call->whole[0] = CUDART_VERSION;
+    Steps steps;
+    return steps.then(cudaDriverGetVersion(call->whole + 1)).then(use_device(call->device)).then(cudaFuncGetAttributes(&known, look_for_disorder)).result();
+#else
+    return call->whole[0] = call->whole[1] = 0;
+#endif
+}
+
 const char* gsparc_error(int64_t code) {
+    using namespace gsparc;
 #ifdef __CUDACC__
     return cudaGetErrorString(cudaError_t(code));
 #else
-    return code ? "a barrier was not met by all threads" : "";
+    return code == shim::kUnmet ? "a barrier was not met by all threads" : code ? "a grid larger than GPUs take" : "";
 #endif
 }
 

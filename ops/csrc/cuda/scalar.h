@@ -23,10 +23,22 @@ template <class S> GSPARC_INLINE S lesser(S a, S b) { return a <= b ? a : b; }
 GSPARC_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 GSPARC_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
 template <class S> GSPARC_INLINE S reciprocal(S x) { return S(1) / x; }
+#ifdef __CUDA_ARCH__
+// To 1 ulp in one instruction instead of ten: what it is asked for lies between the square of the horizon and 1.
+GSPARC_INLINE float reciprocal(float x) {
+    float y;
+    asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+    return y;
+}
+#endif
 GSPARC_INLINE float nearest(float x) { return rintf(x); }
 GSPARC_INLINE double nearest(double x) { return rint(x); }
 #ifdef __CUDA_ARCH__
-GSPARC_INLINE float exponential(float x) { return __expf(x); }  // relative error below 2e-6 within the cut-offs
+GSPARC_INLINE float exponential(float x) {  // relative error below 2e-6 within the cut-offs
+    float y;
+    asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x * 1.44269504f));
+    return y;
+}
 #else
 GSPARC_INLINE float exponential(float x) { return expf(x); }
 #endif

@@ -14,7 +14,7 @@ static_assert(kTileWidth * kTileHeight == kWarp, "a lane is a pixel");
 
 // One call from Python (cuda.py holds the same structure). Addresses of 0 are absent tensors.
 struct Call {
-    int32_t twice, poses, count, samples, channels, capacity;
+    int32_t twice, poses, count, samples, channels, capacity, device;
     int32_t whole[6];
     double real[10];
     uint64_t tensors[32];
@@ -82,23 +82,24 @@ template <class S> Model<S> read_model(Reader& in) {
 // One lane's pixel of a tile.
 template <class S, bool kTangent> struct Pixel {
     int row, column;
-    bool real;  // false beyond the edge of the grid
-    S cos_column, sin_column, number, cos_row, sin_row, turn, per_turn;
+    bool real;               // false beyond the edge of the grid
+    S east, north, up;       // its direction
+    S number, turn, per_turn;
 
-    GSPARC_HD Pixel(const View<S>& v, int tile, int lane) {
-        row = tile / v.tiles_x * kTileHeight + lane / kTileWidth;
-        column = tile % v.tiles_x * kTileWidth + lane % kTileWidth;
+    GSPARC_HD Pixel(const View<S>& v, int tile_row, int tile_column, int lane) {
+        row = tile_row * kTileHeight + lane / kTileWidth;
+        column = tile_column * kTileWidth + lane % kTileWidth;
         real = row < v.lens.height && column < v.lens.width;
         const int in_row = row < v.lens.height ? row : v.lens.height - 1;
-        cos_column = v.tables.cos_column[column], sin_column = v.tables.sin_column[column];
         number = v.tables.column[column];  // the tables are padded: NaN past the last column passes no test
-        cos_row = v.tables.cos_row[in_row], sin_row = v.tables.sin_row[in_row];
+        east = v.tables.cos_row[in_row] * v.tables.cos_column[column], north = v.tables.cos_row[in_row] * v.tables.sin_column[column];
+        up = v.tables.sin_row[in_row];
         turn = v.tables.turn, per_turn = v.tables.per_turn;
     }
     // Standardised offsets of this pixel from the footprint of a record, and whether it lies inside.
     GSPARC_HD bool offsets(const S* record, const Lens<S>& lens, S& tau1, S& tau2, S& form) const {
         const Tables<S> circle = {nullptr, nullptr, nullptr, nullptr, nullptr, turn, per_turn};
-        const Place<S> here = {cos_row, sin_row, S(row), cos_column, sin_column, number};
+        const Place<S> here = {S(1), up, S(row), east, north, number};  // the row's cosine is in the columns already
         const RowView<S, kTangent> view(record, here, circle, lens);
         typename RowView<S, kTangent>::Seen seen;
         const bool inside = view.look(here, seen);
@@ -109,8 +110,11 @@ template <class S, bool kTangent> struct Pixel {
     GSPARC_HD int64_t place(const Lens<S>& lens) const { return int64_t(row) * lens.width + column; }
 };
 
-// Calls run(S()) with S double or float.
-template <class F> int64_t with_scalar(const Call& call, F run) { return call.twice ? run(double()) : run(float()); }
+// Calls run(S()) with S double or float, on the call's device.
+template <class F> int64_t with_scalar(const Call& call, F run) {
+    if (const int64_t error = use_device(call.device)) return -error;
+    return call.twice ? run(double()) : run(float());
+}
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc

@@ -10,15 +10,18 @@ namespace GSPARC_ISA {
 
 template <class S> constexpr int kBatch = sizeof(S) == 4 ? 32 : 16;  // entries a warp takes at a time
 
-struct alignas(16) Quarter {
-    uint32_t words[4];
+// What one instruction moves.
+template <class S> struct alignas(16) Quarter {
+    S numbers[16 / sizeof(S)];
 };
 
 template <class S, int kChannels> struct alignas(16) Staged {
     S record[kRecord];
-    S opacity, extinction, features[kChannels];
+    S opacity, extinction, features[kChannels + (kChannels == 16)];  // one to spare, see below
     int32_t slot, gaussian;
 };
+// Lanes fill an entry each: an odd number of quarters from one to the next spreads them over the banks.
+static_assert(sizeof(Staged<float, 1>) / 16 % 2 && sizeof(Staged<float, 4>) / 16 % 2 && sizeof(Staged<float, 16>) / 16 % 2, "banks");
 
 // What the warps of a block leave for each other.
 template <class S, int kChannels> struct Desk {
@@ -40,7 +43,7 @@ template <class S, bool kTangent, int kChannels> struct Walk {
 
     GSPARC_HD Walk(const View<S>& view, Shared& shared, int block, int thread)
         : v(view), desk(shared), warp(thread / kWarp), lane(thread % kWarp), pose(block / view.tiles),
-          pixel(view, block % view.tiles, thread % kWarp), floor(view.lens.transmittance_min), alpha_max(view.lens.alpha_max),
+          pixel(view, block % view.tiles / view.tiles_x, block % view.tiles % view.tiles_x, thread % kWarp), floor(view.lens.transmittance_min), alpha_max(view.lens.alpha_max),
           base(view.starts[block]), end(view.starts[block + 1]) {}
 
     GSPARC_HD bool lit(S before) const { return pixel.real && floor <= before; }
@@ -59,9 +62,9 @@ template <class S, bool kTangent, int kChannels> struct Walk {
             Staged<S, kChannels>& to = desk.staged[warp][lane];
             const int32_t i = v.gaussians[first + lane];
             const int64_t row = int64_t(pose) * v.count + i;
-            const Quarter* record = reinterpret_cast<const Quarter*>(v.records + row * kRecord);
-            Quarter* copy = reinterpret_cast<Quarter*>(to.record);
-            for (int k = 0; k < int(kRecord * sizeof(S) / sizeof(Quarter)); ++k) copy[k] = record[k];
+            const Quarter<S>* record = reinterpret_cast<const Quarter<S>*>(v.records + row * kRecord);
+            Quarter<S>* copy = reinterpret_cast<Quarter<S>*>(to.record);
+            for (int k = 0; k < int(kRecord * sizeof(S) / sizeof(Quarter<S>)); ++k) copy[k] = record[k];
             const S gain = to.record[kGain];
             to.opacity = gain * model.opacities[i];
             to.extinction = model.extinctions ? gain * model.extinctions[i] : to.opacity;
