@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import logging
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from torch import Tensor
 
 from gsparc.bearings.field import BearingField
+from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -18,11 +21,12 @@ from gsparc.effects import (
     Decision,
     EffectSettings,
     decide_array,
+    decide_directions,
     decide_phase,
     probe_array,
     probe_phase,
 )
-from gsparc.hybrid import Beside, Rest, learn_rest, restored
+from gsparc.hybrid import Companion, Rest, Told, learn_rest, restored, searched_beyond, weight_of
 from gsparc.learned import LearnedField
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
@@ -31,6 +35,12 @@ from gsparc.response import ResponseSettings
 from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)
+
+ALONE, UNHEARD = (
+    0.9,
+    0.05,
+)  # say of directed sources above which nobody else is asked, below which they are not
+HOPELESS = 0.9  # NMSE of held-out channels from which on a short search promises nothing of a long one
 
 
 class Gsparc(LearnedField):
@@ -42,6 +52,7 @@ class Gsparc(LearnedField):
         phase_probe: the same with a small budget, for the probe.
         array_model: what predicts where `array` is on and the receiver is static.
         bearing_model: what predicts where `array` is on and the receiver moves.
+        directed_model: what predicts, alone or with `phase_model`, where `directions` is on.
         **field: see `LearnedField`.
     """
 
@@ -49,9 +60,10 @@ class Gsparc(LearnedField):
         self,
         effects: EffectSettings,
         phase_model: Method,
-        phase_probe: Method,
+        phase_probe: VirtualSourceGP,
         array_model: Method,
         bearing_model: Method,
+        directed_model: DirectedSources,
         **field: Any,
     ) -> None:
         response = replace(
@@ -61,10 +73,13 @@ class Gsparc(LearnedField):
         )
         super().__init__(response=response, **field)
         self.switches = effects
-        self._models = {"phase": phase_model, "array": array_model, "bearings": bearing_model}
+        self._models: dict[str, Method] = {"phase": phase_model, "array": array_model}
+        self._models |= {"bearings": bearing_model, "directions": directed_model}
+        self._directed, self._optimism = directed_model, 1.0
+        self._followed = FitReport(0.0)
         self._probe = phase_probe
         self._chosen: str | None = None
-        self._rest: Rest | Beside | None = None
+        self._rest: Companion | None = None
         self.decisions: tuple[Decision, ...] = ()
 
     @property
@@ -72,13 +87,16 @@ class Gsparc(LearnedField):
         """The effects that are computed, for `summary.json`."""
         response = self.settings.response
         splatted = [name for name, on in (("array", response.array), ("phase", response.carrier)) if on]
-        hybrid = "" if self._rest is None else "+hybrid"
+        told = isinstance(self._rest, Told)
+        hybrid = "+directions" if told else ""
+        if self._rest is not None and not (isinstance(self._rest, Told) and self._rest.rest is None):
+            hybrid += "+hybrid"
         chosen = self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
         return chosen + hybrid
 
     @property
-    def answering(self) -> tuple[Method, Rest | Beside | None]:
-        """What computes the answers, itself when no effect is on, and the process that completes them."""
+    def answering(self) -> tuple[Method, Companion | None]:
+        """What computes the answers, itself when no effect is on, and what completes them."""
         return (self if self._chosen is None else self._models[self._chosen]), self._rest
 
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
@@ -99,11 +117,26 @@ class Gsparc(LearnedField):
             chosen, budget_s = self._models[self._chosen], self.training.settings.budget_s
             if budget_s is not None:
                 _limit(chosen, self.training, budget_s - sum(d.seconds for d in self.decisions))
-            report = chosen.fit(data, fold, run_dir)
+            report = self._followed if self._chosen == "directions" else chosen.fit(data, fold, run_dir)
             decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data, fold)
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
+            self._listen()
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
+
+    def _listen(self) -> None:
+        """Weigh sources of measured directions beside searched ones."""
+        told = any(d.effect == "directions" and d.on for d in self.decisions)
+        searched = None if self._chosen is None else self._models[self._chosen]
+        if not told or not isinstance(searched, VirtualSourceGP):
+            return
+        weight = weight_of(self._directed, searched, self._optimism)
+        log.info("effects.directions: %.0f%% of the say, by left-out channels", 100 * weight)
+        if weight > ALONE:
+            self._chosen, self._rest = "directions", None
+        elif weight > UNHEARD:
+            assert self._rest is None or isinstance(self._rest, Rest)
+            self._rest = Told(self._directed, weight, self._rest)
 
     def _go_on(self, model: Method) -> None:
         """Hand over what an interrupted run has left."""
@@ -121,11 +154,44 @@ class Gsparc(LearnedField):
         splatting = f"emission.hidden={hidden}" if hidden else None
         phase = decide_phase(self.switches.phase, data.site, splatting)
         array = decide_array(self.switches.array, data.site, splatting)
-        if phase.on and self.switches.phase == "auto":
+        sources = phase.on and self.switches.phase != SPLAT
+        directions = decide_directions(self.switches.directions, sources, data)
+        if directions.on:
+            directions = self._follow(data, fold)
+        if directions.on and sources:
+            phase = self._search_beside(data, fold)
+        elif phase.on and self.switches.phase == "auto":
             phase = probe_phase(self._probe, GaussianProcess(), data, fold, self.training.seed)
         if array.on and self.switches.array == "auto":
             array = probe_array(data, fold, self.training.seed)
-        return phase, array
+        return phase, array, directions
+
+    def _search_beside(self, data: Measurements, fold: Fold) -> Decision:
+        """Whether a search is worth its time beside measured directions."""
+        started = time.perf_counter()
+        error, self._optimism = searched_beyond(self._probe, data, fold.train, self.training.seed)
+        reason = (
+            f"short searches leave NMSE {error:.3f} of held-out channels, "
+            f"{self._optimism:.1f} times what they promise"
+        )
+        on = error < HOPELESS or self.switches.phase is True
+        return Decision("phase", on, reason, time.perf_counter() - started)
+
+    def _follow(self, data: Measurements, fold: Fold) -> Decision:
+        """Sources of measured directions, used where they predict left-out channels at all."""
+        wanted = self.switches.directions is True
+        try:
+            report = self._directed.fit(data, fold, Path())
+            self._followed = replace(report, seconds=0.0)  # the decision's own
+        except ValueError as error:
+            if wanted:
+                raise
+            return Decision("directions", False, str(error))
+        receivers, left = self._directed.left_over()
+        power = np.mean(np.abs(data.target[np.unique(receivers)]) ** 2)
+        nmse = float(left.abs().square().mean()) / max(float(power), 1e-30)
+        reason = f"{self._directed.size()} sources where rays meet leave NMSE {nmse:.3f} of left-out channels"
+        return Decision("directions", wanted or nmse < 1, reason, report.seconds)
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the variance errs high by what a process beside it explains."""

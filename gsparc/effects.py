@@ -35,11 +35,13 @@ class EffectSettings:
         phase: carrier phase from source positions (channels of a moving receiver).
         array: array response (spectra with a declared array: the array's vectors where it is static, bearings
             of sources where it moves).
+        directions: measured directions of arrival say where sources are and who sees them; never `splat`.
         hybrid: a process for what the sources of `phase` leave over; never `splat`.
     """
 
     phase: Switch = "auto"
     array: Switch = "auto"
+    directions: Switch = "auto"
     hybrid: Switch = "auto"
 
 
@@ -110,6 +112,29 @@ def decide_array(switch: Switch, site: Site, splatting: str | None) -> Decision:
     return _settle("array", switch, obstacle)
 
 
+def decide_directions(switch: Switch, sources: bool, data: Measurements) -> Decision:
+    """Whether measured directions of arrival are to be used.
+
+    Args:
+        switch: as configured.
+        sources: whether the carrier's phase is to come from sources; `auto` follows it.
+        data: measurements; only whether they have directions is looked at.
+
+    Raises:
+        ValueError: asked for where there is nothing to use.
+    """
+    obstacle = None
+    if data.site.kind != "csi" or data.site.static_end != "tx" or data.site.wavelength is None:
+        obstacle = "they are for channels of a moving receiver at a known carrier"
+    elif data.directions is None:
+        obstacle = "no directions of arrival were measured"
+    elif switch == "auto" and not sources:
+        obstacle = "no sources with carrier phase are asked for"
+    if switch == SPLAT:
+        raise ValueError("model.effects.directions=splat: choose auto, true or false")
+    return _settle("directions", switch, obstacle)
+
+
 def _settle(effect: str, switch: Switch, obstacle: str | None) -> Decision:
     if switch not in ("auto", SPLAT, True, False):
         raise ValueError(f"model.effects.{effect}={switch!r}: choose auto, splat, true or false")
@@ -131,6 +156,20 @@ def spacing_in_wavelengths(data: Measurements, rows: np.ndarray) -> float:
     return float(np.median(nearest)) / data.site.wavelength
 
 
+def fifths(rows: np.ndarray, seed: int) -> list[Fold]:
+    """Five folds of training rows, each with another fifth held out as its test rows; the draw is seeded."""
+    order = np.random.default_rng(seed).permutation(rows)
+    parts = [part for part in np.array_split(order, 5) if len(part)]
+    return [Fold(np.sort(np.setdiff1d(rows, part)), part[:0], part) for part in parts]
+
+
+def nmse_of(method: Method, data: Measurements, rows: np.ndarray) -> float:
+    """Normalised mean squared error of a fitted method on rows of channels."""
+    batch = data.batch(rows)
+    miss = (method.predict(batch.tx, batch.rx).mean - batch.target).abs().square().sum()
+    return float(miss / batch.target.abs().square().sum())
+
+
 def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
     """Let a small coherent search and the Gaussian process predict a held-out fifth of the training rows.
 
@@ -142,15 +181,11 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
     """
     started = time.perf_counter()
     dense = spacing_in_wavelengths(data, fold.train)
-    rows = np.random.default_rng(seed).permutation(fold.train)
-    held, known = rows[: max(len(rows) // 5, 1)], np.sort(rows[max(len(rows) // 5, 1) :])
-    inner = Fold(known, held[:0], held)
+    inner = fifths(fold.train, seed)[0]
     errors = {}
     for name, method in (("coherent", trial), ("interpolation", rival)):
         method.fit(data, inner, Path())
-        batch = data.batch(held)
-        miss = (method.predict(batch.tx, batch.rx).mean - batch.target).abs().square().sum()
-        errors[name] = float(miss / batch.target.abs().square().sum())
+        errors[name] = nmse_of(method, data, inner.test)
     better = errors["coherent"] < errors["interpolation"]
     reason = (
         f"neighbours are {dense:.2f} wavelengths apart"

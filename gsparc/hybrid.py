@@ -7,6 +7,9 @@ measured less what the sources of all *other* receivers say, and counts by its o
 **Beside.** From a few spectra an array's vectors are no better learned than images are, and the two err
 differently: where both predict training spectra without their neighbours about equally well, the mean of both
 answers, weighted by these predictions.
+
+**Told.** Sources where measured directions of arrival meet know who sees what; a search knows walls and
+furniture. Both answer, weighted by their left-out predictions of the training channels.
 """
 
 from __future__ import annotations
@@ -23,16 +26,18 @@ from torch import Tensor
 from gsparc.array.field import ArrayField
 from gsparc.array.tuning import LeftOut, without
 from gsparc.coherent.complex_gp import ComplexGP
+from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.effects import Decision, Switch
+from gsparc.effects import Decision, Switch, fifths, nmse_of
 from gsparc.method import Method
 from gsparc.ops import Pose
 from gsparc.peers.gp import GaussianProcess, choose_kernel
 
 LEVEL_DB = 0.25  # a process of images this far behind an array, left out, is level with it
 WEIGHTS = np.linspace(0, 1, 21)
+PROBE_S = 5.0  # after which no further fifth of the rows is held out
 LEAST_GAIN = 0.03  # of the left-out residual's power, below which `auto` does without
 
 
@@ -91,13 +96,82 @@ class Beside:
         return {"beside": self.process.state(), "weight": self.weight}
 
 
-def restored(site: Site, state: dict[str, Any]) -> Rest | Beside:
+@dataclass(frozen=True)
+class Told:
+    """Sources of measured directions that answer with searched ones.
+
+    Attributes:
+        sources: of measured directions.
+        weight: in (0, 1), their say.
+        rest: a process that completes the searched ones, or None.
+    """
+
+    sources: DirectedSources
+    weight: float
+    rest: Rest | None
+
+    def completed(self, mean: Tensor, tx: Tensor, rx: Pose) -> Tensor:
+        """What searched sources say (B, A, K), averaged with these."""
+        searched = mean if self.rest is None else self.rest.completed(mean, tx, rx)
+        return (1 - self.weight) * searched + self.weight * self.sources.predict(tx, rx).mean
+
+    def state(self) -> dict[str, Any]:
+        """Everything `restore` needs."""
+        rest = None if self.rest is None else self.rest.state()
+        return {"told": self.sources.state(), "weight": self.weight, "rest": rest}
+
+
+Companion = Rest | Beside | Told
+
+
+def restored(site: Site, state: dict[str, Any]) -> Companion:
     """The one whose `state()` this was."""
+    if "told" in state:
+        sources = DirectedSources()
+        sources.restore(site, state["told"])
+        rest = None if state["rest"] is None else Rest.restore(site, state["rest"])
+        return Told(sources, float(state["weight"]), rest)
     if "beside" not in state:
         return Rest.restore(site, state)
     process = GaussianProcess()
     process.restore(site, state["beside"])
     return Beside(process, float(state["weight"]))
+
+
+def searched_beyond(
+    trial: VirtualSourceGP, data: Measurements, rows: np.ndarray, seed: int
+) -> tuple[float, float]:
+    """What short searches on four fifths of the rows predict of the fifth: NMSE, and how many times the error
+    that their own left-out channels promise. From few rows a search finds sources that fit and are not there.
+
+    As many fifths as `PROBE_S` allows, at least one.
+    """
+    started, held, promised = time.perf_counter(), [], []
+    for fold in fifths(rows, seed):
+        trial.fit(data, fold, Path())
+        held.append(nmse_of(trial, data, fold.test))
+        receivers, left = trial.left_over()
+        power = float(np.mean(np.abs(data.target[np.unique(receivers)]) ** 2))
+        promised.append(float(left.abs().square().mean()) / max(power, 1e-30))
+        if time.perf_counter() - started > PROBE_S:
+            break
+    error = float(np.mean(held))
+    return error, max(error / max(float(np.mean(promised)), 1e-30), 1.0)
+
+
+def weight_of(directed: DirectedSources, searched: VirtualSourceGP, optimism: float) -> float:
+    """The say in [0, 1] of sources of measured directions beside searched ones.
+
+    That of least squared error where each receiver is predicted from all others, the searched sources' error
+    being `optimism` times what it is there.
+    """
+    receivers, left = directed.left_over()
+    others, beside = searched.left_over()
+    if not np.array_equal(receivers, others):
+        raise ValueError("directed and searched sources must hold the same rows: set the same rows and seed")
+    theirs, own = optimism * float(beside.abs().square().sum()), float(left.abs().square().sum())
+    common = float((left.conj() * beside).real.sum())
+    return min(max((theirs - common) / max(theirs + own - 2 * common, 1e-30), 0.0), 1.0)
 
 
 def learn_rest(

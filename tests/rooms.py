@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from gsparc.data.own import from_arrays
@@ -32,6 +34,21 @@ def shoebox(
     told = trace(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
     data = from_arrays(told.as_arrays())
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
+
+
+def directed(
+    count: int, *, pillar: bool = False, tones: int = 1, seed: int = 0
+) -> tuple[Measurements, Fold, np.ndarray]:
+    """A shoebox whose receivers measured where every visible path comes from, and its sources (7, 3) [m]."""
+    comb = 2.4e9 + 1e6 * np.arange(tones)
+    trace, data, fold = shoebox(
+        count, pillar=pillar, frequency_hz=comb if tones > 1 else 2.4e9, max_order=1, seed=seed
+    )
+    sources = trace.images.of(trace.tx[0])
+    rays = sources[None] - trace.rx[:, None]
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    seen = [rays[i][trace.visible[i]].astype(np.float32) for i in range(count)]
+    return replace(data, directions=seen), fold, sources - data.site.origin
 
 
 FURNITURE = np.array(  # tables, cabinets, a partition: [m], lower and upper corners

@@ -7,11 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boxes import room_of_spectra
+from rooms import directed
 
 from gsparc.data.rfid import load_rfid
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
-from gsparc.effects import decide_array, decide_phase, probe_array, spacing_in_wavelengths
+from gsparc.effects import (
+    decide_array,
+    decide_directions,
+    decide_phase,
+    fifths,
+    probe_array,
+    spacing_in_wavelengths,
+)
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
 
 
@@ -42,6 +50,25 @@ def test_phase_needs_channels_of_a_moving_receiver(spectra, channels) -> None:
         decide_phase(True, replace(channels, static_end="rx"), None)
     with pytest.raises(ValueError, match="choose auto, splat, true or false"):
         decide_phase("on", channels, None)  # type: ignore[arg-type]
+
+
+def test_directions_need_to_have_been_measured(spectra) -> None:
+    told, _, _ = directed(10)
+    assert decide_directions("auto", True, told).on and decide_directions(True, False, told).on
+    assert "no sources" in decide_directions("auto", False, told).reason
+    assert "no directions" in decide_directions("auto", True, replace(told, directions=None)).reason
+    assert "moving receiver" in decide_directions("auto", True, spectra).reason
+    with pytest.raises(ValueError, match=r"effects\.directions=true is not possible: no directions"):
+        decide_directions(True, True, replace(told, directions=None))
+    with pytest.raises(ValueError, match="choose auto, true or false"):
+        decide_directions("splat", True, told)
+
+
+def test_every_row_is_held_out_once() -> None:
+    rows = np.arange(3, 20)
+    folds = fifths(rows, 0)
+    assert sorted(np.concatenate([fold.test for fold in folds])) == list(rows)
+    assert all(not set(fold.test) & set(fold.train) for fold in folds) and len(folds) == 5
 
 
 def test_an_ablation_of_the_networks_is_not_answered_by_another_model(spectra) -> None:

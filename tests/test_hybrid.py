@@ -9,13 +9,14 @@ import pytest
 import torch
 from campaigns import compose
 from invented import invent
-from rooms import nmse, rough, shoebox
+from rooms import directed, nmse, rough, shoebox
 
 from gsparc.array.tuning import LeftOut
+from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
-from gsparc.hybrid import Beside, Rest, compared, learn_rest
+from gsparc.hybrid import Beside, Rest, Told, compared, learn_rest, searched_beyond, weight_of
 from gsparc.peers.mean import Mean
 from gsparc.registry import build
 
@@ -116,3 +117,70 @@ def test_an_array_of_few_spectra_answers_with_a_process_beside_it(tmp_path):
     again = build(compose().model)
     again.restore(data.site, method.state())
     torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, found, atol=1e-5, rtol=1e-5)
+
+
+SETTINGS = ["phase_model.searches=1", "phase_model.search_rows=220", "phase_model.furniture=false"]
+SETTINGS += ["phase_model.edges=false", "phase_model.margin=4", "phase_probe.margin=4"]
+
+
+def _best(*settings: str):
+    return build(compose(*(f"model.{s}" for s in (*SETTINGS, *settings))).model)
+
+
+def test_from_few_receivers_measured_directions_answer_alone():
+    """A search of 16 channels finds what is not there; its own left-out error does not know."""
+    data, _, _ = directed(80)
+    rows = np.arange(80)
+    fold = Fold(rows[:14], rows[14:16], rows[16:])
+    method, batch = _best(), data.batch(fold.test)
+    method.fit(data, fold, Path())
+    assert method.effects == "directions" and isinstance(method.answering[0], DirectedSources)
+    assert nmse(method.predict(batch.tx, batch.rx).mean.numpy(), data.target[fold.test]) < 0.05
+    other = _best()
+    other.restore(data.site, method.state())
+    assert torch.equal(other.predict(batch.tx, batch.rx).mean, method.predict(batch.tx, batch.rx).mean)
+
+
+def test_searched_and_directed_sources_answer_together_where_both_know_something():
+    data, fold, _ = directed(150, pillar=True)
+    method, batch = _best("effects.phase=true"), data.batch(fold.test)
+    method.fit(data, fold, Path())
+    searched, rest = method.answering
+    assert isinstance(searched, VirtualSourceGP) and isinstance(rest, Told)
+    assert method.effects.startswith("phase+directions") and 0 < rest.weight <= 1
+    both = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), data.target[fold.test])
+    alone = [
+        nmse(one.predict(batch.tx, batch.rx).mean.numpy(), data.target[fold.test])
+        for one in (searched, rest.sources)
+    ]
+    assert both < 1.5 * min(alone) and both < 0.5 * max(alone)
+    other = _best()
+    other.restore(data.site, method.state())
+    assert torch.equal(other.predict(batch.tx, batch.rx).mean, method.predict(batch.tx, batch.rx).mean)
+
+
+@pytest.mark.parametrize("settings", [["effects.directions=false"], ["effects.phase=false"]])
+def test_directions_are_not_used_where_they_are_not_wanted(settings):
+    data, fold, _ = directed(40)
+    method = _best(*settings, "phase_probe.budget_s=1")
+    method.site = data.site
+    decided = {d.effect: d for d in method._decide(data, fold)}
+    assert not decided["directions"].on
+
+
+def test_a_promise_that_a_search_does_not_keep_costs_it_its_say():
+    left = torch.randn(30, 1, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    told, searched = Known(left), Known(0.5 * left.flip(0))
+    weights = [weight_of(told, searched, optimism) for optimism in (1.0, 4.0, 1e6)]  # type: ignore[arg-type]
+    assert weights[0] < weights[1] < weights[2] and weights[2] > 0.99
+    with pytest.raises(ValueError, match="same rows"):
+        weight_of(told, Known(left[:20]), 1.0)  # type: ignore[arg-type]
+
+
+def test_searches_of_few_rows_promise_too_much():
+    data, fold, _ = directed(150)
+    few = fold.train[:10]
+    probe = _best()._probe
+    error, optimism = searched_beyond(probe, data, few, 0)
+    better, honest = searched_beyond(probe, data, fold.train, 0)
+    assert optimism > 2 and optimism > honest and error > 3 * better

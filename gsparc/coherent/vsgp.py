@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from torch import Tensor
 
 from gsparc.coherent.edges import Edges, diffracted, edge_wave, find_edges, with_gains, without
 from gsparc.coherent.ensemble import Budget, Member, search_many, weights
+from gsparc.coherent.frame import Frame, frame_of, refuse
 from gsparc.coherent.furniture.clutter import Clutter
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.offsets import KINDS, Offsets, estimate
@@ -41,26 +41,6 @@ CLEARLY = 0.8  # left-out error beside edges over that without, for edges to sta
 AGAIN = 0.2  # of the budget, at least, for searching again beside edges
 ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
 ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
-
-
-@dataclass(frozen=True)
-class Frame:
-    """How local metres and stored units become the search's.
-
-    Attributes:
-        middle: (3,) float64 [m], local; the search works about it.
-        scale: stored target = scale * search target.
-        carrier_hz: amplitude goes with wavelength, so targets are multiplied by f / carrier first [Hz].
-    """
-
-    middle: Tensor
-    scale: float
-    carrier_hz: float
-
-    def inside(self, rows: Rows) -> Rows:
-        """Rows in local metres and stored units, as the search wants them."""
-        flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
-        return replace(rows.moved(-self.middle), target=flat)
 
 
 class VirtualSourceGP(Method):
@@ -118,11 +98,11 @@ class VirtualSourceGP(Method):
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
         started = time.monotonic()
-        _refuse(data.site)
+        refuse(data.site, self.name)
         known = np.concatenate([fold.train, fold.val])
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
-        self.frame = _frame(data.site, everything)
+        self.frame = frame_of(data.site, everything)
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
         held = self.frame.inside(everything)
@@ -355,24 +335,6 @@ class VirtualSourceGP(Method):
         if self.site is None or not self.members:
             raise ValueError("vsgp: not fitted yet; call fit or restore first")
         return self.site
-
-
-def _refuse(site: Site) -> None:
-    if site.kind != "csi":
-        raise ValueError(f"vsgp: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
-    if site.static_position is None:
-        raise ValueError(f"vsgp: {site.name} does not say where its static end is; take model=complex_gp")
-    if site.static_end == "rx" and site.array is not None and len(site.array) > 1:
-        raise ValueError(
-            f"vsgp: in {site.name} the transmitter moves before an array; that needs mirrored arrays"
-        )
-
-
-def _frame(site: Site, rows: Rows) -> Frame:
-    frequency = tones_of(site)
-    carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
-    power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
-    return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 
 def _scene_state(phased: PhasedScene) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.best import Gsparc
+from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Site
 from gsparc.link.grid import interpolated, resource_grid
@@ -80,13 +81,13 @@ def heard_paths(method: Method, site: Site, uplink: Any) -> Paths:
 def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
     """The paths of a coherent field at positions in local coordinates.
 
-    What a process beside the field adds (`model.effects.hybrid`) has no paths and is not among them.
+    Of several models that answer together (`model.effects.hybrid`, `directions`) these are the first's.
 
     Raises:
         ValueError: the model's channels are not made of paths.
     """
     method = method.answering[0] if isinstance(method, Gsparc) else method
-    if not isinstance(method, VirtualSourceGP):
+    if not isinstance(method, VirtualSourceGP | DirectedSources):
         raise ValueError(f"paths: channels of {method.name} are not made of paths (model=vsgp, uplink)")
     gain, delay, direction = method.paths(tx, rx)
     return Paths(

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from gsparc.best import Gsparc
 from gsparc.data.schema import Measurements
-from gsparc.hybrid import Beside, Rest
+from gsparc.hybrid import Companion
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.tradeoff.points import Settings
@@ -45,15 +45,15 @@ def answering(method: Method) -> Method:
     return method.answering[0] if isinstance(method, Gsparc) else method
 
 
-def _rest(method: Method) -> Rest | Beside | None:
-    """The process that completes its answers."""
+def _rest(method: Method) -> Companion | None:
+    """What completes its answers."""
     return method.answering[1] if isinstance(method, Gsparc) else None
 
 
 class WithRest(View):
-    """Answers completed by the process beside the physics."""
+    """Answers completed by what stands beside the physics."""
 
-    def __init__(self, inner: Method, rest: Rest | Beside) -> None:
+    def __init__(self, inner: Method, rest: Companion) -> None:
         super().__init__(inner)
         self.rest = rest
 
