@@ -79,7 +79,7 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
     model = OmegaConf.to_container(compose().model, resolve=False)
     assert set(still_open(model)) == {
         "warm_start", "field.init", "emission.encoding.kind", "emission.activation", "emission.init_bias",
-        "effects.phase", "effects.array", "effects.hybrid",
+        "effects.phase", "effects.array", "effects.directions", "effects.hybrid",
     }  # fmt: skip
 
 
