@@ -3,53 +3,54 @@
 from __future__ import annotations
 
 import datetime
+import importlib.util
 import json
 import logging
 import os
 import subprocess
 import sys
 import time
-import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import measure
-import torch
-
-LOG = logging.getLogger("gpu")
-
-
-def update(file: Path, **sections: Any) -> None:
-    """Merge sections into the JSON file."""
-    known = json.loads(file.read_text()) if file.exists() else {}
-    file.write_text(json.dumps(known | sections, indent=1))
-    LOG.info("%s", json.dumps(sections))
-
-
-def guarded(section: Callable[[], Any]) -> Any:
-    """What a section measured, or its error: one failure must not cost the others."""
-    try:
-        return section()
-    except Exception as error:
-        LOG.error("%s", traceback.format_exc())
-        return {"error": f"{type(error).__name__}: {error}"}
+from record import LOG, guarded, told, update
 
 
 def machine() -> dict[str, Any]:
     """GPU, driver, versions, commit, date."""
-    asked = "--query-gpu=name,driver_version,clocks.sm,clocks.mem"
-    told = subprocess.run(["nvidia-smi", asked, "--format=csv,noheader"], capture_output=True, text=True)
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
+    import torch
+
+    asked = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
     return {
         "gpu": torch.cuda.get_device_name(),
-        "driver": told.stdout.strip(),
+        "driver": told("nvidia-smi", asked, "--format=csv,noheader"),
         "capability": ".".join(map(str, torch.cuda.get_device_capability())),
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
-        "commit": commit.stdout.strip() or os.environ.get("GSPARC_COMMIT", "unknown"),
+        "commit": told("git", "describe", "--always", "--dirty")
+        or os.environ.get("GSPARC_COMMIT", "unknown"),
         "date": datetime.date.today().isoformat(),
     }
+
+
+NEEDED = {
+    "build": ("torch", "numpy", "nanobind"),
+    "tests": ("pytest", "scipy"),
+    "hard": ("hypothesis", "lightning", "hydra", "h5py", "skimage"),
+    "train": (
+        *("lightning", "hydra", "omegaconf", "torchmetrics", "skimage", "matplotlib", "yaml", "rich"),
+        *("h5py", "PIL", "sklearn", "jinja2"),
+    ),
+}
+
+
+def needs(file: Path) -> None:
+    """Which modules are missing for which stage, before any of them fails for it."""
+    missing = {
+        stage: [name for name in names if importlib.util.find_spec(name) is None]
+        for stage, names in NEEDED.items()
+    }
+    update(file, missing={stage: names for stage, names in missing.items() if names})
 
 
 def build(file: Path) -> None:
@@ -65,31 +66,44 @@ def build(file: Path) -> None:
 
 def bench(file: Path) -> None:
     """Ceilings, kernels, end-to-end queries, frozen batches."""
+    import measure
+
     update(file, machine=guarded(machine))
     ceilings = measure.ceilings()
     update(file, ceilings=ceilings)
     for count in (1_000, 10_000, 62_000):
         update(file, **{f"n{count}": guarded(lambda count=count: measure.pipeline(count, ceilings))})
     update(file, batch=guarded(lambda: measure.many_poses(10_000, 16, ceilings)))
-    update(file, frozen=guarded(lambda: measure.frozen(2_000, 4_096, ceilings)))
+    update(file, frozen=guarded(lambda: measure.frozen(2_000, ceilings)))
     update(file, emission=guarded(lambda: measure.emission(62_000, 16, ceilings)))
 
 
 def short() -> None:
     """Each kernel once on a small scene: what compute-sanitizer watches."""
+    import measure
+
     measure.touch_everything()
     LOG.info("every kernel ran")
 
 
+def of_what() -> list[str]:
+    """The folder RFID of the real release where that is set, else a simulated site."""
+    if os.environ.get("RFID"):
+        return ["dataset=rfid", f"dataset.root={os.environ['RFID']}"]
+    return ["experiment=demo", "dataset.root=build/stand-ins", "dataset.count=160"]
+
+
 def train(file: Path) -> None:
     """The same short training on the CPU and on the GPU, through train.py."""
+    import measure
+
     update(file, learning=guarded(lambda: measure.learning(200)))
-    results: dict[str, Any] = {}
+    results: dict[str, Any] = {"of": of_what()[0]}
     for accelerator in ("gpu", "cpu"):
         folder = Path("build") / f"train-{accelerator}"
-        command = [sys.executable, "-P", "train.py", "experiment=demo"]
+        command = [sys.executable, "-P", "train.py", *of_what()]
         command += [f"trainer.accelerator={accelerator}", f"hydra.run.dir={folder}"]
-        command += ["baselines=[zero,mean,nearest]", "dataset.root=build/stand-ins", "dataset.count=160"]
+        command += ["baselines=[zero,mean,nearest]"]
         command += ["model.effects.array=false", "model.effects.phase=false"]  # the splatted field
         started = time.perf_counter()
         try:
@@ -105,7 +119,11 @@ def train(file: Path) -> None:
         else:
             results[accelerator]["error"] = (done.stderr or done.stdout)[-1500:]
         update(file, train=results)
-    if any(result["exit"] for result in results.values()):
+    key = "test/ssim_median"
+    both = [results[accelerator] for accelerator in ("gpu", "cpu")]
+    if all(key in result for result in both):
+        update(file, train=results | {"gpu_to_cpu_ssim": both[0][key] / both[1][key]})
+    if any(result["exit"] for result in both):
         raise SystemExit(1)
 
 
@@ -145,14 +163,14 @@ def note(file: Path, name: str, status: str, seconds: str) -> None:
     known = json.loads(file.read_text()) if file.exists() else {}
     stages = known.get("stages", {}) | {name: {"exit": int(status), "seconds": int(seconds)}}
     log = file.parent / f"{name}.log"
-    if log.exists() and name in ("tests", "sanitize"):
+    if log.exists() and name in ("tests", "hard", "sanitize"):
         lines = log.read_text(errors="replace").splitlines()
         kept = [line for line in lines if "passed" in line or "failed" in line or "SUMMARY" in line]
         stages[name]["said"] = kept[-6:]
     file.write_text(json.dumps(known | {"stages": stages}, indent=1))
 
 
-STAGES = {"build": build, "bench": bench, "short": short, "train": train, "table": table, "note": note}
+STAGES = {stage.__name__: stage for stage in (needs, build, bench, short, train, table, note)}
 
 if __name__ == "__main__":
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -1,4 +1,9 @@
-"""What the stages of gpu.py measure: synchronised events, warm, medians; ratios to what the device can do."""
+"""What the stages of gpu.py measure: medians and 95th percentiles, as ratios to what the device can do.
+
+Kernels are timed as replays of captured graphs between events, queued behind a wait so that the host is not
+timed; `cold` ones find nothing of their own in the second-level cache. End to end is from a call to its
+finished result.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import torch
+from record import guarded, told
 from torch import Tensor
 
 from gsparc.ops import (
@@ -29,6 +35,8 @@ Model = tuple[Tensor, Tensor, Tensor, Tensor]
 # Floating-point operations of one pixel inside one footprint, read off csrc/pixels.h and csrc/layer.h.
 FORWARD_FLOPS, PER_CHANNEL = 42, 2
 BACKWARD_FLOPS = 120
+
+AHEAD = 400_000  # cycles that the device waits while the host queues what is timed: about 0.2 ms
 
 
 def scene(count: int, seed: int = 0) -> Model:
@@ -52,16 +60,23 @@ def origin(count: int = 0) -> Pose:
     return Pose.identity(0.3 * torch.randn(count, 3, generator=torch.Generator().manual_seed(1))).to("cuda")
 
 
-def event_ms(function: Callable[[], Any], rounds: int = 30, inner: int = 1) -> dict[str, float]:
-    """Milliseconds of `function` between device events, over rounds of `inner` calls."""
+def event_ms(
+    function: Callable[[], Any], rounds: int = 30, *, inner: int = 1, forget: Tensor | None = None
+) -> dict[str, float]:
+    """Milliseconds of `function`, which is `inner` calls, between device events.
+
+    `forget` is a buffer larger than the second-level cache, written before each round.
+    """
     for _ in range(3):
         function()
     times = []
     for _ in range(rounds):
         first, last = torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)
+        if forget is not None:
+            forget.zero_()
+        torch.cuda._sleep(AHEAD)
         first.record()
-        for _ in range(inner):
-            function()
+        function()
         last.record()
         last.synchronize()
         times.append(first.elapsed_time(last) / inner)
@@ -103,14 +118,26 @@ def graph_of(function: Callable[[], Any], inner: int = 1) -> torch.cuda.CUDAGrap
     return graph
 
 
-def kernel_ms(function: Callable[[], Any], inner: int = 10) -> dict[str, float]:
+def kernel_ms(function: Callable[[], Any], inner: int = 10, rounds: int = 100) -> dict[str, float]:
     """Milliseconds of the kernels alone: replays of a graph that holds several calls."""
-    graph = graph_of(function, inner)
-    times = event_ms(graph.replay)
-    return {key: value / inner for key, value in times.items()}
+    return event_ms(graph_of(function, inner).replay, rounds, inner=inner)
 
 
-def ceilings() -> dict[str, float]:
+def cold_ms(function: Callable[[], Any], rounds: int = 100) -> dict[str, float]:
+    """The same of one call that finds nothing of its own in the second-level cache."""
+    size = 4 * torch.cuda.get_device_properties().L2_cache_size
+    return event_ms(
+        graph_of(function).replay, rounds, forget=torch.empty(size, dtype=torch.uint8, device="cuda")
+    )
+
+
+def clocks() -> str:
+    """SM and memory clocks now and at most, power and temperature, as the driver says."""
+    asked = "--query-gpu=clocks.sm,clocks.max.sm,clocks.mem,clocks.max.mem,power.draw,temperature.gpu"
+    return told("nvidia-smi", asked, "--format=csv,noheader")
+
+
+def ceilings() -> dict[str, Any]:
     """What this device does at best: copy bandwidth, float32 arithmetic, and a launch that does nothing."""
     big = torch.randn(512 * 2**20, device="cuda")
     other = torch.empty_like(big)
@@ -119,25 +146,30 @@ def ceilings() -> dict[str, float]:
     torch.backends.cuda.matmul.allow_tf32 = False
     a, b = (torch.randn(8192, 8192, device="cuda") for _ in range(2))
     product = event_ms(lambda: a @ b, rounds=8)["p50"]
+    for _ in range(40):
+        a @ b
+    busy = clocks()  # while those run
+    torch.cuda.synchronize()
     one = torch.zeros(1, device="cuda")
     return {
         "copy_tb_s": 2 * 4 * 512 * 2**20 / copy / 1e9,
         "float32_tflop_s": 2 * 8192**3 / product / 1e9,
         "empty_launch_ms": kernel_ms(lambda: one.add_(1), inner=20)["p50"],
+        "empty_graph_ms": kernel_ms(lambda: one.add_(1), inner=1)["p50"],
+        "clocks_under_load": busy,
     }
 
 
-def compared(
-    times: dict[str, float], bytes_: float, flops: float, limits: dict[str, float]
-) -> dict[str, float]:
+def compared(times: dict[str, float], bytes_: float, flops: float, limits: dict[str, Any]) -> dict[str, Any]:
     """Times beside the least the device needs for so many bytes and operations."""
-    floor = max(bytes_ / limits["copy_tb_s"], flops / limits["float32_tflop_s"]) / 1e9
-    launch = limits["empty_launch_ms"]
-    ratio = times["p50"] / floor
+    by_bytes, by_flops = bytes_ / limits["copy_tb_s"] / 1e9, flops / limits["float32_tflop_s"] / 1e9
+    floor = max(by_bytes, by_flops)
     return times | {
         "floor_ms": floor,
-        "ratio": ratio,
-        "ratio_with_one_launch": times["p50"] / (floor + launch),
+        "bound_by": "bytes" if by_bytes > by_flops else "arithmetic",
+        "ratio": times["p50"] / floor,
+        "ratio_p95": times["p95"] / floor,
+        "ratio_with_one_launch": times["p50"] / (floor + limits["empty_launch_ms"]),
     }
 
 
@@ -147,29 +179,34 @@ def counted_pairs(model: Model, pose: Pose) -> tuple[int, int]:
     return int((view.buffers[3] > 0).sum()), len(view.buffers[2])
 
 
-def pipeline(count: int, limits: dict[str, float]) -> dict[str, Any]:
-    """One static receiver, one real channel: kernels alone and from call to result."""
+def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
+    """One static receiver, one real channel: kernels alone, and end to end from call to result."""
     model, pose, features = scene(count), origin(), torch.rand(count, 1, device="cuda")
     pairs, entries = counted_pairs(model, pose)
     plan = make_plan(*model, pose, GRID)
     pixels = GRID.height * GRID.width
-    image_bytes, model_bytes = 8 * pixels, 4 * count * 12
     found: dict[str, Any] = {"pairs": pairs, "entries": entries, "pairs_per_pixel": pairs / pixels}
 
-    forward = lambda: composite(plan, *model, features)  # noqa: E731
-    flops = pairs * (FORWARD_FLOPS + PER_CHANNEL)
-    found["plan"] = compared(
-        kernel_ms(lambda: make_plan(*model, pose, GRID)), 4 * count * (11 + 21), 0, limits
-    )
-    found["forward"] = compared(kernel_ms(forward), model_bytes + image_bytes, flops, limits)
-    found["plan_and_forward"] = kernel_ms(lambda: rasterize(*model, features, pose, GRID))
-    backward = backward_of(plan, model, features[None])
-    moved = 2 * model_bytes + 3 * image_bytes
-    found["backward"] = compared(kernel_ms(backward), moved, pairs * BACKWARD_FLOPS, limits)
+    # Bytes and operations that nobody can avoid: the model once, the plan's records once, images once.
+    image, gaussians, records = 8 * pixels, 4 * count * 12, 4 * count * 21
+    planning = (gaussians + records, 0)
+    forward = (gaussians + image, pairs * (FORWARD_FLOPS + PER_CHANNEL))
+    whole = (gaussians + image, forward[1])
+    backward = (2 * gaussians + 3 * image, pairs * BACKWARD_FLOPS)
+    step_cost = (3 * gaussians + 4 * image, forward[1] + backward[1])
+    thawing = (4 * pairs, 2 * pairs)
+
     view = freeze(plan, *model, version=0)
-    found["frozen_query"] = compared(
-        kernel_ms(lambda: view.render(features, 0)), 4 * pairs, 2 * pairs, limits
-    )
+    calls: dict[str, tuple[Callable[[], Any], tuple[int, int]]] = {
+        "plan": (lambda: make_plan(*model, pose, GRID), planning),
+        "forward": (lambda: composite(plan, *model, features), forward),
+        "plan_and_forward": (lambda: rasterize(*model, features, pose, GRID), whole),
+        "backward": (backward_of(plan, model, features[None]), backward),
+        "frozen_query": (lambda: view.render(features, 0), thawing),
+    }
+    for name, (call, cost) in calls.items():
+        found[name] = guarded(lambda call=call, cost=cost: compared(kernel_ms(call), *cost, limits))
+        found[f"{name}_cold"] = guarded(lambda call=call, cost=cost: compared(cold_ms(call), *cost, limits))
 
     leaves = [tensor.clone().requires_grad_() for tensor in (*model, features)]
     upstream = torch.randn(1, 1, GRID.height, GRID.width, device="cuda")
@@ -178,12 +215,16 @@ def pipeline(count: int, limits: dict[str, float]) -> dict[str, Any]:
         rasterize(*leaves, pose, GRID).image.backward(upstream)
 
     with torch.no_grad():
-        found["end_to_end_forward"] = wall_ms(lambda: rasterize(*model, features, pose, GRID))
-        found["end_to_end_frozen"] = wall_ms(lambda: view.render(features, 0))
-        replay = graph_of(lambda: rasterize(*model, features, pose, GRID))
-        found["end_to_end_graph"] = wall_ms(replay.replay)
-    found["end_to_end_forward_backward"] = wall_ms(step)
-    found["kernels_us"] = by_kernel(step)
+        query = lambda: rasterize(*model, features, pose, GRID)  # noqa: E731
+        ends = {
+            "forward": (query, whole),
+            "frozen": (lambda: view.render(features, 0), thawing),
+            "graph": (graph_of(query).replay, whole),
+        }
+        for name, (call, cost) in ends.items():
+            found[f"end_to_end_{name}"] = compared(wall_ms(call), *cost, limits)
+    found["end_to_end_forward_backward"] = compared(wall_ms(step), *step_cost, limits)
+    found["kernels_us"] = guarded(lambda: by_kernel(step))
     return found
 
 
@@ -210,7 +251,7 @@ def by_kernel(function: Callable[[], Any]) -> dict[str, float]:
     return {name: round(us, 1) for name, us in sorted(rows, key=lambda row: -row[1])[:14] if us > 0}
 
 
-def many_poses(count: int, poses: int, limits: dict[str, float]) -> dict[str, Any]:
+def many_poses(count: int, poses: int, limits: dict[str, Any]) -> dict[str, Any]:
     """A training batch of a moving receiver, and of a static one with as many samples."""
     model, several = scene(count), origin(poses)
     features = torch.rand(poses, count, 1, device="cuda")
@@ -234,37 +275,57 @@ def many_poses(count: int, poses: int, limits: dict[str, float]) -> dict[str, An
     }
 
 
-def frozen(count: int, batch: int, limits: dict[str, float]) -> dict[str, Any]:
-    """Spectra per second of a static receiver, our kernel beside the vendor's products."""
+BATCHES = (1, 16, 64, 256, 1024, 4096)
+
+
+def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
+    """Spectra per second of a static receiver by the size of the batch, beside the vendor's products."""
     model, pose = scene(count), origin()
     view = freeze(make_plan(*model, pose, GRID), *model, version=0)
-    features = torch.rand(batch, count, 1, device="cuda")
+    weights = int((view.buffers[3] > 0).sum())
     with torch.no_grad():
-        ours = event_ms(lambda: view.render(features, 0), rounds=15)["p50"]
         dense = view.render(torch.eye(count, device="cuda").unsqueeze(-1), 0).flatten(1)
-        flat = features.squeeze(-1)
-        want, got = flat @ dense, view.render(features, 0).flatten(1)
-        vendor = event_ms(lambda: flat @ dense, rounds=10)["p50"]
-        torch.backends.cuda.matmul.allow_tf32 = True
-        vendor_tf32 = event_ms(lambda: flat @ dense, rounds=10)["p50"]
-        torch.backends.cuda.matmul.allow_tf32 = False
         sparse = dense.mT.contiguous().to_sparse_csr()
-        columns = flat.mT.contiguous()
-        vendor_sparse = event_ms(lambda: sparse @ columns, rounds=5)["p50"]
-        del want
-        found = {
+        found: dict[str, Any] = {
             "gaussians": count,
-            "batch": batch,
-            "share_of_weights_not_zero": float((dense != 0).float().mean()),
-            "spectra_per_s": 1e3 * batch / ours,
-            "spectra_per_s_dense_float32": 1e3 * batch / vendor,
-            "spectra_per_s_dense_tf32": 1e3 * batch / vendor_tf32,
-            "spectra_per_s_sparse_csr": 1e3 * batch / vendor_sparse,
-            "error_to_dense": float((got - flat @ dense).abs().max()),
-            "bytes_written_floor_ms": 4 * batch * GRID.height * GRID.width / limits["copy_tb_s"] / 1e9,
+            "share_of_weights_not_zero": weights / dense.numel(),
+            "weights_not_zero": weights,
         }
-        found |= with_networks(view, model, batch)
+        for batch in BATCHES:
+            found[f"batch{batch}"] = guarded(
+                lambda batch=batch: frozen_batch(view, dense, sparse, batch, weights, limits)
+            )
+        found |= guarded(lambda: with_networks(view, model, BATCHES[-1]))
     return found
+
+
+def frozen_batch(
+    view: Any, dense: Tensor, sparse: Tensor, batch: int, weights: int, limits: dict[str, Any]
+) -> dict[str, Any]:
+    """One size of batch: calls as a user makes them, captured ones, and the vendor's three ways."""
+    features = torch.rand(batch, len(dense), 1, device="cuda")
+    flat = features.squeeze(-1)
+    columns = flat.mT.contiguous()
+    query = lambda: view.render(features, 0)  # noqa: E731
+    wall = wall_ms(query, rounds=30)
+    cost = (
+        4 * batch * dense.shape[1],
+        2 * batch * weights,
+    )  # images written, products of weights that are not zero
+    kernels = compared(kernel_ms(query, inner=2, rounds=30), *cost, limits)
+    rates = {"": wall["p50"], "_captured": kernels["p50"]}
+    for tf32, name in ((False, "_dense_float32"), (True, "_dense_tf32")):
+        torch.backends.cuda.matmul.allow_tf32 = tf32
+        rates[name] = kernel_ms(lambda: flat @ dense, inner=2, rounds=10)["p50"]
+    torch.backends.cuda.matmul.allow_tf32 = False
+    error = float((query().flatten(1) - flat @ dense).abs().max())
+    found = {"end_to_end": wall, "kernels": kernels, "error_to_dense": error}
+    csr = guarded(lambda: event_ms(lambda: sparse @ columns, rounds=5))
+    if "p50" in csr:
+        rates["_sparse_csr"] = csr["p50"]
+    else:
+        found["sparse_csr"] = csr
+    return found | {f"spectra_per_s{name}": 1e3 * batch / ms for name, ms in rates.items()}
 
 
 def with_networks(view: Any, model: Model, batch: int) -> dict[str, float]:
@@ -282,11 +343,10 @@ def with_networks(view: Any, model: Model, batch: int) -> dict[str, float]:
         distance = torch.cdist(places, model[0]).unsqueeze(-1)
         return view.render(torch.sigmoid(networks.networks(encoded, *weights) - distance.log()) / distance, 0)
 
-    whole = event_ms(answer, rounds=10)["p50"]
-    return {"spectra_per_s_with_networks": 1e3 * batch / whole}
+    return {"spectra_per_s_with_networks": 1e3 * batch / wall_ms(answer, rounds=10)["p50"]}
 
 
-def emission(count: int, batch: int, limits: dict[str, float]) -> dict[str, Any]:
+def emission(count: int, batch: int, limits: dict[str, Any]) -> dict[str, Any]:
     """The emission networks alone (33-32-2), ours beside matrix products."""
     weights = [
         torch.randn(shape, device="cuda")

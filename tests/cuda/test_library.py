@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
 import subprocess
 import sys
@@ -151,14 +152,56 @@ def test_the_shim_reports_barriers_that_not_all_threads_meet_and_grids_that_no_g
     assert loaded.gsparc_rows(65535) == 0 and loaded.gsparc_rows(65536) == 2 == loaded.gsparc_blocks(2**31)
 
 
+def resources(told: str) -> dict[str, dict[str, int]]:
+    """What ptxas -v says of each kernel of ours: bytes on the stack and spilled, registers, shared memory."""
+    found, name = {}, ""
+    for line in told.splitlines():
+        if match := re.search(r"Compiling entry function '(\w+)'", line):
+            name = match[1]
+        numbers = found.setdefault(name, {})
+        for what in ("stack frame", "spill stores", "registers", "smem"):
+            if match := re.search(rf"(\d+) (?:bytes )?{what}", line):
+                numbers[what] = int(match[1])
+    return {name: numbers for name, numbers in found.items() if name.startswith("_ZN6gsparc")}
+
+
+def test_resources_are_read_as_ptxas_says_them():
+    told = """ptxas info    : Compiling entry function '_ZN6gsparc4thawEv' for 'sm_90'
+    8 bytes stack frame, 4 bytes spill stores, 4 bytes spill loads
+ptxas info    : Used 56 registers, used 1 barriers, 8 bytes cumulative stack size, 6144 bytes smem
+ptxas info    : Compiling entry function '_ZN3cub4sortEv' for 'sm_90'
+ptxas info    : Used 99 registers"""
+    numbers = {"stack frame": 8, "spill stores": 4, "registers": 56, "smem": 6144}
+    assert resources(told) == {"_ZN6gsparc4thawEv": numbers}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", ["75", "90"])
-def test_compiles(arch, tmp_path):
-    """The whole library for an old and a new GPU, without one."""
+def test_compiles(arch, tmp_path, monkeypatch):
+    """The whole library for an old and a new GPU, without one; every kernel fits there as it was meant to."""
     if cuda_library.compiler() is None:
         pytest.skip("there is no nvcc here, so the CUDA sources were only compiled for the host shim")
-    path = tmp_path / "kernels.so"
+    path, run, told = tmp_path / "kernels.so", subprocess.run, []
+
+    def kept(command, **options):
+        done = run(command, **options)
+        told.append((done.stdout or "") + (done.stderr or ""))
+        return done
+
+    monkeypatch.setattr(cuda_library, "FLAGS", (*cuda_library.FLAGS, "-Xptxas=-v"))
+    monkeypatch.setattr(subprocess, "run", kept)
     cuda_library.build(path, arch)
+    monkeypatch.undo()
+    kernels = resources("\n".join(told))
+    assert len(kernels) > 30
+    for name, numbers in kernels.items():
+        assert numbers["stack frame"] == numbers["spill stores"] == 0, f"{name} spills: {numbers}"
+        assert numbers.get("smem", 0) <= 48 * 1024, f"{name}: no more is there without asking: {numbers}"
+        assert numbers["registers"] * 128 <= 65536 // 2, f"two blocks of 128 do not fit: {name} {numbers}"
+        if (
+            "If" in name and "composite_kernel" in name
+        ):  # float32: seven of eight blocks that shared memory allows
+            assert numbers["registers"] <= 96, f"{name}: {numbers}"
     listed = subprocess.run(["nm", "-D", str(path)], capture_output=True, text=True, check=True).stdout
     functions = [
         f"gsparc_{name}" for name in ("plan", "bin", "composite_backward", "weights", "thaw", "networks")
