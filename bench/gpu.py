@@ -36,10 +36,10 @@ def machine() -> dict[str, Any]:
 NEEDED = {
     "build": ("torch", "numpy", "nanobind"),
     "tests": ("pytest", "scipy"),
-    "hard": ("hypothesis", "lightning", "hydra", "h5py", "skimage"),
+    "hard": ("hypothesis", "lightning", "hydra", "h5py", "skimage", "cloudpickle"),
     "train": (
         *("lightning", "hydra", "omegaconf", "torchmetrics", "skimage", "matplotlib", "yaml", "rich"),
-        *("h5py", "PIL", "sklearn", "jinja2"),
+        *("h5py", "PIL", "sklearn", "cloudpickle", "jinja2"),
     ),
 }
 
@@ -107,7 +107,8 @@ def train(file: Path) -> None:
         command += ["model.effects.array=false", "model.effects.phase=false"]  # the splatted field
         started = time.perf_counter()
         try:
-            done = subprocess.run(command, capture_output=True, text=True, timeout=130)
+            told_whole = {**os.environ, "HYDRA_FULL_ERROR": "1"}
+            done = subprocess.run(command, capture_output=True, text=True, timeout=130, env=told_whole)
         except subprocess.TimeoutExpired as late:
             done = subprocess.CompletedProcess(command, 124, "", str(late))
         results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": done.returncode}
@@ -158,6 +159,9 @@ def flat(section: dict[str, Any], before: str = "") -> list[tuple[str, Any]]:
     return rows
 
 
+TELLING = ("passed", "failed", "skipped", "SUMMARY", " error")
+
+
 def note(file: Path, name: str, status: str, seconds: str) -> None:
     """How a stage ended."""
     known = json.loads(file.read_text()) if file.exists() else {}
@@ -165,7 +169,7 @@ def note(file: Path, name: str, status: str, seconds: str) -> None:
     log = file.parent / f"{name}.log"
     if log.exists() and name in ("tests", "hard", "sanitize"):
         lines = log.read_text(errors="replace").splitlines()
-        kept = [line for line in lines if "passed" in line or "failed" in line or "SUMMARY" in line]
+        kept = [line for line in lines if any(word in line for word in TELLING)]
         stages[name]["said"] = kept[-6:]
     file.write_text(json.dumps(known | {"stages": stages}, indent=1))
 

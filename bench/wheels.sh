@@ -10,8 +10,8 @@ for glibc in 2_28 2_27 2_26 2_24 2_17; do TARGET+=(--platform "manylinux_${glibc
 TARGET+=(--platform manylinux2014_x86_64)
 "$PYTHON" -m pip download --quiet --no-deps --dest "$1" -c constraints.txt "${TARGET[@]}" \
   nanobind pytest pluggy iniconfig pygments packaging pytest-timeout hypothesis sortedcontainers \
-  lightning lightning-utilities torchmetrics hydra-core omegaconf PyYAML rich markdown-it-py mdurl jinja2 MarkupSafe \
-  scikit-learn joblib narwhals threadpoolctl scikit-image imageio lazy-loader tifffile networkx pillow h5py tqdm fsspec \
+  lightning lightning-utilities torchmetrics hydra-core omegaconf PyYAML rich markdown-it-py mdurl \
+  scikit-learn joblib cloudpickle narwhals threadpoolctl scikit-image imageio lazy-loader tifffile pillow h5py tqdm \
   matplotlib contourpy cycler fonttools kiwisolver pyparsing python-dateutil six
 "$PYTHON" -m pip wheel --quiet --no-deps --wheel-dir "$1" -c constraints.txt antlr4-python3-runtime # hydra's; a source alone
 du -sh "$1"
