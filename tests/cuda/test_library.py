@@ -21,6 +21,11 @@ void kernel(int) { if (threadIdx.x != 7) warp_sync(); }
 extern "C" int64_t gsparc_unmet() { return launch(kernel, 1, 1, 32, nullptr, 0); }
 void idle(int) {}
 extern "C" int64_t gsparc_rows(int64_t rows) { return launch(idle, 1, rows, 32, nullptr, 0); }
+extern "C" int64_t gsparc_steps() {
+    int64_t ran = 0;
+    auto step = [&](int64_t error) { return [&ran, error] { return ++ran, error; }; };
+    return Steps().then(step(0)).then(step(7)).then(step(9)).result() == -7 ? ran : -1;
+}
 extern "C" int64_t gsparc_blocks(int64_t blocks) { return launch(idle, blocks, 1, 32, nullptr, 0); }
 """
 
@@ -146,7 +151,8 @@ def test_the_shim_reports_barriers_that_not_all_threads_meet_and_grids_that_no_g
     code = f"import ctypes; print(ctypes.CDLL({str(library)!r}).gsparc_unmet())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1"
-    loaded = ctypes.CDLL(str(library))  # grids that no GPU takes
+    loaded = ctypes.CDLL(str(library))
+    assert loaded.gsparc_steps() == 2  # a launch after one that failed would work on what is not there
     for function in (loaded.gsparc_rows, loaded.gsparc_blocks):
         function.argtypes, function.restype = [ctypes.c_int64], ctypes.c_int64
     assert loaded.gsparc_rows(65535) == 0 and loaded.gsparc_rows(65536) == 2 == loaded.gsparc_blocks(2**31)

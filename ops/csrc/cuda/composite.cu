@@ -291,11 +291,11 @@ template <class S> int64_t backward(const Call& call, bool weights) {
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     Steps steps;
-    if (weights) steps.then(blend(v, model, forward, stream));
+    if (weights) steps.then([&] { return blend(v, model, forward, stream); });
     const auto kernel = v.lens.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
-    steps.then(launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up));
-    steps.then(add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : call.channels));
-    steps.then(launch(chain_kernel<S>, blocks_for(v.count), 1, kThreads, stream, v, model, sums, chunks, out));
+    steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up); });
+    steps.then([&] { return add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : call.channels); });
+    steps.then([&] { return launch(chain_kernel<S>, blocks_for(v.count), 1, kThreads, stream, v, model, sums, chunks, out); });
     return steps.result();
 }
 
@@ -313,9 +313,9 @@ template <class S> int64_t weigh(const Call& call) {
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     Steps steps;
     const auto kernel = v.lens.tangent ? weigh_kernel<S, true> : weigh_kernel<S, false>;
-    steps.then(launch(kernel, int64_t(v.poses) * v.tiles, 1, kBlock, stream, v, model, out));
+    steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, 1, kBlock, stream, v, model, out); });
     if (sums)
-        steps.then(add<S>(v, 1, stream, out.rows, 2, 2, sums, nullptr, 0));
+        steps.then([&] { return add<S>(v, 1, stream, out.rows, 2, 2, sums, nullptr, 0); });
     return steps.result();
 }
 

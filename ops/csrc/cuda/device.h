@@ -75,11 +75,11 @@ int64_t launch(void (*kernel)(P...), int64_t blocks, int64_t rows, int threads, 
 
 #endif
 
-// Runs the steps of a call one after the other until one fails.
+// Runs the steps of a call one after the other until one fails: what follows would work on what is not there.
 class Steps {
   public:
-    Steps& then(int64_t error) {
-        if (first_ == 0) first_ = error;
+    template <class F> Steps& then(F step) {
+        if (first_ == 0) first_ = step();
         return *this;
     }
     int64_t result() const { return -first_; }  // 0, or minus the first error

@@ -198,28 +198,28 @@ template <class S> int64_t plan(const Call& call) {
     int64_t *counts = arena.take<int64_t>(all), *sums = arena.take<int64_t>(all);
     size_t sort_bytes = 0, sum_bytes = 0;
     Steps steps;
-    steps.then(sort_pairs<uint64_t>(nullptr, sort_bytes, out.keys, keys, out.values, v.order, sorted_at_once, bits, nullptr));
-    steps.then(running_sums(nullptr, sum_bytes, counts, sums, all, nullptr));
+    steps.then([&] { return sort_pairs<uint64_t>(nullptr, sort_bytes, out.keys, keys, out.values, v.order, sorted_at_once, bits, nullptr); });
+    steps.then([&] { return running_sums(nullptr, sum_bytes, counts, sums, all, nullptr); });
     size_t bytes = sort_bytes > sum_bytes ? sort_bytes : sum_bytes;
     char* temp = arena.take<char>(bytes);
     if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
-    steps.then(clear(out.wrong, 0xff, 2 * sizeof *out.wrong, stream));  // sound, and sorted
-    steps.then(launch(project_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, out));
+    steps.then([&] { return clear(out.wrong, 0xff, 2 * sizeof *out.wrong, stream); });  // sound, and sorted
+    steps.then([&] { return launch(project_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, out); });
     for (int pose = 0; pose < sorts; ++pose) {
         const int64_t at = pose * sorted_at_once;
-        steps.then(sort_pairs<uint64_t>(temp, sort_bytes, out.keys + at, keys + at, out.values + at, v.order + at, sorted_at_once, bits, stream));
+        steps.then([&] { return sort_pairs<uint64_t>(temp, sort_bytes, out.keys + at, keys + at, out.values + at, v.order + at, sorted_at_once, bits, stream); });
     }
     if (ids) {
-        steps.then(launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, sorted));
-        steps.then(launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, sorted, v.poses, v.count));
+        steps.then([&] { return launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, sorted); });
+        steps.then([&] { return launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, sorted, v.poses, v.count); });
     }
     const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
-    steps.then(launch(list, blocks_for(all * kWarp), 1, kThreads, stream, v, keys, counts, nullptr, nullptr));
-    steps.then(running_sums(temp, sum_bytes, counts, sums, all, stream));
-    steps.then(launch(write_slots<S>, blocks_for(all + v.poses), 1, kThreads, stream, sums, keys, out.wrong, v.poses, v.count, v.slots, v.shown,
-                      v.total, verdict));
+    steps.then([&] { return launch(list, blocks_for(all * kWarp), 1, kThreads, stream, v, keys, counts, nullptr, nullptr); });
+    steps.then([&] { return running_sums(temp, sum_bytes, counts, sums, all, stream); });
+    steps.then([&] { return launch(write_slots<S>, blocks_for(all + v.poses), 1, kThreads, stream, sums, keys, out.wrong, v.poses, v.count, v.slots, v.shown,
+                      v.total, verdict); });
     return steps.result();
 }
 
@@ -233,17 +233,17 @@ template <class S> int64_t bin(const Call& call) {
     int32_t *numbers = arena.take<int32_t>(capacity), *slots = arena.take<int32_t>(capacity), *gaussians = arena.take<int32_t>(capacity);
     size_t bytes = 0;
     Steps steps;
-    steps.then(sort_pairs<uint32_t>(nullptr, bytes, keys, sorted_keys, numbers, slots, capacity, bits, nullptr));
+    steps.then([&] { return sort_pairs<uint32_t>(nullptr, bytes, keys, sorted_keys, numbers, slots, capacity, bits, nullptr); });
     char* temp = arena.take<char>(bytes);
     if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
-    steps.then(launch(number_slots, blocks_for(capacity), 1, kThreads, stream, numbers, keys, v.total, v.capacity, tiles));
-    steps.then(launch(list, blocks_for(int64_t(v.poses) * v.count * kWarp), 1, kThreads, stream, v, nullptr, nullptr, keys, gaussians));
-    if (capacity > 0) steps.then(sort_pairs<uint32_t>(temp, bytes, keys, sorted_keys, numbers, slots, capacity, bits, stream));
-    steps.then(launch(write_entries, blocks_for(capacity + 1), 1, kThreads, stream, sorted_keys, slots, gaussians, v.capacity, tiles,
-                      v.starts, v.gaussians, v.slot_of));
+    steps.then([&] { return launch(number_slots, blocks_for(capacity), 1, kThreads, stream, numbers, keys, v.total, v.capacity, tiles); });
+    steps.then([&] { return launch(list, blocks_for(int64_t(v.poses) * v.count * kWarp), 1, kThreads, stream, v, nullptr, nullptr, keys, gaussians); });
+    if (capacity > 0) steps.then([&] { return sort_pairs<uint32_t>(temp, bytes, keys, sorted_keys, numbers, slots, capacity, bits, stream); });
+    steps.then([&] { return launch(write_entries, blocks_for(capacity + 1), 1, kThreads, stream, sorted_keys, slots, gaussians, v.capacity, tiles,
+                      v.starts, v.gaussians, v.slot_of); });
     return steps.result();
 }
 
@@ -282,7 +282,10 @@ int64_t gsparc_check(gsparc::GSPARC_ISA::Call* call) {
     cudaFuncAttributes known;
     call->whole[0] = CUDART_VERSION;
     Steps steps;
-    return steps.then(cudaDriverGetVersion(call->whole + 1)).then(use_device(call->device)).then(cudaFuncGetAttributes(&known, look_for_disorder)).result();
+    steps.then([&] { return cudaDriverGetVersion(call->whole + 1); });
+    steps.then([&] { return use_device(call->device); });
+    steps.then([&] { return cudaFuncGetAttributes(&known, look_for_disorder); });
+    return steps.result();
 #else
     return call->whole[0] = call->whole[1] = 0;
 #endif
