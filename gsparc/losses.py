@@ -164,7 +164,7 @@ def _up_to_offsets(prediction: Tensor, target: Tensor, mask: Tensor | None, timi
     if timing and product.shape[1] > 1:
         period = DELAYS_PER_TONE * product.shape[1]
         best = torch.fft.ifft(product.detach(), period).abs().argmax(1, keepdim=True)
-        turn = 2 * math.pi / period * best * torch.arange(product.shape[1])
+        turn = 2 * math.pi / period * best * torch.arange(product.shape[1], device=product.device)
         product = product * torch.polar(torch.ones_like(turn), turn)
     power = ((prediction.abs().square() + target.abs().square()) * known).flatten(1).sum(1)
     alike = torch.view_as_real(product.sum(1)).square().sum(1).clamp_min(1e-20).sqrt()

@@ -97,3 +97,12 @@ def test_slopes_of_the_blind_losses(snapshot):
 
     # The delay is held on its comb: its best value moves the loss in second order only.
     assert torch.autograd.gradcheck(loss, [parts])
+
+
+@pytest.mark.parametrize("snapshot", ["none", "phase", "phase_timing"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_channel_losses_stay_on_the_device_of_the_channels(snapshot, masked):
+    """Offsets of timing took their tones from the CPU; `meta` mixes with those as little as a GPU does."""
+    channels = torch.empty(3, 2, 5, dtype=torch.complex64, device="meta")
+    mask = torch.empty(3, 2, 5, dtype=torch.bool, device="meta") if masked else None
+    assert channel_loss(channels, channels, mask, snapshot).device.type == "meta"
