@@ -64,7 +64,10 @@ class ChannelResponse(nn.Module):
         if tones_hz is not None and subcarriers > 1:
             band = float(tones_hz[-1] - tones_hz[0]) * subcarriers / (subcarriers - 1)
             numbers = (tones_hz - tones_hz[0]).double() / band * subcarriers
-        self.register_buffer("numbers", numbers - numbers.mean(), persistent=False)
+        numbers = numbers - numbers.mean()
+        self.register_buffer("numbers", numbers, persistent=False)
+        self.first = float(numbers[0])  # known from the start: asking a GPU later would wait for it
+        self.even = len(numbers) < 3 or float((numbers.diff() - numbers.diff().mean()).abs().max()) < UNEVEN
         turns = lengths / LIGHT * band if band else torch.zeros_like(lengths)
         # In cells of 1 / bandwidth: a step of Adam then means the same on every band.
         self.delays = nn.Parameter(turns.float(), requires_grad=subcarriers > 1)
@@ -73,11 +76,10 @@ class ChannelResponse(nn.Module):
         """Visible gains (B, N) complex -> channels (B, A, K) complex."""
         gains = torch.view_as_real(weighted)
         delays = self.delays.double() / self.subcarriers  # in periods of the mean tone spacing
-        numbers = self.numbers
-        if len(numbers) < 3 or float((numbers.diff() - numbers.diff().mean()).abs().max()) < UNEVEN:
-            found = channels(gains, self.steering, delays, float(numbers[0]), 1.0, self.subcarriers)
+        if self.even:
+            found = channels(gains, self.steering, delays, self.first, 1.0, self.subcarriers)
             return torch.view_as_complex(found)
-        phase = -2 * math.pi * torch.outer(delays, numbers).float()
+        phase = -2 * math.pi * torch.outer(delays, self.numbers).float()
         comb = torch.polar(torch.ones_like(phase), phase)
         return torch.einsum("bn,na,nk->bak", weighted, torch.view_as_complex(self.steering), comb)
 
