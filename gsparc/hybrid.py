@@ -113,7 +113,7 @@ class Told:
     def completed(self, mean: Tensor, tx: Tensor, rx: Pose) -> Tensor:
         """What searched sources say (B, A, K), averaged with these."""
         searched = mean if self.rest is None else self.rest.completed(mean, tx, rx)
-        return (1 - self.weight) * searched + self.weight * self.sources.predict(tx, rx).mean
+        return (1 - self.weight) * searched + self.weight * self.sources.mean_at(tx, rx)
 
     def state(self) -> dict[str, Any]:
         """Everything `restore` needs."""
@@ -167,10 +167,10 @@ def weight_of(directed: DirectedSources, searched: VirtualSourceGP, optimism: fl
     """
     receivers, left = directed.left_over()
     others, beside = searched.left_over()
-    if not np.array_equal(receivers, others):
-        raise ValueError("directed and searched sources must hold the same rows: set the same rows and seed")
-    theirs, own = optimism * float(beside.abs().square().sum()), float(left.abs().square().sum())
-    common = float((left.conj() * beside).real.sum())
+    theirs, own = optimism * float(beside.abs().square().mean()), float(left.abs().square().mean())
+    # Of large data each holds other rows: their errors are then taken to have nothing in common.
+    same = np.array_equal(receivers, others)
+    common = float((left.conj() * beside).real.mean()) if same else 0.0
     return min(max((theirs - common) / max(theirs + own - 2 * common, 1e-30), 0.0), 1.0)
 
 

@@ -32,7 +32,11 @@ from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.directions import virtual_transmitters, votes
 
-LEAST_SEEN = 2  # receivers whose rays meet in a source
+LEAST_SEEN, MOST_SOURCES = (
+    2,
+    60,
+)  # receivers whose rays meet in a source; of more sources the most seen are kept
+MOST_RECEIVERS = 1000  # of more some are drawn: intersections and sightings grow faster than what they tell
 CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
 NOISES = (0.001, 0.01, 0.05)  # of the rows' power
@@ -90,14 +94,15 @@ class DirectedSources(Method):
         refuse(data.site, self.name)
         if data.directions is None:
             raise ValueError("directed: needs directions of arrival; this dataset has none")
-        known = np.concatenate([fold.train, fold.val])
+        known = _some(np.concatenate([fold.train, fold.val]), self.seed)
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
         centres, met = virtual_transmitters(places, rays)
         seen = votes(places, met, len(centres)).double().clamp_max(1)
-        often = seen.sum(0) >= LEAST_SEEN
-        if not bool(often.any()):
+        often = torch.nonzero(seen.sum(0) >= LEAST_SEEN).flatten()
+        if not len(often):
             raise ValueError("directed: the directions of arrival meet nowhere")
+        often = often[seen[:, often].sum(0).argsort(descending=True, stable=True)[:MOST_SOURCES]]
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
@@ -137,6 +142,10 @@ class DirectedSources(Method):
         self.waves = self._seen(self.rows, self.observer)
         self.factor = _factor((self.waves * self.power) @ self.waves.mH, self.rows, self.law)
 
+        # (n, K R), real and imaginary: what each row adds to each source's gain
+        pulled = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
+        self.pulled = [part.flatten(1).contiguous() for part in (pulled.real, pulled.imag)]
+
     def _seen(self, rows: Rows, observer: Tensor) -> Tensor:
         """Waves (n, K) complex64 of the sources at every row, of those that its receiver sees."""
         return steering(rows, self.sources) * self.sightings.seen[observer].float()
@@ -144,24 +153,33 @@ class DirectedSources(Method):
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the variance counts gains, noise and who is seen."""
-        site = self._fitted()
         flat, count = self._places(tx, rx)
-        tones = torch.from_numpy(tones_of(site))
         likely = self.sightings.likely(flat).float()
         correlation = self.law.correlation(flat, self.rows.position)
         away = ranges(flat, self.sources)
-        gains = likely[:, :, None] * self._gains(correlation)
-        mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(away, tones))
-        loudness = (self.frame.carrier_hz / tones).float()
-        mean = (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
         arriving = wave(away, self.frame.carrier_hz)
         variance, prior = self._variance(arriving, likely, correlation)
         variance, prior = (v.reshape(count, -1).mean(1) for v in (variance, prior))
         return Prediction(
-            mean,
+            self._sum(likely, correlation, away, count),
             confidence=(1 - variance / prior).clamp(0, 1),
             variance=variance * self.frame.scale**2,
         )
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean alone (B, A, K) complex64."""
+        flat, count = self._places(tx, rx)
+        likely = self.sightings.likely(flat).float()
+        correlation = self.law.correlation(flat, self.rows.position)
+        return self._sum(likely, correlation, ranges(flat, self.sources), count)
+
+    def _sum(self, likely: Tensor, correlation: Tensor, away: Tensor, count: int) -> Tensor:
+        """Of the waves that places (m, ...) receive, as channels of `count` receivers."""
+        tones = torch.from_numpy(tones_of(self._fitted()))
+        gains = likely[:, :, None] * self._gains(correlation)
+        mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(away, tones))
+        loudness = (self.frame.carrier_hz / tones).float()
+        return (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
         """What `predict` sums, one path a source: see `VirtualSourceGP.paths`."""
@@ -181,9 +199,8 @@ class DirectedSources(Method):
 
     def _gains(self, correlation: Tensor) -> Tensor:
         """Posterior mean gains (m, K, R) where the law's correlation with the rows is (m, n)."""
-        pulled = self.power[:, None, None] * self.waves.mH[:, :, None] * self.factor.alpha[None]  # (K, n, R)
-        real, imag = (torch.einsum("mn,knr->mkr", correlation, part) for part in (pulled.real, pulled.imag))
-        return torch.complex(real, imag)
+        real, imag = (correlation @ part for part in self.pulled)
+        return torch.complex(real, imag).unflatten(1, (len(self.sources), -1))
 
     def _variance(self, arriving: Tensor, likely: Tensor, correlation: Tensor) -> tuple[Tensor, Tensor]:
         """Expected squared error and expected power (m,) of waves (m, K) seen with these probabilities."""
@@ -243,6 +260,13 @@ class DirectedSources(Method):
         if self.site is None:
             raise ValueError("directed: not fitted yet; call fit or restore first")
         return self.site
+
+
+def _some(known: np.ndarray, seed: int) -> np.ndarray:
+    """At most `MOST_RECEIVERS` of them."""
+    if len(known) <= MOST_RECEIVERS:
+        return known
+    return np.sort(np.random.default_rng(seed).choice(known, MOST_RECEIVERS, replace=False))
 
 
 def _factor(shared: Tensor, rows: Rows, law: Law) -> Factor:
