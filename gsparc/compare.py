@@ -95,9 +95,12 @@ def _rooms(settings: Mapping[str, Any], kept: Path) -> list[Room | Remembered]:
 
 def _may_match(pattern: str, dataset: str, split: str) -> bool:
     """Whether a pattern of cells can speak of this room, so that others need not be loaded."""
-    parts = pattern.split("/")
-    named = (dataset, split)
-    return all("*" in part or fnmatchcase(name, part) for part, name in zip(parts, named, strict=False))
+    for part, name in zip(pattern.split("/"), (dataset, split), strict=False):
+        if "*" in part:  # it may stand for what follows, too
+            return fnmatchcase(name, part.partition("*")[0] + "*")
+        if not fnmatchcase(name, part):
+            return False
+    return True
 
 
 def fill_all(

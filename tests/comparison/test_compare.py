@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from campaigns import spectra
 
-from gsparc.compare import _timed
+from gsparc.compare import _may_match, _timed
 from gsparc.comparison.cells import Cell
 from gsparc.comparison.fitting import Filled, Prepared, Remembered, remember
 
@@ -94,3 +94,19 @@ def test_mistakes_are_one_line(tmp_path):
     assert done.returncode == 1 and "matches no cell" in done.stderr and "Traceback" not in done.stderr
     done = compare(tmp_path, "train=false", "only=[own/random/mean/*]")
     assert done.returncode == 1 and "no cell is filled" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("pattern", "rfid", "newrf"),
+    [
+        ("*/gp/*", True, True),  # one star stands for dataset and split: rooms were left out without a word
+        ("newrf/*", False, True),
+        ("new*/60/0", False, True),
+        ("rfid/random/gp/any/any", True, False),
+        ("*", True, True),
+        ("rfid/sparse/*", False, False),
+    ],
+)
+def test_a_star_may_stand_for_several_parts_of_a_cell(pattern, rfid, newrf):
+    assert _may_match(pattern, "rfid", "random") == rfid
+    assert _may_match(pattern, "newrf", "random") == newrf
