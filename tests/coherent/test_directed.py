@@ -125,6 +125,42 @@ def test_what_cannot_be_followed_is_refused_in_one_line(pillar, spoil, message):
         DirectedSources().fit(spoil(data), fold, Path())
 
 
+def _at_a_source(data, sources):
+    places = data.rx_position.copy()
+    places[0] = sources[0]
+    return replace(data, rx_position=places)
+
+
+def _anyhow(data, sources):
+    rays = np.random.default_rng(0).normal(size=(len(data.directions), 5, 3)).astype(np.float32)
+    return replace(data, directions=list(rays / np.linalg.norm(rays, axis=-1, keepdims=True)))
+
+
+HARD = {
+    "silence": lambda data, sources: replace(data, target=0 * data.target),
+    "huge": lambda data, sources: replace(data, target=1e15 * data.target),
+    "a receiver at a source": _at_a_source,
+    "rays that mean nothing": _anyhow,
+    "half see nobody": lambda data, sources: replace(
+        data, directions=[d[: len(d) * (i % 2)] for i, d in enumerate(data.directions)]
+    ),
+}
+
+
+@pytest.mark.parametrize("case", HARD)
+def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
+    data, fold, sources = directed(60, pillar=True)
+    data = HARD[case](data, sources)
+    method = DirectedSources()
+    method.fit(data, fold, Path())
+    batch = data.batch(fold.test)
+    said, (_, left) = method.predict(batch.tx, batch.rx), method.left_over()
+    for part in (torch.view_as_real(said.mean), said.variance, said.confidence, torch.view_as_real(left)):
+        assert bool(torch.isfinite(part).all())
+    if case != "silence":
+        assert error(method, data, fold.test) < 1.1
+
+
 def test_the_conference_room_from_43_receivers():
     """A search finds nothing there: NMSE 1.1; a network along the rays leaves 0.17."""
     if not REAL.exists():
