@@ -52,7 +52,8 @@ class Gsparc(LearnedField):
         phase_probe: the same with a small budget, for the probe.
         array_model: what predicts where `array` is on and the receiver is static.
         bearing_model: what predicts where `array` is on and the receiver moves.
-        directed_model: what predicts, alone or with `phase_model`, where `directions` is on.
+        directed_model: what predicts, alone or with `phase_model`, where `directions` is on; checkpoints of
+            before there was one have none.
         **field: see `LearnedField`.
     """
 
@@ -63,7 +64,7 @@ class Gsparc(LearnedField):
         phase_probe: VirtualSourceGP,
         array_model: Method,
         bearing_model: Method,
-        directed_model: DirectedSources,
+        directed_model: DirectedSources | None = None,
         **field: Any,
     ) -> None:
         response = replace(
@@ -74,8 +75,8 @@ class Gsparc(LearnedField):
         super().__init__(response=response, **field)
         self.switches = effects
         self._models: dict[str, Method] = {"phase": phase_model, "array": array_model}
-        self._models |= {"bearings": bearing_model, "directions": directed_model}
-        self._directed, self._optimism = directed_model, 1.0
+        self._directed, self._optimism = directed_model or DirectedSources(), 1.0
+        self._models |= {"bearings": bearing_model, "directions": self._directed}
         self._followed = FitReport(0.0)
         self._probe = phase_probe
         self._chosen: str | None = None

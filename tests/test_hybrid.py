@@ -183,3 +183,9 @@ def test_searches_of_few_rows_promise_too_much():
     error, optimism = searched_beyond(probe, data, few, 0)
     better, honest = searched_beyond(probe, data, fold.train, 0)
     assert optimism > 2 and optimism > honest and error > 3 * better
+
+
+def test_a_checkpoint_of_before_there_were_directions_still_loads():
+    config = compose(*(f"model.{s}" for s in SETTINGS)).model
+    del config.directed_model, config.effects.directions
+    assert build(config).switches.directions == "auto"
