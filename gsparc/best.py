@@ -36,10 +36,8 @@ from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)
 
-ALONE, UNHEARD = (
-    0.9,
-    0.05,
-)  # say of directed sources above which nobody else is asked, below which they are not
+# The say of directed sources above which nobody else is asked, below which they are not.
+ALONE, UNHEARD = 0.9, 0.05
 HOPELESS = 0.9  # NMSE of held-out channels from which on a short search promises nothing of a long one
 
 

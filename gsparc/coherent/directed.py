@@ -32,10 +32,8 @@ from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.directions import virtual_transmitters, votes
 
-LEAST_SEEN, MOST_SOURCES = (
-    2,
-    60,
-)  # receivers whose rays meet in a source; of more sources the most seen are kept
+# Receivers whose rays meet in a source; of more sources the most seen are kept.
+LEAST_SEEN, MOST_SOURCES = 2, 60
 MOST_RECEIVERS = 1000  # of more some are drawn: intersections and sightings grow faster than what they tell
 CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
