@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from torch import Tensor
 
 from gsparc.bearings.field import BearingField
@@ -26,7 +25,16 @@ from gsparc.effects import (
     probe_array,
     probe_phase,
 )
-from gsparc.hybrid import Companion, Rest, Told, learn_rest, restored, searched_beyond, weight_of
+from gsparc.hybrid import (
+    Companion,
+    Rest,
+    Told,
+    learn_rest,
+    left_out_nmse,
+    restored,
+    searched_beyond,
+    weight_of,
+)
 from gsparc.learned import LearnedField
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
@@ -86,12 +94,9 @@ class Gsparc(LearnedField):
         """The effects that are computed, for `summary.json`."""
         response = self.settings.response
         splatted = [name for name, on in (("array", response.array), ("phase", response.carrier)) if on]
-        told = isinstance(self._rest, Told)
-        hybrid = "+directions" if told else ""
-        if self._rest is not None and not (isinstance(self._rest, Told) and self._rest.rest is None):
-            hybrid += "+hybrid"
+        told, rest = ("+directions", self._rest.rest) if isinstance(self._rest, Told) else ("", self._rest)
         chosen = self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
-        return chosen + hybrid
+        return chosen + told + ("" if rest is None else "+hybrid")
 
     @property
     def answering(self) -> tuple[Method, Companion | None]:
@@ -111,7 +116,10 @@ class Gsparc(LearnedField):
         if self._chosen is None:
             report = super().fit(data, fold, run_dir)
         else:
-            self._go_on(self._models[self._chosen])
+            if (
+                self._chosen != "directions"
+            ):  # they were followed while deciding: nothing is left to go on with
+                self._go_on(self._models[self._chosen])
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             chosen, budget_s = self._models[self._chosen], self.training.settings.budget_s
             if budget_s is not None:
@@ -186,9 +194,7 @@ class Gsparc(LearnedField):
             if wanted:
                 raise
             return Decision("directions", False, str(error))
-        receivers, left = self._directed.left_over()
-        power = np.mean(np.abs(data.target[np.unique(receivers)]) ** 2)
-        nmse = float(left.abs().square().mean()) / max(float(power), 1e-30)
+        nmse = left_out_nmse(self._directed, data)
         reason = f"{self._directed.size()} sources where rays meet leave NMSE {nmse:.3f} of left-out channels"
         return Decision("directions", wanted or nmse < 1, reason, report.seconds)
 

@@ -138,6 +138,13 @@ def restored(site: Site, state: dict[str, Any]) -> Companion:
     return Beside(process, float(state["weight"]))
 
 
+def left_out_nmse(method: DirectedSources | VirtualSourceGP, data: Measurements) -> float:
+    """Normalised mean squared error of a fitted method, each receiver predicted from all others."""
+    receivers, left = method.left_over()
+    power = float(np.mean(np.abs(data.target[np.unique(receivers)]) ** 2))
+    return float(left.abs().square().mean()) / max(power, 1e-30)
+
+
 def searched_beyond(
     trial: VirtualSourceGP, data: Measurements, rows: np.ndarray, seed: int
 ) -> tuple[float, float]:
@@ -150,9 +157,7 @@ def searched_beyond(
     for fold in fifths(rows, seed):
         trial.fit(data, fold, Path())
         held.append(nmse_of(trial, data, fold.test))
-        receivers, left = trial.left_over()
-        power = float(np.mean(np.abs(data.target[np.unique(receivers)]) ** 2))
-        promised.append(float(left.abs().square().mean()) / max(power, 1e-30))
+        promised.append(left_out_nmse(trial, data))
         if time.perf_counter() - started > PROBE_S:
             break
     error = float(np.mean(held))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -139,6 +140,16 @@ def test_from_few_receivers_measured_directions_answer_alone():
     other = _best()
     other.restore(data.site, method.state())
     assert torch.equal(other.predict(batch.tx, batch.rx).mean, method.predict(batch.tx, batch.rx).mean)
+
+
+def test_an_interrupted_run_that_directions_answer_alone_goes_on(tmp_path):
+    """It was refused with a sentence about recovered vectors."""
+    data, _, _ = directed(80)
+    rows = np.arange(80)
+    method = _best("effects.phase=false", "effects.directions=true")
+    method.training = replace(method.training, resume=tmp_path / "last.ckpt")
+    method.fit(data, Fold(rows[:14], rows[14:16], rows[16:]), Path())
+    assert method.effects == "directions"
 
 
 def test_searched_and_directed_sources_answer_together_where_both_know_something():

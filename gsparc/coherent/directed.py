@@ -125,9 +125,10 @@ class DirectedSources(Method):
         waves = self._seen(rows, observer)
         loud = float(waves.abs().square().sum(1).mean())
         self.power = torch.full((len(self.sources),), 1 / max(loud, 1e-30))
+        alike = {law: law.correlation(rows.position, rows.position) for law in LAWS}
         for _ in range(ROUNDS):
             shared = (waves * self.power) @ waves.mH
-            tried = [(_factor(shared, rows, law), law) for law in LAWS]
+            tried = [(_factor(shared * alike[law], rows, law), law) for law in LAWS]
             factor, self.law = min(tried, key=lambda one: one[0].nll)
             # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
             prior = self.power * self.law.constant
@@ -138,7 +139,8 @@ class DirectedSources(Method):
     def _prepare(self) -> None:
         """What queries need beyond the state."""
         self.waves = self._seen(self.rows, self.observer)
-        self.factor = _factor((self.waves * self.power) @ self.waves.mH, self.rows, self.law)
+        alike = self.law.correlation(self.rows.position, self.rows.position)
+        self.factor = _factor((self.waves * self.power) @ self.waves.mH * alike, self.rows, self.law)
 
         # (n, K R), real and imaginary: what each row adds to each source's gain
         pulled = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
@@ -267,8 +269,7 @@ def _some(known: np.ndarray, seed: int) -> np.ndarray:
     return np.sort(np.random.default_rng(seed).choice(known, MOST_RECEIVERS, replace=False))
 
 
-def _factor(shared: Tensor, rows: Rows, law: Law) -> Factor:
-    """Of the covariance (n, n) that gains alike everywhere would have, under a law, with noise."""
-    covariance = shared * law.correlation(rows.position, rows.position)
+def _factor(covariance: Tensor, rows: Rows, law: Law) -> Factor:
+    """Of the covariance (n, n) of the rows' channels, with the law's noise."""
     covariance.diagonal().add_(law.noise + JITTER)
     return Factor.of(covariance, rows.target)
