@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import hydra
 import pytest
 from campaigns import brief, compose, spectra
+from hydra import initialize_config_module
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
@@ -91,9 +95,23 @@ def test_the_paper_leaves_nothing_to_auto():
     assert len(config.model.guesses) > 5
 
 
-def test_run_directories_name_dataset_and_model():
-    text = (CONF / "train.yaml").read_text()
-    assert "%f" in text  # two runs within a second stay apart
+def run_directory(monkeypatch, *overrides: str) -> str:
+    """Where `train.py` would write."""
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
+    return config.hydra.run.dir
+
+
+@pytest.mark.parametrize("model", sorted(file.stem for file in (CONF / "model").glob("*.yaml")))
+def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
+    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
+    named = run_directory(monkeypatch, f"model={model}", "dataset=own")
+    assert re.fullmatch(rf"outputs/own/{model}/[\d_-]+-\d{{6}}", named)  # microseconds: no two share one
+
+
+def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
+    assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
 
 
 @pytest.mark.slow
