@@ -135,7 +135,7 @@ def plan(
         capacity = _roomy(_capacities[key])
     else:
         wrong, capacity = verdict.tolist()
-        if wrong == 1 << 62:
+        if wrong == layout().UNSOUND_POSE:
             door.raise_for_pose()
         if wrong >= 0:
             door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)

@@ -27,7 +27,7 @@ MEMORY_BOUND = 8 * 2**30
 
 
 def layout() -> Any:
-    """Constants that the kernels of all devices share: RECORD, MOMENTS, STRIP_ROWS."""
+    """Constants that the kernels of all devices share: RECORD, MOMENTS, STRIP_ROWS, UNSOUND_POSE."""
     return built.kernels()
 
 

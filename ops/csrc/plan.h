@@ -16,8 +16,6 @@ template <class S> struct PlanArgs {
     int64_t *slots, *strip_starts;     // (P, N + 1), (P strips + 1)
 };
 
-constexpr int64_t kUnsoundPose = int64_t(1) << 62;
-
 // Fills all of the above; returns -1, the first unsound Gaussian as `Kernels::project` does, or kUnsoundPose.
 template <class S> int64_t make_plan(const PlanArgs<S>& args);
 

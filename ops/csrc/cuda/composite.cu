@@ -165,62 +165,109 @@ __global__ void __launch_bounds__(kBlock) weigh_kernel(View<S> v, Model<S> model
 
 // Adds the rows of each Gaussian: value k of a row goes to first (.., split) or, from split on, to second (.., rest).
 // A block takes as many ranks as have room, a thread one value; of int64 divisions there are none: they take longest.
+// A list of more than kLong rows is added by the whole block: one thread would keep all others waiting.
+#ifdef __CUDACC__
+constexpr int64_t kLong = 32;
+#else
+constexpr int64_t kLong = 4;  // few, so that small images have such lists
+#endif
 GSPARC_HD int ranks_of_block(int width) { return kThreads / width; }
 template <class S>
 __global__ void add_rows(View<S> v, const S* rows, int width, int split, S* first, S* second, int rest) {
+    __shared__ S parts[kThreads];
     const uint32_t together = ranks_of_block(width), within = threadIdx.x / width, all = uint32_t(v.poses) * v.count;
-    const uint32_t ranked = blockIdx.x * together + within;
-    if (within >= together || ranked >= all) return;
-    const int k = threadIdx.x % width, chunk = blockIdx.y, pose = ranked / v.count, rank = ranked % v.count;
-    const int value = chunk * (width - split) + k - split;
-    if (k >= split && value >= rest) return;
-    const bool broken = v.overflows();
-    const int64_t begin = broken ? 0 : v.first_slot(pose, rank), end = broken ? 0 : v.first_slot(pose, rank + 1);
-    S total = 0;
-    for (int64_t slot = begin; slot < end; ++slot) total += rows[(int64_t(chunk) * v.capacity + slot) * width + k];
-    if (broken) total = S(NAN);
-    const int64_t row = int64_t(pose) * v.count + (broken ? rank : v.order[ranked]);
-    if (k < split)
-        first[(int64_t(chunk) * all + row) * split + k] = total;
-    else
-        second[row * rest + value] = total;
+    const int k = threadIdx.x % width, chunk = blockIdx.y, value = chunk * (width - split) + k - split;
+    const bool broken = v.overflows(), takes = within < together && (k < split || value < rest);
+    // Every step-th row of a rank, the first of which is `from`.
+    auto added = [&](int64_t from, int64_t end, int step) {
+        S total = 0;
+        GSPARC_UNROLL_BY(4)
+        for (int64_t slot = from; slot < end; slot += step) total += rows[(int64_t(chunk) * v.capacity + slot) * width + k];
+        return total;
+    };
+    auto put = [&](uint32_t ranked, S total) {
+        const int pose = ranked / v.count, rank = ranked % v.count;
+        const int64_t row = int64_t(pose) * v.count + (broken ? rank : v.order[ranked]);
+        if (k < split)
+            first[(int64_t(chunk) * all + row) * split + k] = total;
+        else
+            second[row * rest + value] = total;
+    };
+    struct Span {
+        int64_t begin, end;
+        GSPARC_HD bool is_long() const { return end - begin > kLong; }
+    };
+    auto span = [&](uint32_t ranked) -> Span {
+        if (broken || ranked >= all) return {0, 0};
+        const int pose = ranked / v.count, rank = ranked % v.count;
+        return {v.first_slot(pose, rank), v.first_slot(pose, rank + 1)};
+    };
+    const uint32_t base = blockIdx.x * together, own = base + within;
+    const Span mine = span(within < together ? own : all);
+    if (takes && own < all && !mine.is_long()) put(own, broken ? S(NAN) : added(mine.begin, mine.end, 1));
+    if (!block_any(mine.is_long())) return;
+    for (uint32_t ranked = base; ranked < base + together; ++ranked) {
+        const Span one = span(ranked);
+        if (!one.is_long()) continue;
+        if (takes) parts[threadIdx.x] = added(one.begin + within, one.end, together);
+        block_sync();
+        if (takes && within == 0) {
+            S total = 0;
+            for (uint32_t w = 0; w < together; ++w) total += parts[w * width + k];
+            put(ranked, total);
+        }
+        block_sync();
+    }
 }
 
 template <class S> struct Slopes {
-    S *means, *quats, *scales, *opacities, *extinctions, *screen;  // the last two may be absent; screen (P, N, 2)
+    S *means, *quats, *scales, *opacities, *extinctions;  // the last may be absent
 };
 
-// Chains the sums (chunks, P, N, kMoments) into the parameters; poses are added in order.
+constexpr int kSlopes = 12;  // of a mean, a quaternion, three scales, opacity and extinction
+
+// Chains the sums (chunks, P, N, kMoments) into slopes (P, N, kSlopes) of the parameters as each pose sees them.
 template <class S>
-__global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunks, Slopes<S> out) {
-    const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-    if (i >= v.count) return;
-    const bool broken = v.overflows();
-    Gradients<S> total{};
+__global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunks, S* slopes, S* screen) {
+    const uint32_t row = blockIdx.x * kThreads + threadIdx.x, all = uint32_t(v.poses) * v.count;
+    if (row >= all) return;
+    const int pose = row / v.count, i = row % v.count;
+    const bool broken = v.overflows(), seen = !broken && v.boxes[row].row1 > v.boxes[row].row0;
+    S* to = slopes + int64_t(row) * kSlopes;
+    if (!seen) {
+        for (int k = 0; k < kSlopes; ++k) to[k] = broken ? S(NAN) : S(0);
+        if (screen) screen[2 * int64_t(row)] = screen[2 * int64_t(row) + 1] = broken ? S(NAN) : S(0);
+        return;
+    }
+    S m[kMoments] = {};
+    for (int chunk = 0; chunk < chunks; ++chunk)
+        for (int k = 0; k < kMoments; ++k) m[k] += sums[(int64_t(chunk) * all + row) * kMoments + k];
     const Gaussian<S> g = gaussian(model, i);
     const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : opacity;
-    for (int pose = 0; pose < v.poses; ++pose) {
-        const int64_t row = int64_t(pose) * v.count + i, all = int64_t(v.poses) * v.count;
-        if (out.screen) out.screen[2 * row] = out.screen[2 * row + 1] = broken ? S(NAN) : S(0);
-        if (broken || v.boxes[row].row1 <= v.boxes[row].row0) continue;
-        S m[kMoments] = {};
-        for (int chunk = 0; chunk < chunks; ++chunk)
-            for (int k = 0; k < kMoments; ++k) m[k] += sums[(chunk * all + row) * kMoments + k];
-        const S* rotation = model.rotations + 9 * pose;
-        const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, v.lens);
-        const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
-        const Gradients<S> one = project_backward(f, moments, opacity, extinction, rotation, v.lens);
-        for (int k = 0; k < 3; ++k) total.mean[k] += one.mean[k], total.scale[k] += one.scale[k];
-        for (int k = 0; k < 4; ++k) total.quat[k] += one.quat[k];
-        total.opacity += one.opacity, total.extinction += one.extinction;
-        if (out.screen) out.screen[2 * row] = one.screen[0], out.screen[2 * row + 1] = one.screen[1];
-    }
-    const S poison = broken ? S(NAN) : S(0);
-    for (int k = 0; k < 3; ++k) out.means[3 * i + k] = total.mean[k] + poison, out.scales[3 * i + k] = total.scale[k] + poison;
-    for (int k = 0; k < 4; ++k) out.quats[4 * i + k] = total.quat[k] + poison;
-    // What emits also hides unless extinctions are given apart.
-    out.opacities[i] = total.opacity + (out.extinctions ? S(0) : total.extinction) + poison;
-    if (out.extinctions) out.extinctions[i] = total.extinction + poison;
+    const S* rotation = model.rotations + 9 * pose;
+    const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, v.lens);
+    const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
+    const Gradients<S> one = project_backward(f, moments, opacity, extinction, rotation, v.lens);
+    for (int k = 0; k < 3; ++k) to[k] = one.mean[k], to[7 + k] = one.scale[k];
+    for (int k = 0; k < 4; ++k) to[3 + k] = one.quat[k];
+    to[10] = one.opacity, to[11] = one.extinction;
+    if (screen) screen[2 * int64_t(row)] = one.screen[0], screen[2 * int64_t(row) + 1] = one.screen[1];
+}
+
+// Adds what the poses see, in their order: a thread holds one parameter of one Gaussian.
+template <class S> __global__ void add_poses(View<S> v, const S* slopes, Slopes<S> out) {
+    const int64_t at = int64_t(blockIdx.x) * kThreads + threadIdx.x, i = at / kSlopes, k = at % kSlopes;
+    if (i >= v.count) return;
+    auto total = [&](int part) {
+        S sum = 0;
+        for (int pose = 0; pose < v.poses; ++pose) sum += slopes[(int64_t(pose) * v.count + i) * kSlopes + part];
+        return sum;
+    };
+    if (k < 3) out.means[3 * i + k] = total(k);
+    else if (k < 7) out.quats[4 * i + k - 3] = total(k);
+    else if (k < 10) out.scales[3 * i + k - 7] = total(k);
+    else if (k == 11 && out.extinctions) out.extinctions[i] = total(k);
+    else if (k == 10) out.opacities[i] = total(10) + (out.extinctions ? S(0) : total(11));  // what emits also hides, then
 }
 
 int64_t blocks_for(int64_t threads) { return (threads + kThreads - 1) / kThreads; }
@@ -279,13 +326,13 @@ template <class S> int64_t backward(const Call& call, bool weights) {
     out.means = in.next<S>(), out.quats = in.next<S>(), out.scales = in.next<S>(), out.opacities = in.next<S>();
     out.extinctions = in.next<S>();
     S* features = weights ? nullptr : in.next<S>();
-    out.screen = weights ? nullptr : in.next<S>();
+    S* screen = weights ? nullptr : in.next<S>();  // (P, N, 2)
 
     const int64_t all = int64_t(v.poses) * v.count;
     const int width = width_for<S>(call.channels), chunks = chunks_for(call.channels, width), row = kMoments + width;
     Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
     up.rows = arena.take<S>(int64_t(chunks) * v.capacity * row);
-    S* sums = arena.take<S>(int64_t(chunks) * all * kMoments);
+    S *sums = arena.take<S>(int64_t(chunks) * all * kMoments), *slopes = arena.take<S>(all * kSlopes);
     if (weights) forward.image = arena.take<S>(v.poses * pixels_of(v.lens));
     if (arena.measuring()) return arena.bytes();
 
@@ -295,7 +342,8 @@ template <class S> int64_t backward(const Call& call, bool weights) {
     const auto kernel = v.lens.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
     steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up); });
     steps.then([&] { return add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : call.channels); });
-    steps.then([&] { return launch(chain_kernel<S>, blocks_for(v.count), 1, kThreads, stream, v, model, sums, chunks, out); });
+    steps.then([&] { return launch(chain_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, sums, chunks, slopes, screen); });
+    steps.then([&] { return launch(add_poses<S>, blocks_for(int64_t(v.count) * kSlopes), 1, kThreads, stream, v, slopes, out); });
     return steps.result();
 }
 

@@ -6,8 +6,21 @@ namespace gsparc {
 namespace GSPARC_ISA {
 namespace {
 
-constexpr unsigned long long kSound = ~0ull, kUnsoundPose = 1ull << 62;
+constexpr unsigned long long kSound = ~0ull;
 constexpr int kThreads = 128;
+
+// Warps that share the tiles of a Gaussian: with few Gaussians most of the GPU would wait for the widest of them.
+constexpr int kMostPieces = 16;
+#ifdef __CUDACC__
+constexpr int64_t kWarpsWanted = 1 << 16;
+#else
+constexpr int64_t kWarpsWanted = 1 << 9;  // few, so that tests have every number of pieces
+#endif
+int pieces_for(int64_t gaussians) {
+    int pieces = 1;
+    while (pieces < kMostPieces && 2 * pieces * gaussians <= kWarpsWanted) pieces *= 2;
+    return pieces;
+}
 
 template <class S> uint64_t GSPARC_HD depth_bits(S depth);
 template <> uint64_t GSPARC_HD depth_bits(float depth) {
@@ -50,7 +63,7 @@ template <class S> __global__ void project_kernel(View<S> v, Model<S> model, Out
         bool finite = true;
         for (int k = 0; k < 3; ++k) finite &= fabs(model.positions[3 * pose + k]) <= S(3e38);
         for (int k = 0; k < 9; ++k) finite &= fabs(model.rotations[9 * pose + k]) <= S(3e38);
-        if (!finite) atomicMin(out.wrong, kUnsoundPose);
+        if (!finite) atomicMin(out.wrong, static_cast<unsigned long long>(kUnsoundPose));
     }
     if (!one.visible[i]) v.boxes[at] = {0, 0, 0, 0};
     out.keys[at] = depth_key<S>(pose, one.visible[i], one.depths[i]), out.values[at] = int32_t(i);
@@ -97,8 +110,9 @@ template <class S> __global__ void break_ties(int32_t* order, const uint64_t* ke
 // Tiles that a box touches, each once: a box that would wrap into its own first tile was widened to the circle.
 static_assert(kTileWidth < kLanes, "set_columns widens boxes within kLanes of the full circle");
 struct TileRange {
-    int row0, rows, column0, columns;
+    int row0 = 0, rows = 0, column0 = 0, columns = 0;
 
+    TileRange() = default;
     template <class S> GSPARC_HD TileRange(const Box& box, const View<S>& v) {
         row0 = box.row0 / kTileHeight;
         rows = box.row1 > box.row0 ? (box.row1 - 1) / kTileHeight - row0 + 1 : 0;
@@ -111,34 +125,55 @@ struct TileRange {
     }
 };
 
-// A tile counts if at least one of its pixels lies inside the footprint: the test the compositing will make. A warp
-// holds one Gaussian. Writing is a second run of counting, which takes who is visible from the sorted keys.
-template <class S, bool kTangent>
-__global__ void list_tiles(View<S> v, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
-    const int lane = threadIdx.x % kWarp;
-    const uint32_t at = blockIdx.x * (kThreads / kWarp) + threadIdx.x / kWarp;
-    if (at >= uint32_t(v.poses) * v.count) return;
-    const int pose = at / v.count, rank = at % v.count;
-    int64_t found = 0;
-    if (counts ? !hidden_key<S>(sorted[at]) : rank < v.shown[pose]) {
-        const int32_t i = v.order[at];
-        const int64_t row = int64_t(pose) * v.count + i;
-        S record[kRecord];  // a copy: what is written below might be the records, for all the compiler knows
-        memcpy(record, v.records + row * kRecord, sizeof record);
-        const TileRange range(v.boxes[row], v);
-        const int64_t slot = counts ? 0 : v.slots[int64_t(pose) * (v.count + 1) + rank];
-        for (int row = range.row0; row < range.row0 + range.rows; ++row)
-            for (int k = 0, column = range.column0; k < range.columns; ++k, ++column) {
-                if (column == v.tiles_x) column = 0;
-                const Pixel<S, kTangent> pixel(v, row, column, lane);
-                S tau1, tau2, form;
-                if (!warp_any(pixel.offsets(record, v.lens, tau1, tau2, form))) continue;
-                if (!counts && lane == 0 && slot + found < v.capacity)
-                    keys[slot + found] = uint32_t(pose) * v.tiles + row * v.tiles_x + column, gaussians[slot + found] = i;
-                ++found;
-            }
+// A tile counts if at least one of its pixels lies inside the footprint: the test the compositing will make. Calls
+// keep(which of those found, tile) for tiles [from, end) of a range; returns how many there are.
+template <class S, bool kTangent, class Keep>
+__device__ int find_tiles(const View<S>& v, const TileRange& range, const S* record, int from, int end, Keep keep) {
+    int found = 0, row = from < end ? range.row0 + from / range.columns : 0, k = from < end ? from % range.columns : 0;
+    for (int at = from; at < end; ++at, ++k) {
+        if (k == range.columns) k = 0, ++row;
+        const int column = range.column0 + k < v.tiles_x ? range.column0 + k : range.column0 + k - v.tiles_x;
+        const Pixel<S, kTangent> pixel(v, row, column, threadIdx.x % kWarp);
+        S tau1, tau2, form;
+        if (warp_any(pixel.offsets(record, v.lens, tau1, tau2, form))) keep(found++, row * v.tiles_x + column);
     }
-    if (counts && lane == 0) counts[at] = found;
+    return found;
+}
+
+// `pieces` warps hold one Gaussian, each a run of its tiles. Writing is a second run of counting, which takes who is
+// visible from the sorted keys.
+template <class S, bool kTangent>
+__global__ void list_tiles(View<S> v, int pieces, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
+    __shared__ int found[kMostPieces];
+    const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, piece = warp % pieces, all = v.poses * v.count;
+    const int64_t at = int64_t(blockIdx.x) * (blockDim.x / kWarp / pieces) + warp / pieces;
+    const int pose = int(at) / v.count, rank = int(at) % v.count;
+    S record[kRecord];  // a copy: what is written below might be the records, for all the compiler knows
+    TileRange range;
+    int32_t i = 0;
+    if (at < all && (counts ? !hidden_key<S>(sorted[at]) : rank < v.shown[pose])) {
+        i = v.order[at];
+        const int64_t row = int64_t(pose) * v.count + i;
+        memcpy(record, v.records + row * kRecord, sizeof record);
+        range = TileRange(v.boxes[row], v);
+    }
+    const int tiles = range.rows * range.columns, from = tiles * piece / pieces, end = tiles * (piece + 1) / pieces;
+    if (counts || pieces > 1) {
+        const int mine = find_tiles<S, kTangent>(v, range, record, from, end, [](int, int) {});
+        if (lane == 0) found[warp] = mine;
+        block_sync();
+    }
+    int before = 0;
+    for (int k = 0; k < piece; ++k) before += found[warp - piece + k];
+    if (counts) {
+        if (at < all && lane == 0 && piece == pieces - 1) counts[at] = before + found[warp];
+        return;
+    }
+    if (from >= end) return;
+    const int64_t slot = v.slots[int64_t(pose) * (v.count + 1) + rank] + before;
+    find_tiles<S, kTangent>(v, range, record, from, end, [&](int nth, int tile) {
+        if (lane == 0 && slot + nth < v.capacity) keys[slot + nth] = uint32_t(pose) * v.tiles + tile, gaussians[slot + nth] = i;
+    });
 }
 
 // slots (P, N + 1) from the running sums, shown (P,) from the sorted keys: the first hidden rank; the total, or more
@@ -176,6 +211,15 @@ __global__ void write_entries(const uint32_t* keys, const int32_t* slot_of, cons
 }
 
 int64_t blocks_for(int64_t threads) { return (threads + kThreads - 1) / kThreads; }
+
+// Counts where `counts` is given, else writes entries.
+template <class S>
+int64_t list(const View<S>& v, void* stream, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
+    const int64_t all = int64_t(v.poses) * v.count;
+    const int pieces = pieces_for(all), warps = pieces > kWarps ? pieces : kWarps, together = warps / pieces;
+    const auto kernel = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
+    return launch(kernel, (all + together - 1) / together, 1, warps * kWarp, stream, v, pieces, sorted, counts, keys, gaussians);
+}
 
 template <class S> int64_t plan(const Call& call) {
     Reader in{call};
@@ -215,8 +259,7 @@ template <class S> int64_t plan(const Call& call) {
         steps.then([&] { return launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, sorted); });
         steps.then([&] { return launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, sorted, v.poses, v.count); });
     }
-    const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
-    steps.then([&] { return launch(list, blocks_for(all * kWarp), 1, kThreads, stream, v, keys, counts, nullptr, nullptr); });
+    steps.then([&] { return list<S>(v, stream, keys, counts, nullptr, nullptr); });
     steps.then([&] { return running_sums(temp, sum_bytes, counts, sums, all, stream); });
     steps.then([&] { return launch(write_slots<S>, blocks_for(all + v.poses), 1, kThreads, stream, sums, keys, out.wrong, v.poses, v.count, v.slots, v.shown,
                       v.total, verdict); });
@@ -238,9 +281,8 @@ template <class S> int64_t bin(const Call& call) {
     if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
-    const auto list = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
     steps.then([&] { return launch(number_slots, blocks_for(capacity), 1, kThreads, stream, numbers, keys, v.total, v.capacity, tiles); });
-    steps.then([&] { return launch(list, blocks_for(int64_t(v.poses) * v.count * kWarp), 1, kThreads, stream, v, nullptr, nullptr, keys, gaussians); });
+    steps.then([&] { return list<S>(v, stream, nullptr, nullptr, keys, gaussians); });
     if (capacity > 0) steps.then([&] { return sort_pairs<uint32_t>(temp, bytes, keys, sorted_keys, numbers, slots, capacity, bits, stream); });
     steps.then([&] { return launch(write_entries, blocks_for(capacity + 1), 1, kThreads, stream, sorted_keys, slots, gaussians, v.capacity, tiles,
                       v.starts, v.gaussians, v.slot_of); });
