@@ -8,6 +8,7 @@ from torch import Tensor
 from gsparc.ops import door, reference
 from gsparc.ops.geometry import Pose, SphereGrid
 from gsparc.ops.plan import Plan
+from gsparc.ops.results import visible_share
 from gsparc.ops.settings import Optics
 
 
@@ -72,10 +73,8 @@ def mean_weights(
     for index in range(plan.num_poses):
         weights, alpha, _ = _weights(plan, index, means, quats, scales, opacities, extinctions, still)
         back = torch.argsort(plan.buffers[0][index])
-        total = alpha.sum(1)
-        share = torch.where(total > 0, weights.sum(1) / torch.where(total > 0, total, 1.0), 0.0)
         averages.append(weights.mean(1)[back])
-        shares.append(share[back])
+        shares.append(visible_share(weights.sum(1), alpha.sum(1))[back])
     return torch.stack(averages), torch.stack(shares)
 
 

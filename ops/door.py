@@ -62,12 +62,18 @@ def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor, pose
             raise_for(name, int(torch.argmin(ok.to(torch.int8))))
 
 
+def strongest(opacities: Tensor, extinctions: Tensor) -> Tensor:
+    """The larger of each two; the smaller where it is negative, so that nobody hides behind the other."""
+    least = torch.minimum(opacities, extinctions)
+    return torch.where(least < 0, least, torch.maximum(opacities, extinctions))
+
+
 def raise_for(name: str, index: int) -> None:
     """The error for Gaussian `index` whose `name` no footprint can be made of (UnsoundGaussian)."""
     wanted = {
         "means": f"finite and within {FARTHEST:.0e} m",
         "scales": f"finite and from 0 to {WIDEST:.0e} m",
-        "opacities": "in [0, 1]",
+        "opacities": "in [0, 1], extinctions included",
     }.get(name, "finite")
     raise UnsoundGaussian(
         f"Gaussian {index} has {name} that are not {wanted}; find where they come from", index

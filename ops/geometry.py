@@ -62,6 +62,10 @@ class Pose:
         return Pose(position, eye.expand(*position.shape[:-1], 3, 3))
 
 
+WIDEST_GRID = 32767
+"""Most columns of a grid: the kernels count blocks of one to four columns in 16 bits."""
+
+
 @dataclass(frozen=True)
 class SphereGrid:
     """Directions on the receiver's sphere; row i and column j are pixel *centres*.
@@ -73,6 +77,9 @@ class SphereGrid:
         height, width: number of elevations and azimuths.
         first_elevation, first_azimuth: centre of pixel (0, 0) [rad].
         elevation_step, azimuth_step: spacing of the centres, positive [rad].
+
+    Raises:
+        ValueError: no pixel, angles that are not finite, rows beyond a pole, columns beyond the circle.
     """
 
     height: int
@@ -83,10 +90,20 @@ class SphereGrid:
     azimuth_step: float
 
     def __post_init__(self) -> None:
+        angles = (self.first_elevation, self.first_azimuth, self.elevation_step, self.azimuth_step)
+        if not all(map(math.isfinite, angles)):
+            raise ValueError(f"a grid needs finite angles, got {self}")
         if self.height < 1 or self.width < 1 or self.elevation_step <= 0 or self.azimuth_step <= 0:
             raise ValueError(f"a grid needs at least one pixel and positive steps, got {self}")
         if self.width * self.azimuth_step > 2 * math.pi * (1 + 1e-6):
             raise ValueError(f"{self.width} columns of {self.azimuth_step} rad exceed the circle")
+        if self.width > WIDEST_GRID:
+            raise ValueError(f"a grid has at most {WIDEST_GRID} columns, got {self.width}")
+        last = self.first_elevation + (self.height - 1) * self.elevation_step
+        if self.first_elevation < -math.pi / 2 - 1e-6 or last > math.pi / 2 + 1e-6:
+            raise ValueError(
+                f"elevations run from {self.first_elevation:g} to {last:g} rad; a sphere ends at +-pi/2"
+            )
 
     @property
     def periodic(self) -> bool:

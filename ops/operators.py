@@ -17,6 +17,7 @@ from torch.library import custom_op
 from gsparc.ops import built
 from gsparc.ops.geometry import Pose, SphereGrid
 from gsparc.ops.plan import Plan
+from gsparc.ops.results import visible_share
 from gsparc.ops.settings import ALPHA_MAX, HORIZON_COSINE, Optics
 
 KERNELS: dict[str, ModuleType] = {}
@@ -384,8 +385,7 @@ def mean_weights(
         *(means, quats, scales, opacities, extinctions, plan.pose.position, plan.pose.rotation),
         *(plan.buffers, *numbers(plan.grid, plan.optics)),
     )
-    share = torch.where(total > 0, seen / torch.where(total > 0, total, 1.0), 0.0)
-    return seen / (plan.grid.height * plan.grid.width), share
+    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 
 def model_of(means, quats, scales, opacities, extinctions, positions, rotations) -> list[Tensor | None]:

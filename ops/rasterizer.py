@@ -50,7 +50,7 @@ def make_plan(
     """
     door.gaussians(means, quats, scales, opacities, extinctions, ids)
     with torch.no_grad():
-        strongest = opacities if extinctions is None else torch.maximum(opacities, extinctions)
+        strongest = opacities if extinctions is None else door.strongest(opacities, extinctions)
         chosen = backends.choose(backend, means.device)
         optics = Optics(projection, low_pass, compensate, near, cutoff)
         return chosen.make_plan(means, quats, scales, strongest, ids, door.poses(pose, means), grid, optics)

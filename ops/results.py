@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
+
+from gsparc.ops.settings import FAINTEST
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,16 @@ class Weights:
     Attributes:
         mean: (P, N), mean over pixels of alpha times transmittance.
         share: (P, N) in [0, 1], sum of alpha times transmittance over sum of alpha: the visible part of the
-            footprint; 0 where there is no footprint.
+            footprint; 0 where there is no footprint. Below `FAINTEST` it has a value and no gradient.
     """
 
     mean: Tensor
     share: Tensor
+
+
+def visible_share(seen: Tensor, total: Tensor) -> Tensor:
+    """`Weights.share` of the sums over pixels of alpha T and of alpha."""
+    bright = total > FAINTEST
+    with torch.no_grad():
+        faint = torch.where(total > 0, seen / torch.where(total > 0, total, 1.0), 0.0)
+    return torch.where(bright, seen / torch.where(bright, total, 1.0), faint)

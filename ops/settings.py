@@ -19,6 +19,9 @@ SHORTEST_QUATERNION = 1e-18
 ALPHA_MAX = 0.99
 """Largest opacity of one layer at one pixel; a clamped layer passes no gradient to geometry or opacity."""
 
+FAINTEST = 1e-30
+"""A Gaussian whose alphas add up to less has a visible share without a gradient: 1 / sum is no float32."""
+
 HORIZON_COSINE = 0.01
 """`tangent` only: pixels more than 89.4 degrees from a Gaussian's direction never see it (the tangent plane
 ends at 90 degrees, and float32 has lost two digits of the offset before that)."""

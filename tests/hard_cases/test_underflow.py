@@ -6,9 +6,9 @@ Shown: gradients of everything behind are exactly 0, not small.
 
 import pytest
 import torch
-from rasters import Scene, assert_equals_float64, origin, render
+from rasters import Scene, assert_equals_float64, one, origin, render
 
-from gsparc.ops import SphereGrid
+from gsparc.ops import Cutoff, SphereGrid, make_plan, mean_weights
 
 GRID = SphereGrid(5, 5, -0.02, -0.02, 0.01, 0.01)
 
@@ -35,6 +35,25 @@ def test_what_lies_behind_gets_exactly_zero(backend, dtype):
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 def test_equals_float64(backend, projection):
     assert_equals_float64(tunnel(), origin(), GRID, backend, projection=projection)
+
+
+@pytest.mark.parametrize("opacity", [1e-44, 1e-38, 1e-31, 1e-20, 1e-3])
+def test_share_of_the_faintest_has_no_slope_that_overflows(backend, opacity):
+    """1 / sum(alpha) is infinite in float32, and 0 times it was NaN: the share keeps its value only."""
+    scene = one([1.0, 0.0, 0.0]).to(torch.float32)
+    model = [getattr(scene, k).clone().requires_grad_() for k in ("means", "quats", "scales", "opacities")]
+    model[3].data.fill_(opacity)
+    plan = make_plan(*model, origin(), GRID, cutoff=Cutoff(1e-3, relative=True), backend=backend)
+    share = mean_weights(plan, *model).share
+    share.sum().backward()
+    assert abs(share.item() - 1) < 1e-5
+    assert all(leaf.grad.isfinite().all() for leaf in model)
+
+
+def test_share_by_plain_division_breaks():
+    total = torch.full((1,), 1e-44, requires_grad=True)
+    (0.5 * total / total).backward()
+    assert total.grad.isnan().all()
 
 
 def test_without_a_stopping_rule_it_breaks():

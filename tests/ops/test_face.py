@@ -8,12 +8,14 @@ from gsparc.ops import (
     BackendUnavailable,
     Cutoff,
     Optics,
+    SphereGrid,
     StalePlan,
     composite,
     freeze,
     make_plan,
     rasterize,
 )
+from gsparc.ops.geometry import WIDEST_GRID
 
 GRID = GRIDS["hemisphere"]
 
@@ -54,6 +56,45 @@ def test_poison_is_named(backend, name, poison):
     values[name][3] = poison
     with pytest.raises(ValueError, match=f"Gaussian 3 has {name}"):
         make_plan(**values, pose=poses(0), grid=GRID, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("name", ["opacities", "extinctions"])
+def test_nobody_negative_hides_behind_the_larger(backend, name):
+    """What emits and what hides are looked at both: only the larger was, and -1e30 went through."""
+    scene = random_scene(n=5, hides=True)
+    values = {**parts(scene), "extinctions": scene.extinctions}
+    values[name] = values[name].clone()
+    values[name][3] = -0.5
+    with pytest.raises(ValueError, match=r"Gaussian 3 has opacities that are not in \[0, 1\]"):
+        make_plan(**values, pose=poses(0), grid=GRID, backend=backend)
+
+
+@pytest.mark.parametrize(
+    "grid,words",
+    [
+        ((3, 4, float("nan"), 0.0, 0.2, 0.1), "finite angles"),
+        ((3, 4, 0.0, float("inf"), 0.2, 0.1), "finite angles"),
+        ((3, 4, 0.0, 0.0, 0.2, float("nan")), "finite angles"),
+        ((3, 4, 1.4, 0.0, 0.2, 0.1), "elevations run from 1.4 to 1.8"),
+        ((3, 4, -2.0, 0.0, 0.2, 0.1), "elevations run from -2"),
+        ((1, 70_000, 0.0, 0.0, 0.1, 6.28 / 70_000), "at most 32767 columns"),
+    ],
+)
+def test_grids_that_were_drawn_black(grid, words):
+    """Blocks of columns are counted in 16 bits, and nothing is seen at NaN or beyond a pole."""
+    with pytest.raises(ValueError, match=words):
+        SphereGrid(*grid)
+
+
+def test_the_widest_grid_is_drawn_to_its_last_column():
+    scene, width = random_scene(n=20, samples=1), WIDEST_GRID
+    grid = SphereGrid(1, width, 0.2, 0.0, 0.1, 2 * torch.pi / width)
+    plans = [
+        rasterize(**parts(scene), features=scene.features, pose=poses(0), grid=grid, backend=b)
+        for b in ("cpu", "reference")
+    ]
+    assert (plans[0].image - plans[1].image).abs().max() < 1e-12 and plans[1].image.abs().max() > 0.01
 
 
 def test_samples_and_poses_must_agree():
