@@ -30,6 +30,7 @@ METHODS = {
     "uplink": "gsparc.uplink.method.UplinkField",
     "complex_gp": "gsparc.coherent.complex_gp.ComplexGP",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
+    "directed": "gsparc.coherent.directed.DirectedSources",
     "array": "gsparc.array.field.ArrayField",
     "array_mirrored": "gsparc.array.mirrored_field.MirroredField",
     "bearings": "gsparc.bearings.field.BearingField",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
+import yaml
 
 from gsparc.method import Method
 from gsparc.peers.gp import GaussianProcess
@@ -12,6 +15,13 @@ from gsparc.registry import METHODS, build, method_class
 @pytest.mark.parametrize("name", METHODS)
 def test_every_name_is_a_method(name):
     assert issubclass(method_class(name), Method)
+
+
+def test_every_model_of_the_configuration_has_a_name():
+    """`model=directed` could be trained, but was no baseline and could not be read from a bare checkpoint."""
+    files = (Path(__file__).parents[1] / "conf" / "model").glob("*.yaml")
+    targets = {file.stem: yaml.safe_load(file.read_text())["_target_"] for file in files}
+    assert targets == METHODS
 
 
 def test_a_typo_gets_the_nearest_name():
