@@ -166,7 +166,7 @@ def aligned(data: Measurements, site: Site) -> Measurements:
     """`data` in the local coordinates and target units that a model of `site` was trained in.
 
     Raises:
-        ValueError: another kind, target shape, moving end or static place.
+        ValueError: another kind, grid, moving end or static place.
     """
     own = data.site
     for what in ("kind", "static_end", "grid"):
@@ -192,8 +192,15 @@ def aligned(data: Measurements, site: Site) -> Measurements:
         ),
         tx=data.tx + shift,
         rx_position=data.rx_position + shift,
-        target=data.target if rescale == 1 else (data.target * rescale).astype(data.target.dtype),
+        target=_times(data.target, rescale),
+        uplink=None if data.uplink is None else _times(data.uplink, rescale),
+        noise_variance=None if data.noise_variance is None else _times(data.noise_variance, rescale**2),
     )
+
+
+def _times(values: np.ndarray, factor: float) -> np.ndarray:
+    """Values in another unit, of the same type."""
+    return values if factor == 1 else (values * factor).astype(values.dtype)
 
 
 def main() -> None:

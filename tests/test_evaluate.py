@@ -151,6 +151,22 @@ def test_data_centred_elsewhere_are_moved_not_misread(trained, room):
             aligned(other, stored.site)
 
 
+def test_what_is_in_target_units_is_converted_with_the_target(trained, room):
+    """An uplink kept its own unit: whoever hears it and predicts a downlink was wrong by the ratio."""
+    stored = checkpoint.read(trained)
+    data = load({"name": "newrf", "file": str(room)})
+    heard = np.full((len(data), 2, 3), 1 + 1j, np.complex64)
+    noise = np.full(len(data), 0.5, np.float32)
+    louder = dataclasses.replace(data.site, target_scale=data.site.target_scale * 4)
+    own = dataclasses.replace(
+        data, site=louder, target=data.target / 4, uplink=heard / 4, noise_variance=noise / 16
+    )
+    back = aligned(own, stored.site)
+    assert np.allclose(back.target, data.target)
+    assert np.allclose(back.uplink, heard) and np.allclose(back.noise_variance, noise)
+    assert back.uplink.dtype == np.complex64 and back.noise_variance.dtype == np.float32
+
+
 def test_folds_need_their_checkpoints(trained):
     method, stored = checkpoint.load(trained)
     checkpoint.save(trained, method, stored.config, {})
