@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
+from clocks import WoundClock
 from invented import invent
 
+from gsparc import clock
 from gsparc.clock import ClockSettings
 from gsparc.data.splits import Fold
 from gsparc.effects import decide_array
@@ -17,6 +17,9 @@ from gsparc.peers.nearest import Nearest
 from gsparc.prices import measure
 
 FOLD = Fold(np.arange(30), np.arange(30, 32), np.arange(32, 48))
+
+
+WATCH = WoundClock()
 
 
 class Slow(Nearest):
@@ -29,7 +32,7 @@ class Slow(Nearest):
         return FitReport(3.0)
 
     def predict(self, tx, rx):
-        time.sleep(0.004)
+        WATCH.wind(0.004)
         return super().predict(tx, rx)
 
 
@@ -38,6 +41,10 @@ class Quick(Nearest):
         super().fit(data, fold, run_dir)
         return FitReport(1.0)
 
+    def predict(self, tx, rx):
+        WATCH.wind(0.001)
+        return super().predict(tx, rx)
+
 
 class Impossible(Mean):
     def fit(self, data, fold, run_dir):
@@ -45,16 +52,34 @@ class Impossible(Mean):
         raise AssertionError
 
 
-def test_prices_are_ratios_to_the_plain_variant(tmp_path):
-    data = invent("csi")
-    makers = {"plain": Quick, "slow": Slow, "impossible": Impossible}
-    clock = ClockSettings(rounds=10, budget_s=2)
-    found = {p.name: p for p in measure(makers, data, FOLD, tmp_path, plain="plain", rounds=2, clock=clock)}
+def priced(makers, data, folder):
+    settings = ClockSettings(rounds=10, budget_s=2)
+    found = measure(makers, data, FOLD, folder, plain="plain", rounds=2, clock=settings)
+    return {price.name: price for price in found}
+
+
+def test_prices_are_ratios_to_the_plain_variant(tmp_path, monkeypatch):
+    monkeypatch.setattr(clock.time, "perf_counter", WATCH)
+    found = priced({"plain": Quick, "slow": Slow, "impossible": Impossible}, invent("csi"), tmp_path)
     assert set(found) == {"plain", "slow"}
     assert found["plain"].query_ratio == found["plain"].train_ratio == 1
     assert found["slow"].train_ratio == pytest.approx(3) and found["slow"].query_ms >= 4
-    assert found["slow"].query_ratio > 2 and found["slow"].effects == "sleep"
+    assert 3 < found["slow"].query_ratio < 4 and found["slow"].effects == "sleep"  # 4.1 ms to 1.1
     assert found["slow"].value == pytest.approx(found["plain"].value)
+
+
+def test_methods_that_hear_an_uplink_are_asked_with_it(tmp_path):
+    """They were asked for positions alone, which they refuse, after everything had been trained."""
+
+    class Hears(Quick):
+        def predict(self, tx, rx):
+            raise ValueError("answers snapshots with their uplink")
+
+        def answer(self, batch):
+            return Quick.predict(self, batch.tx, batch.rx)
+
+    found = priced({"plain": Quick, "hears": Hears}, invent("csi"), tmp_path)
+    assert found["hears"].value == pytest.approx(found["plain"].value)
 
 
 def test_the_plain_variant_must_be_there(tmp_path):

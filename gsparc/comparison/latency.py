@@ -63,10 +63,10 @@ def _loaded(path: Path) -> Method:
 def _calls(methods: Mapping[str, Method], room: Room) -> dict[str, Callable[[int], object]]:
     """One query end to end each, another test position every time."""
     rows = room.folds.folds[0].test[:QUERIES]
-    queries = [(batch.tx, batch.rx) for batch in (room.data.batch(rows[i : i + 1]) for i in range(len(rows)))]
+    queries = [room.data.batch(rows[i : i + 1]) for i in range(len(rows))]
 
     def call(method: Method) -> Callable[[int], object]:
-        return lambda turn: method.predict(*queries[turn % len(queries)])
+        return lambda turn: method.answer(queries[turn % len(queries)])
 
     return {name: call(method) for name, method in methods.items()}
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import pytest
 import torch
+from clocks import WoundClock
 
+from gsparc import clock
 from gsparc.comparison import latency
 from gsparc.comparison.cells import Cell
 from gsparc.comparison.fitting import Filled, Room
@@ -17,19 +18,23 @@ WAITS = {"quick": 0.0, "slow": 0.2, "endless": 0.7}  # [s]
 
 
 class Waiting:
-    def __init__(self, name: str) -> None:
-        self.name, self.asked = name, []
+    """Reads whole batches, as methods that hear an uplink do: they refuse to be asked for positions alone."""
 
-    def predict(self, tx, rx):
-        self.asked.append(tx)
-        time.sleep(WAITS[self.name])
-        return Prediction(torch.zeros(len(tx), 1))
+    def __init__(self, name: str, watch: WoundClock) -> None:
+        self.name, self.watch, self.asked = name, watch, []
+
+    def answer(self, batch):
+        self.asked.append(batch.tx)
+        self.watch.wind(WAITS[self.name])
+        return Prediction(torch.zeros(len(batch), 1))
 
 
 def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path):
     made: dict[str, Waiting] = {}
+    watch = WoundClock()
+    monkeypatch.setattr(clock.time, "perf_counter", watch)
     monkeypatch.setattr(
-        latency, "_loaded", lambda path: made.setdefault(path.parent.name, Waiting(path.parent.name))
+        latency, "_loaded", lambda path: made.setdefault(path.parent.name, Waiting(path.parent.name, watch))
     )
     monkeypatch.setattr(latency, "SLOW_MS", 150.0)
     monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)
@@ -39,6 +44,6 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     found = latency.latencies(cells, room)
     assert list(found) == list(WAITS)
     assert {name: one.rounds for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}
-    assert found["slow"].p50_ms == pytest.approx(200, rel=0.5) and found["quick"].p50_ms < 100
+    assert found["slow"].p50_ms == pytest.approx(200, abs=1) and found["quick"].p50_ms < 1
     assert all(len(tx) == 1 for tx in made["quick"].asked)
     assert len({tuple(tx[0].tolist()) for tx in made["quick"].asked}) == 5, "another test position each time"
