@@ -16,7 +16,6 @@ from gsparc import limits
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.learned import LearnedField
 from gsparc.method import Method
 from gsparc.registry import build, method_class
 from gsparc.trainer import Training
@@ -53,7 +52,7 @@ def setting(config: DictConfig) -> Setting:
     def maker(overrides: Any) -> Callable[[], Method]:
         def make() -> Method:
             method = build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
-            if isinstance(method, LearnedField):
+            if hasattr(method, "training"):
                 method.training = Training(instantiate(config.trainer), int(config.seed))
             return method
 
