@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.utils import get_class, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc import checkpoint
@@ -24,7 +24,6 @@ from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation import dataset_facts, split_facts
-from gsparc.learned import LearnedField
 from gsparc.registry import build
 from gsparc.scoring import score
 from gsparc.summary import provenance, write_summary
@@ -180,7 +179,7 @@ def prepare(
     """Compose a cell's configuration and name the folder of its result."""
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
     model = _plain(config.model)
-    by_trainer = issubclass(get_class(model["_target_"]), LearnedField)
+    by_trainer = hasattr(build(config.model), "training")
     trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks")} if by_trainer else {}
     name = key(model, trainer, *room.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
@@ -198,7 +197,7 @@ def fill(prepared: Prepared, room: Room) -> Filled:
     methods, seconds, processor, notes = [], [], [], []
     for number, fold in enumerate(room.folds.folds[: None if prepared.scored else 1]):
         method = build(config.model)
-        if isinstance(method, LearnedField):
+        if hasattr(method, "training"):
             method.training = Training(
                 settings=instantiate(config.trainer),
                 seed=int(config.seed),

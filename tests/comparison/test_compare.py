@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 from campaigns import spectra
+from hydra import initialize_config_module
 
 from gsparc.compare import _may_match, _timed
-from gsparc.comparison.cells import Cell
-from gsparc.comparison.fitting import Filled, Prepared, Remembered, remember
+from gsparc.comparison.cells import Cell, Contender
+from gsparc.comparison.fitting import Filled, Prepared, Remembered, prepare, remember
 
 ROOT = Path(__file__).parents[2]
 
@@ -61,6 +62,19 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     assert remember(tmp_path, "toy", ["random", "sparse"]) == [room] and not remember(
         tmp_path, "t", ["random"]
     )
+
+
+@pytest.mark.parametrize("model", ["gsparc", "bearings", "committee"])
+def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
+    """Committees were trained as if there were no budget, and one of 5 s was found again as one of 60 s."""
+    room = Remembered("own", "random", "spectrum", ("d", "s"))
+    contender = Contender(model, (f"model={model}",), ("trainer.budget_s={budget_s}",))
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        short, long = (
+            prepare(Cell("own", "random", model, budget_s, 0), contender, {"file": "x"}, room, tmp_path)
+            for budget_s in (5.0, 60.0)
+        )
+    assert short.config.trainer.budget_s == 5 and short.folder != long.folder
 
 
 @pytest.mark.slow
