@@ -23,7 +23,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluate import Opened, open_files
 from gsparc.evaluation import dataset_facts, split_facts
 from gsparc.method import Method
-from gsparc.scoring import score
+from gsparc.scoring import rows_of, score
 from gsparc.summary import provenance, write_samples, write_summary
 from gsparc.tradeoff import stored
 from gsparc.tradeoff.picture import Rival, beaten_by, draw
@@ -40,6 +40,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     run = open_files([config.ckpt], _plain(config.dataset), _plain(config.split))
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
+    rows = rows_of(fold, config.eval_on)
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = measure(method, data, learned)
     settings = list(combinations(method, _plain(config.grid), _plain(config.singles)))
@@ -47,7 +48,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
     rivals = _rivals(config, run)
-    rows = getattr(fold, config.eval_on)
     clocks = {name: asker(rival, data, rows) for name, (rival, _) in rivals.items()}
     points, other_ms = sweep(
         candidates, data, fold, eval_on=config.eval_on,

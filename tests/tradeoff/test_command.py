@@ -41,6 +41,16 @@ def swept(field, tmp_path_factory):
         return task(config), folder, ckpt
 
 
+def test_a_misspelt_subset_is_refused_in_words_before_anything_is_measured(field, tmp_path, monkeypatch):
+    """Without baselines it was an AttributeError, after every combination had been made."""
+    monkeypatch.setattr(
+        HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": tmp_path})})
+    )
+    config = compose(f"ckpt='{field.checkpoints[0]}'", "baselines=[]", "eval_on=tset", config="tradeoff")
+    with pytest.raises(ValueError, match="eval_on='tset' is none of train, val, test"):
+        task(config)
+
+
 def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     facts, folder, _ = swept
     with (folder / "tradeoff.csv").open() as file:
