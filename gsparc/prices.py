@@ -19,13 +19,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import dataset_facts
 from gsparc.method import Method
+from gsparc.metrics import DECIDING
 from gsparc.scoring import score
 from gsparc.summary import provenance, write_summary
 from gsparc.variants import setting
 
 log = logging.getLogger(__name__)
 
-FIGURES = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
 QUERIES = 32  # test positions asked in turn
 
 
@@ -102,7 +102,7 @@ def measure(
         return lambda turn: method.answer(batches[turn % len(batches)])
 
     times = interleaved({name: asking(method) for name, method in fitted.items()}, clock)
-    figure = FIGURES[data.site.kind]
+    figure = DECIDING[data.site.kind]
     found = []
     for name, method in fitted.items():
         value = score((method,), data, Split("prices", (fold,), ""), "test").figures()[figure]
@@ -128,7 +128,7 @@ def task(config: DictConfig) -> list[Price]:
         where.makers, where.data, where.fold, where.run_dir,
         plain=str(config.plain), rounds=int(config.rounds), clock=clock,
     )  # fmt: skip
-    figure = FIGURES[where.data.site.kind]
+    figure = DECIDING[where.data.site.kind]
     facts: dict[str, object] = {**dataset_facts(where.data), **machine_facts(), **provenance()}
     facts |= {"seed": int(config.seed), "price/plain": str(config.plain), "price/rounds": int(config.rounds)}
     for price in found:

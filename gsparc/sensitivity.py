@@ -22,13 +22,12 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import dataset_facts
 from gsparc.method import Method
+from gsparc.metrics import DECIDING
 from gsparc.scoring import score
 from gsparc.summary import provenance, write_summary
 from gsparc.variants import setting
 
 log = logging.getLogger(__name__)
-
-FIGURES = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,7 @@ def sweep(
     seed: int,
 ) -> Iterator[Row]:
     """Rows as they are finished; every method sees the same disturbed positions."""
-    figure = FIGURES[data.site.kind]
+    figure = DECIDING[data.site.kind]
     learned = np.concatenate([fold.train, fold.val])
     for name, make in contenders.items():
         method, seconds = _fitted(make, data, fold, run_dir / name)

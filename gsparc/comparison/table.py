@@ -13,10 +13,11 @@ import numpy as np
 
 from gsparc.comparison.fitting import Filled
 from gsparc.comparison.latency import Latency
+from gsparc.data.schema import Kind
+from gsparc.metrics import DECIDING, score_of
 from gsparc.summary import BUSY
 
-FIGURE = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}  # the one that places are given by
-SECOND = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
+SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
 SIMPLE = ("zero", "mean", "nearest", "idw", "gp", "kriging", "complex_gp")
 CLOSE_DB = 0.5
@@ -63,12 +64,10 @@ class Row:
     earlier: str = ""
 
 
-def score_db(kind: str, facts: Mapping[str, Any]) -> float:
+def score_db(kind: Kind, facts: Mapping[str, Any]) -> float:
     """The figure places are given by, as decibels of which more are better."""
-    value = float(facts[f"test/{FIGURE[kind]}"])
-    if kind == "csi":
-        return float(-10 * np.log10(max(value, 1e-12)))
-    return -value if kind == "rssi" else value
+    figure = DECIDING[kind]
+    return score_of(figure, float(facts[f"test/{figure}"]))
 
 
 def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> list[Row]:
@@ -94,7 +93,7 @@ def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -
 
 def _row(same: list[Filled], latency: Latency | None) -> Row:
     cell, facts = same[0].cell, [one.facts for one in same]
-    kind = str(facts[0]["dataset/kind"])
+    kind: Kind = facts[0]["dataset/kind"]
     scores = [score_db(kind, f) for f in facts]
 
     def mean(name: str) -> float | None:
@@ -106,7 +105,7 @@ def _row(same: list[Filled], latency: Latency | None) -> Row:
         score_db=float(np.mean(scores)),
         spread_db=float(np.std(scores, ddof=1)) if len(scores) > 1 else None,
         seeds=len(same),
-        figure=FIGURE[kind], value=mean(f"test/{FIGURE[kind]}") or 0.0,
+        figure=DECIDING[kind], value=mean(f"test/{DECIDING[kind]}") or 0.0,
         second=SECOND[kind], second_value=mean(f"test/{SECOND[kind]}"),
         train_s=mean("time/train_s") or 0.0, train_cpu_s=mean("time/train_cpu_s") or 0.0,
         query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,

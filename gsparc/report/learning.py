@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsparc.metrics import score_of
 from gsparc.report.runs import Run
 from gsparc.report.table import Column, Table
 from gsparc.report.tables import FORMS, HEADS, number
-from gsparc.tradeoff.points import score_of
 
 MINUTES = (1, 2, 5, 10)
 
@@ -65,12 +65,17 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 
 def levels(runs: Sequence[Run], count: int = 3) -> list[float]:
-    """Round figures between what the worst and the best run reach."""
+    """Round figures between what the worst and the best run reach, the worst first."""
     figure = validation_figure(runs[0])
-    ends = [max(curve(run)[1], key=lambda v: score_of(figure, v)) for run in runs if len(curve(run)[0])]
+
+    def score(value: float) -> float:
+        return score_of(figure, value)
+
+    ends = [max(curve(run)[1], key=score) for run in runs if len(curve(run)[0])]
     if not ends:
         return []
-    low, high = min(ends), max(ends)
-    if high - low < 1e-9 * max(abs(high), 1e-9):
-        return [float(f"{low:.3g}")]
-    return sorted({float(f"{v:.3g}") for v in np.linspace(low, high, count + 2)[:-1]})[:count]
+    worst, best = min(ends, key=score), max(ends, key=score)
+    if abs(best - worst) < 1e-9 * max(abs(best), 1e-9):
+        return [float(f"{worst:.3g}")]
+    between = {float(f"{v:.3g}") for v in np.linspace(worst, best, count + 2)[:-1]}
+    return sorted(between, key=score)[:count]

@@ -16,11 +16,12 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
+from gsparc.metrics import lower_is_better, score_of
 from gsparc.report.intervals import interval, over_seeds
 from gsparc.report.learning import curve, validation_figure
 from gsparc.report.runs import PER_SAMPLE, Run
 from gsparc.report.tables import BASELINES, HEADS, grouped
-from gsparc.tradeoff.points import LOWER_IS_BETTER, front, score_of
+from gsparc.tradeoff.points import front
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95
@@ -305,7 +306,7 @@ def _one() -> tuple[Figure, Axes]:
 
 def _accuracy(axes: Axes, name: str) -> None:
     axes.set_ylabel(HEADS.get(name, name))
-    if name in LOWER_IS_BETTER or name == "mse":
+    if lower_is_better(name):
         axes.set_yscale("log")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from gsparc.data.schema import Kind
-from gsparc.tradeoff.points import FIGURES
+from gsparc.metrics import DECIDING
 
 SIDE: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "ssim", "mse"), "csi": ("snr_db",), "rssi": ("mae_db", "nmse")
@@ -47,12 +47,12 @@ class Run:
     def kind(self) -> Kind:
         """`spectrum`, `csi` or `rssi`."""
         kind = self.facts.get("dataset/kind")
-        return kind if kind in FIGURES else "spectrum"
+        return kind if kind in DECIDING else "spectrum"
 
     @property
     def figure(self) -> str:
         """Name of the deciding accuracy."""
-        return FIGURES[self.kind]
+        return DECIDING[self.kind]
 
     @cached_property
     def setting(self) -> str:

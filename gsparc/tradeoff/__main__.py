@@ -23,11 +23,12 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluate import Opened, open_files
 from gsparc.evaluation import dataset_facts, split_facts
 from gsparc.method import Method
+from gsparc.metrics import DECIDING, score_of
 from gsparc.scoring import rows_of, score
 from gsparc.summary import provenance, write_samples, write_summary
 from gsparc.tradeoff import stored
 from gsparc.tradeoff.picture import Rival, beaten_by, draw
-from gsparc.tradeoff.points import FIGURES, Point, cost_of_halving, front, score_of
+from gsparc.tradeoff.points import Point, cost_of_halving, front
 from gsparc.tradeoff.spare import combinations, measure, reduced
 from gsparc.tradeoff.sweep import asker, candidate, sweep
 from gsparc.tradeoff.timing import Pace
@@ -53,7 +54,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         candidates, data, fold, eval_on=config.eval_on,
         pace=Pace(rounds=config.rounds, budget_s=config.budget_s), others={COPY: reference_copy(), **clocks},
     )  # fmt: skip
-    figure = FIGURES[data.site.kind]
+    figure = DECIDING[data.site.kind]
     shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
@@ -98,7 +99,7 @@ def _threads(given: Sequence[int] | None) -> list[int]:
 
 def _rivals(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | None]]:
     """Baselines and the methods in other checkpoints, with the deciding figure of each."""
-    figure, fold, data = FIGURES[run.data.site.kind], run.split.folds[0], run.data
+    figure, fold, data = DECIDING[run.data.site.kind], run.split.folds[0], run.data
     cache = platform_cache() if config.cache is None else Path(config.cache)
     found: dict[str, tuple[Method, float | None]] = {}
     for name in config.baselines:

@@ -10,7 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from gsparc.tradeoff.points import LOWER_IS_BETTER, Point, score_of
+from gsparc.metrics import lower_is_better, score_of
+from gsparc.tradeoff.points import Point
 
 NAMES = {
     "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"
@@ -76,7 +77,7 @@ def draw(
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
     worst, best = min(y), max(y)  # far-off rivals would flatten the front
-    if figure_name in LOWER_IS_BETTER:
+    if lower_is_better(figure_name):
         axes.set_yscale("log")
         axes.invert_yaxis()
     else:

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from gsparc.data.schema import Kind
-
 Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as trained
 
-FIGURES: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
-LOWER_IS_BETTER = ("nmse", "rmse_db")
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",
     "stride": lambda value: f"1 of {value} x {value} pixels",
@@ -74,13 +69,6 @@ def worded(settings: Settings) -> str:
     """`25% kept, 1 of 3 x 3 pixels`; `as trained` when nothing is spared."""
     said = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
     return ", ".join(word for word in said if word) or "as trained"
-
-
-def score_of(figure: str, value: float) -> float:
-    """A number that is larger when the figure is better, in dB where the figure allows it."""
-    if figure == "nmse":
-        return -10 * math.log10(max(value, 1e-12))
-    return -value if figure in LOWER_IS_BETTER else value
 
 
 def front(latency: Sequence[float], score: Sequence[float]) -> list[int]:

@@ -15,9 +15,10 @@ from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import paired_differences
 from gsparc.method import Method, Prediction
+from gsparc.metrics import DECIDING
 from gsparc.predictor import Predictor
 from gsparc.scoring import Scores, rows_of, score
-from gsparc.tradeoff.points import FIGURES, Point, Settings, worded
+from gsparc.tradeoff.points import Point, Settings, worded
 from gsparc.tradeoff.timing import Pace, in_turns
 from gsparc.tradeoff.view import View
 
@@ -79,7 +80,7 @@ def sweep(
     Returns:
         A point per candidate and number of threads, and the times [ms] of `others`.
     """
-    figure = FIGURES[data.site.kind]
+    figure = DECIDING[data.site.kind]
     split = Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
     rows, whole = rows_of(fold, eval_on), None

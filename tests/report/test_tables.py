@@ -12,7 +12,7 @@ import pytest
 from gsparc.report import effects, learning, tables
 from gsparc.report.intervals import Interval, bootstrap, interval
 from gsparc.report.plots import _short
-from gsparc.report.runs import columns, find_runs, told_apart
+from gsparc.report.runs import Run, columns, find_runs, told_apart
 from gsparc.report.table import Column, Table
 
 
@@ -90,6 +90,20 @@ def test_time_to_accuracies_and_best_within_minutes(three):
     assert last["PSNR dB within 1 min"] is None and last["PSNR dB within 5 min"] == 29.5  # 130 s in one piece
     reached = [c for c in first if c.startswith("s to ")]
     assert reached and all(first[c] is None or 0 < first[c] <= 10 for c in reached)
+
+
+def test_of_channels_the_least_error_is_the_best_reached(tmp_path):
+    """The largest was: a mean squared error was taken for a figure of which more are better."""
+    facts = {"dataset/kind": "csi", "model/name": "splat", "time/train_s": 200.0}
+    falling = {"train_s": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.2, 0.1])}
+    slower = {"train_s": np.array([10.0, 100.0, 200.0]), "val/mse": np.array([0.9, 0.7, 0.5])}
+    runs = [Run(tmp_path, {**facts, "seed": i}, curve=c) for i, c in enumerate((falling, slower))]
+    table = learning.within_minutes(runs)
+    first, second = cells(table, 0), cells(table, 1)
+    assert [first[f"MSE within {m} min"] for m in (1, 2, 5)] == [0.9, 0.2, 0.1]
+    assert [second[f"MSE within {m} min"] for m in (1, 2, 5)] == [0.9, 0.7, 0.5]
+    assert learning.levels(runs) == pytest.approx([0.5, 0.4, 0.3])  # from what the worse reaches
+    assert first["s to 0.5"] == 100 and second["s to 0.5"] == 200 and second["s to 0.4"] is None
 
 
 def test_effects_are_paired_by_sample_and_seed(three):

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsparc.tradeoff.picture import Rival, beaten_by
-from gsparc.tradeoff.points import Point, cost_of_halving, front, score_of, worded
+from gsparc.tradeoff.points import Point, cost_of_halving, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 
@@ -32,12 +32,6 @@ def test_nobody_on_the_front_is_beaten_and_everybody_else_is(pairs):
 def test_a_halving_costs_the_slope_of_the_front():
     assert cost_of_halving([1, 2, 4, 8], [20, 21, 22, 23]) == pytest.approx(1.0)
     assert cost_of_halving([1], [20]) is None and cost_of_halving([1, 1], [20, 21]) is None
-
-
-def test_a_score_is_larger_when_the_figure_is_better():
-    assert score_of("psnr_db", 30) > score_of("psnr_db", 20)
-    assert score_of("nmse", 0.01) == pytest.approx(20) and score_of("nmse", 0.1) < score_of("nmse", 0.01)
-    assert score_of("rmse_db", 2) > score_of("rmse_db", 3) and np.isfinite(score_of("nmse", 0.0))
 
 
 def test_settings_are_said_in_words():
