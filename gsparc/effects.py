@@ -182,6 +182,10 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
     started = time.perf_counter()
     dense = spacing_in_wavelengths(data, fold.train)
     inner = fifths(fold.train, seed)[0]
+    if not (data.target[inner.train].any() and data.target[inner.test].any()):
+        return Decision(
+            "phase", False, "the channels to probe with are silent", time.perf_counter() - started
+        )
     errors = {}
     for name, method in (("coherent", trial), ("interpolation", rival)):
         method.fit(data, inner, Path())

@@ -6,6 +6,7 @@ import functools
 import math
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -104,6 +105,11 @@ def _spread(images: Tensor) -> Tensor:
     return images
 
 
+def holds_window(images: Tensor | np.ndarray) -> bool:
+    """Whether images (..., H, W) are as large as the window of `ssim`, 11 x 11."""
+    return min(images.shape[-2:]) > 2 * WINDOW_RADIUS
+
+
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5, data range 1.
 
@@ -116,7 +122,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     Raises:
         ValueError: an image smaller than the window.
     """
-    if min(prediction.shape[-2:]) <= 2 * WINDOW_RADIUS:
+    if not holds_window(prediction):
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
     single = prediction.dtype == target.dtype == torch.float32
     kernel = single and prediction.device.type == "cpu" and built.kernels() is not None
@@ -124,9 +130,12 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """(1 - l) L1 + l (1 - SSIM) per image (paper, eq. 6): (B, H, W) twice -> (B,)."""
+    """(1 - l) L1 + l (1 - SSIM) per image (paper, eq. 6): (B, H, W) twice -> (B,).
+
+    L1 alone for images smaller than SSIM's window, which have no SSIM.
+    """
     absolute = (prediction - target).abs().mean(dim=(-2, -1))
-    if ssim_weight == 0:
+    if ssim_weight == 0 or not holds_window(prediction):
         return absolute
     return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
 

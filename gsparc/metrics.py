@@ -125,20 +125,23 @@ class ChannelMetrics(SampleMetric):
         self.scale = scale
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
-        p, t = (x.to(torch.complex128).flatten(1).numpy() * self.scale for x in (prediction, target))
+        # Of stored units, which are near 1: fourth powers of a channel of 1e-90 or 1e90 are no numbers.
+        p, t = (x.to(torch.complex128).flatten(1).numpy() for x in (prediction, target))
         m = np.ones(t.shape, bool) if mask is None else mask.flatten(1).numpy()
         p, t, count = np.where(m, p, 0), np.where(m, t, 0), np.maximum(m.sum(1), 1)
         error, power = (np.abs(p - t) ** 2).sum(1), (np.abs(t) ** 2).sum(1)
         own, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
         explained = np.divide(cross, own, out=np.zeros_like(own), where=own > 0)
+        # One free number fits one number: for a single-entry channel the figure would say nothing.
+        left = np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan
+        unit = self.scale**2
         return {
-            "error_power": error,
-            "target_power": power,
-            # One free number fits one number: for a single-entry channel the figure would say nothing.
-            "scalar_error_power": np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan,
+            "error_power": error * unit,
+            "target_power": power * unit,
+            "scalar_error_power": left * unit,
             "snr_db": _db(power, error),
-            "mse": error / count,
-            "mae": np.abs(p - t).sum(1) / count,
+            "mse": error / count * unit,
+            "mae": np.abs(p - t).sum(1) / count * self.scale,
             "power_db": np.where(power > 0, _db(np.maximum(own, power * SILENCE), power), np.nan),
         }
 

@@ -14,7 +14,7 @@ from gsparc import surgery
 from gsparc.budget import Pace
 from gsparc.confidence import weighted
 from gsparc.data.schema import Batch
-from gsparc.losses import Snapshot, channel_loss, spectrum_loss, ssim
+from gsparc.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
 from gsparc.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
 from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
@@ -25,7 +25,8 @@ class LossSettings:
     """Task loss.
 
     Attributes:
-        ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone.
+        ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone, as do images
+            smaller than 11 x 11.
         snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
             not look at it.
     """
@@ -118,7 +119,8 @@ class GaussianModule(L.LightningModule):
         size = len(batch)
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
         if self.model.site.kind == "spectrum":
-            self.log("val/ssim_gauss", ssim(mean, batch.target).mean(), batch_size=size, prog_bar=True)
+            if holds_window(mean):
+                self.log("val/ssim_gauss", ssim(mean, batch.target).mean(), batch_size=size, prog_bar=True)
             self.log(
                 "val/psnr_db", (-10 * error.clamp_min(1e-12).log10()).mean(), batch_size=size, prog_bar=True
             )

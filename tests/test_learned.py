@@ -42,6 +42,18 @@ MAKERS = {
 }
 
 
+@pytest.mark.parametrize("height,width", [(1, 8), (8, 1), (7, 13)])
+@pytest.mark.parametrize("more", [(), ("model.warm_start=false",)], ids=["closed form", "steps"])
+def test_images_smaller_than_the_window_of_ssim_train(tmp_path, caplog, height, width, more):
+    with np.load(spectra(tmp_path / "own.npz")) as stored:
+        arrays = {**stored, "spectrum": stored["spectrum"][:, :height, :width]}
+    np.savez(tmp_path / "own.npz", **arrays)
+    method, data, fold = fitted(tmp_path / "own.npz", tmp_path, *more)
+    assert "smaller than SSIM's window" in caplog.text
+    batch = data.batch(fold.test)
+    assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
+
+
 @pytest.mark.parametrize("name", MAKERS)
 def test_every_kind_of_file_trains_predicts_and_reads_back(tmp_path, name):
     """The default model, nothing said about the data."""

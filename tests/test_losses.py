@@ -46,6 +46,12 @@ def test_spectrum_loss_mixes_l1_and_ssim():
     assert torch.equal(spectrum_loss(a, b, 0.0), absolute)
 
 
+def test_images_smaller_than_the_window_are_learned_by_their_absolute_error():
+    """The default loss refused a user's own 10 x 40 spectra, and named no way out."""
+    a, b = images(2, 10, 40), images(2, 10, 40, seed=1)
+    assert torch.equal(spectrum_loss(a, b, 0.2), (a - b).abs().mean((1, 2)))
+
+
 def test_no_ssim_no_limit_on_the_size():
     assert spectrum_loss(images(2, 3, 3), images(2, 3, 3), 0.0).shape == (2,)
 

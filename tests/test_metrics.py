@@ -58,6 +58,15 @@ def test_spectrum_figures_are_the_libraries():
     assert figures["nmse"] == pytest.approx(((p - t) ** 2).sum() / (t**2).sum(), abs=1e-12)
 
 
+@pytest.mark.parametrize("scale", [1e-120, 1e-90, 1e90, 1e120])
+def test_ratios_do_not_depend_on_the_unit_of_the_channels(scale):
+    """Fourth powers of the physical channel vanished or overflowed: after one free scalar, NMSE 1 or 0."""
+    plain, scaled = (summarise(ChannelMetrics(s), *channels()) for s in (1.0, scale))
+    for name in ("nmse", "nmse_scalar", "snr_db", "power_mae_db"):
+        assert scaled[name] == pytest.approx(plain[name], rel=1e-9), name
+    assert scaled["mae"] == pytest.approx(scale * plain["mae"])
+
+
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
 def test_batches_change_nothing(kind):
     if kind == "rssi":

@@ -54,9 +54,12 @@ class WavePackets(nn.Module):
         centres: (N, 3) [m].
         widths: (N,) [m].
         waves: (N, 3) [rad/m].
-        origin: (3,) [m], subtracted from positions first: float32 then keeps the digits.
+        origin: (3,) [m], subtracted from positions first.
         elements: M.
     """
+
+    # Positions and `form` are float64: in a site of 10^4 widths (millimetre waves) these squares are 1e8, and
+    # what is left of them at a packet is of order 1.
 
     form: Tensor
     origin: Tensor
@@ -65,22 +68,22 @@ class WavePackets(nn.Module):
     def __init__(self, centres: Tensor, widths: Tensor, waves: Tensor, origin: Tensor, elements: int) -> None:
         super().__init__()
         self.elements = elements
-        c, w, s = (centres - origin).double(), waves.double(), widths.double()
+        c, w, s = centres.double() - origin.double(), waves.double(), widths.double()
         # Exponent and phase are linear in (x, x^2, 1): one small product gives both.
         curve = (-0.5 / s**2).expand(3, -1)
         exponent = torch.cat([(c / s[:, None] ** 2).T, curve, -0.5 * (c**2).sum(1)[None] / s**2])
         phase = torch.cat([w.T, torch.zeros(3, len(w)), -(c * w).sum(1)[None]])
-        self.register_buffer("form", torch.cat([exponent, phase], 1).float().contiguous())
-        self.register_buffer("origin", origin.float())
+        self.register_buffer("form", torch.cat([exponent, phase], 1).contiguous())
+        self.register_buffer("origin", origin.double())
         self.gains = nn.Parameter(torch.zeros(2 * len(centres), 2 * elements + 2))
         self.register_buffer("bias", torch.tensor([0.0] * (2 * elements) + [1.0, 0.0]))
 
     def features(self, x: Tensor) -> Tensor:
-        """(B, 2 N) of positions (B, 3) [m]."""
-        x = x - self.origin
-        lifted = torch.cat([x, x * x, torch.ones_like(x[:, :1])], 1)
-        exponent, phase = (lifted @ self.form).chunk(2, 1)
-        window = exponent.exp()
+        """(B, 2 N) of positions (B, 3) [m], in their precision."""
+        away = x.double() - self.origin
+        lifted = torch.cat([away, away * away, torch.ones_like(away[:, :1])], 1)
+        exponent, phase = (lifted @ self.form).to(x.dtype).chunk(2, 1)
+        window = exponent.clamp(max=0).exp()
         return torch.cat([window * phase.cos(), window * phase.sin()], 1)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -112,7 +115,7 @@ def distil(teacher: VectorProcess, settings: PacketSettings, wavelength: float, 
     centres = centres + settings.jitter * widths[:, None] * rng.standard_normal((count, 3))
     waves = settings.pitch / widths[:, None] * student_t(count, rng)
     c, s, w, origin = (torch.from_numpy(part) for part in (centres, widths, waves, places.mean(0)))
-    field = WavePackets(c, s, w, origin, m).double()
+    field = WavePackets(c, s, w, origin, m)
     reach = np.exp(rng.uniform(np.log(settings.near), np.log(settings.far), (settings.samples, 1))) * length
     around = places[rng.integers(0, n, settings.samples)] + reach * rng.standard_normal((settings.samples, 3))
     asked = np.concatenate([places, around])
@@ -128,4 +131,4 @@ def distil(teacher: VectorProcess, settings: PacketSettings, wavelength: float, 
         gram[np.diag_indices_from(gram)] += settings.ridge * np.trace(gram) / len(gram)
         gains = cho_solve(cho_factor(gram, lower=True, overwrite_a=True), features.T @ (weight * wanted))
         field.gains.copy_(torch.from_numpy(gains))
-    return field.float()
+    return field

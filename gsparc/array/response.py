@@ -168,6 +168,8 @@ def site_problem(site: Site) -> str | None:
         return "the receiver moves; its array must be static"
     if site.array is None or len(site.array) < 2:
         return "the dataset declares no antenna array"
+    if not np.ptp(site.array, axis=0).any():
+        return "all antennas of the declared array are at one place"
     if site.wavelength is None:
         return "the carrier is unknown"
     return None

@@ -32,10 +32,16 @@ class Frame:
 
 
 def frame_of(site: Site, rows: Rows) -> Frame:
-    """Where these rows have their middle and unit power."""
+    """Where these rows have their middle and unit power.
+
+    Raises:
+        ValueError: every channel is silent.
+    """
     frequency = tones_of(site)
     carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
     power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
+    if not power > 0:
+        raise ValueError(f"{site.name}: every channel to learn from is silent, no source can be found")
     return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -22,7 +23,7 @@ class Rates:
     """Choices at one noise level for n positions.
 
     Attributes:
-        snr_db: median over positions of the mean signal-to-noise ratio [dB].
+        snr_db: median over positions that are not silent of the mean signal-to-noise ratio [dB].
         oracle, chosen: (n,) MCS from the true and from the predicted channel.
         oracle_bps, chosen_bps: (n,) throughput with the transport blocks that arrive [bit/s].
         best_bps: (n,) of the MCS that carries most, were the channel known [bit/s].
@@ -56,6 +57,12 @@ class Band:
     true: Tensor
     predicted: Tensor
     variance: Tensor
+
+    @property
+    def median_power(self) -> float:
+        """Median over the positions that are not silent of the mean power; 0 where all are."""
+        power = self.true.abs().square().mean(1)
+        return float(power[power > 0].median()) if (power > 0).any() else 0.0
 
     @property
     def expected_power(self) -> Tensor:
@@ -101,13 +108,12 @@ class Adaptation:
         else:
             chosen, regret = self._carries_most(guess, care * self._doubt_db(band))
         delivered = self.full_bps * (1 - fails.clamp_max(1))
-        snr = band.true.abs().square().mean(1) / noise
 
         def of(table: Tensor, mcs: Tensor) -> np.ndarray:
             return table.gather(1, mcs[:, None])[:, 0].double().numpy()
 
         return Rates(
-            float(10 * snr.median().log10()),
+            10 * math.log10(band.median_power / noise),
             oracle.numpy(),
             chosen.numpy(),
             of(delivered, oracle),

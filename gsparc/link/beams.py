@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+LEAST = 1e-10  # of the gain of the true channel's beam: no beam at all is 100 dB off, not infinitely
+
 
 def gain(true: Tensor, predicted: Tensor) -> Tensor:
     """Power gain over one average antenna, beams from `predicted` (n, A, K): mean over tones (n,), linear."""
@@ -15,5 +17,6 @@ def gain(true: Tensor, predicted: Tensor) -> Tensor:
 
 
 def loss_db(true: Tensor, predicted: Tensor) -> Tensor:
-    """What is lost against beams from the true channel (n,) [dB]."""
-    return 10 * torch.log10(gain(true, true) / gain(true, predicted).clamp_min(1e-30))
+    """What is lost against beams from the true channel (n,) [dB], at most 100; NaN where that is silent."""
+    best = gain(true, true)
+    return 10 * torch.log10(best / torch.maximum(gain(true, predicted), LEAST * best))

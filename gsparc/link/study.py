@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from gsparc.calibration.threshold import binomial_interval
 from gsparc.link.adaptation import Adaptation, Band, Rates, Rule
-from gsparc.link.beams import gain, loss_db
+from gsparc.link.beams import LEAST, gain, loss_db
 from gsparc.link.pusch import Blocks, Pusch
 from gsparc.link.statistics import crossing
 
@@ -33,19 +34,27 @@ class Curve:
 def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
     """`beams/<antennas>/*`: gain of true and predicted beams, and the loss [dB]; 8 and all antennas.
 
+    Positions whose channel is silent have no beam: they are counted in `beams/silent` and left out.
+
     Args:
         true, predicted: (n, A, K).
         accepted: which of the n are.
     """
-    facts: dict[str, Any] = {"beams/positions": len(true)}
-    for count in sorted({min(8, true.shape[1]), true.shape[1]}):
+    few = min(8, true.shape[1])
+    loud = true[:, :few].abs().amax((1, 2)) > 0
+    facts: dict[str, Any] = {"beams/positions": len(true), "beams/silent": int((~loud).sum())}
+    true, predicted, accepted = true[loud], predicted[loud], accepted[loud.numpy()]
+    if not len(true):
+        return facts
+    for count in sorted({few, true.shape[1]}):
         there, guess = true[:, :count], predicted[:, :count]
         loss = loss_db(there, guess).numpy()
-        lost = gain(there, guess).mean() / gain(there, there).mean()
+        best = gain(there, there).mean()
+        own = torch.maximum(gain(there, guess).mean(), LEAST * best)
         facts |= {
-            f"beams/{count}/gain_db": float(10 * gain(there, there).mean().log10()),
-            f"beams/{count}/predicted_gain_db": float(10 * gain(there, guess).mean().log10()),
-            f"beams/{count}/loss_db": float(-10 * lost.log10()),
+            f"beams/{count}/gain_db": float(10 * best.log10()),
+            f"beams/{count}/predicted_gain_db": float(10 * own.log10()),
+            f"beams/{count}/loss_db": float(10 * (best / own).log10()),
             f"beams/{count}/loss_db_mean": float(loss.mean()),
             f"beams/{count}/loss_db_max": float(loss.max()),
             f"beams/{count}/share_losing_more_than_1_db": float((loss > 1).mean()),
@@ -70,11 +79,16 @@ def adapt(
         aside: of others, on which care and backoff are chosen.
         snr_db, settings: see conf/link.yaml.
         tick: called after each level.
+
+    Raises:
+        ValueError: every position is silent.
     """
     loop = Adaptation(
         float(settings["bler_target"]), int(settings["subcarriers"]), float(settings["symbols_per_s"])
     )
-    median = float(band.true.abs().square().mean(1).median())
+    median = band.median_power
+    if median <= 0:
+        raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
     noises = [median / 10 ** (level / 10) for level in snr_db]
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
     carried = {
@@ -113,9 +127,9 @@ def _rates_of(one: Rates, room: str, accepted: np.ndarray, score: np.ndarray) ->
         f"{room}/oracle_mbps": one.oracle_bps.mean() / 1e6,
         f"{room}/best_mbps": one.best_bps.mean() / 1e6,
         f"{room}/chosen_mbps": one.chosen_bps.mean() / 1e6,
-        f"{room}/shortfall": 1 - one.chosen_bps.mean() / one.oracle_bps.mean(),
-        f"{room}/shortfall_best": 1 - one.chosen_bps.mean() / one.best_bps.mean(),
-        f"{room}/shortfall_with_fallback": 1 - together.mean() / one.oracle_bps.mean(),
+        f"{room}/shortfall": _shortfall(one.chosen_bps, one.oracle_bps),
+        f"{room}/shortfall_best": _shortfall(one.chosen_bps, one.best_bps),
+        f"{room}/shortfall_with_fallback": _shortfall(together, one.oracle_bps),
         f"{room}/exact": float((miss == 0).mean()),
         f"{room}/off_by_more_than_2": float((miss > 2).mean()),
         f"{room}/tbler": float(one.fails.mean()),
@@ -124,35 +138,38 @@ def _rates_of(one: Rates, room: str, accepted: np.ndarray, score: np.ndarray) ->
     }
     for share in (0.5, 0.7, 0.9):
         surest = score >= np.quantile(score, 1 - share)
-        short = 1 - one.chosen_bps[surest].mean() / one.oracle_bps[surest].mean()
+        short = _shortfall(one.chosen_bps[surest], one.oracle_bps[surest])
         facts[f"{room}/shortfall_surest_{share:.0%}"] = short
     if np.isfinite(one.regret_bps).all():
         facts |= _by_regret(one, room)
     if accepted.any():
-        oracle, best = one.oracle_bps[accepted].mean(), one.best_bps[accepted].mean()
-        taken = one.chosen_bps[accepted].mean()
+        taken = one.chosen_bps[accepted]
         facts |= {
-            f"{room}/shortfall_accepted": 1 - taken / oracle,
-            f"{room}/shortfall_best_accepted": 1 - taken / best,
+            f"{room}/shortfall_accepted": _shortfall(taken, one.oracle_bps[accepted]),
+            f"{room}/shortfall_best_accepted": _shortfall(taken, one.best_bps[accepted]),
             f"{room}/tbler_accepted": float(one.fails[accepted].mean()),
             f"{room}/off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
         }
     return facts
 
 
-def _by_regret(one: Rates, room: str) -> dict[str, float]:
+def _shortfall(taken: np.ndarray, oracle: np.ndarray) -> float | None:
+    """Share of the oracle's throughput that is missed; None where nothing can be carried."""
+    return float(1 - taken.mean() / oracle.mean()) if len(oracle) and oracle.mean() > 0 else None
+
+
+def _by_regret(one: Rates, room: str) -> dict[str, float | None]:
     """`shortfall_calm_<share>`: of the positions whose choice is expected to miss least; `..._fallback`: of
     all positions when the others send pilots. What a rate needs to know is not how large an error is, but
     whether it crosses a step."""
-    facts: dict[str, float] = {}
+    facts: dict[str, float | None] = {}
     order = np.argsort(one.regret_bps, kind="stable")
     for share in np.arange(0.3, 1.01, 0.1):
         calm = np.zeros(len(order), bool)
         calm[order[: round(share * len(order))]] = True
-        together = np.where(calm, one.chosen_bps, one.oracle_bps).mean()
-        taken, oracle = one.chosen_bps[calm].mean(), one.oracle_bps[calm].mean()
-        facts[f"{room}/shortfall_calm_{share:.0%}"] = 1 - taken / oracle if oracle > 0 else 0.0
-        facts[f"{room}/shortfall_calm_{share:.0%}_fallback"] = 1 - together / one.oracle_bps.mean()
+        together = np.where(calm, one.chosen_bps, one.oracle_bps)
+        facts[f"{room}/shortfall_calm_{share:.0%}"] = _shortfall(one.chosen_bps[calm], one.oracle_bps[calm])
+        facts[f"{room}/shortfall_calm_{share:.0%}_fallback"] = _shortfall(together, one.oracle_bps)
     return facts
 
 

@@ -24,7 +24,7 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
             f"{level:g}",
             f"{facts[f'{room}/oracle_mbps']:.1f}",
             f"{facts[f'{room}/chosen_mbps']:.1f}",
-            f"{facts[f'{room}/shortfall']:.1%}",
+            _shown(facts[f"{room}/shortfall"], ".1%"),
             _shown(facts.get(f"{room}/shortfall_accepted"), ".1%"),
             f"{facts[f'{room}/tbler']:.1%}",
             f"{facts[f'{room}/outage']:.1%}",

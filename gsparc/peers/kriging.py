@@ -23,6 +23,7 @@ from gsparc.peers.encoding import entry_variance, to_real
 from gsparc.peers.interpolation import Interpolator
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
+SILENCE = 1e-36  # power of a channel where none was measured, in stored units: it has no decibels
 BINS = 24
 PAIRS = 200_000  # looked at for the variogram
 SIDE = 2048  # pixels of an image looked at for it
@@ -107,7 +108,8 @@ class Kriging(Interpolator):
         assert self.site is not None
         if self._complex:
             power = np.abs(targets.reshape(len(targets), -1)) ** 2
-            return 10 * np.log10(np.maximum(power, power.mean() * 1e-8)).astype(np.float32)
+            floor = max(float(power.mean()) * 1e-8, SILENCE)
+            return 10 * np.log10(np.maximum(power, floor)).astype(np.float32)
         rows = to_real(targets, self.site.kind)
         if self.site.kind == "rssi":
             return rows  # already decibels

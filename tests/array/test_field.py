@@ -76,6 +76,30 @@ def test_packets_know_nothing_far_away():
     assert torch.equal(out[:, :4], torch.zeros_like(out[:, :4])) and (out[:, 4] == 1).all()
 
 
+@pytest.mark.parametrize("extent,wavelength", [(3.0, 0.33), (10.0, 0.0107), (100.0, 0.125), (100.0, 0.005)])
+def test_packets_far_from_the_middle_are_as_good_as_float64(extent, wavelength):
+    """The exponent is a difference of squares of site / width: in float32 off by 0.6, or infinite."""
+    rng = np.random.default_rng(0)
+    widths = np.resize([0.2, 0.4, 0.8], 60) * wavelength
+    centres, waves = rng.uniform(-extent / 2, extent / 2, (60, 3)), rng.normal(size=(60, 3)) / widths[:, None]
+    parts = [torch.from_numpy(part) for part in (centres, widths, waves, np.zeros(3))]
+    x = (centres + 0.3 * widths[:, None] * rng.normal(size=(60, 3))).astype(np.float32)
+    away = x[:, None].astype(np.float64) - centres
+    window = np.exp(-0.5 * (away**2).sum(-1) / widths**2)
+    phase = (away * waves).sum(-1)
+    found = WavePackets(*parts, elements=4).features(torch.from_numpy(x)).numpy()
+    wanted = np.concatenate([window * np.cos(phase), window * np.sin(phase)], 1)
+    assert np.abs(wanted).max() > 0.5 and np.abs(found - wanted).max() < 1e-5
+
+
+def test_antennas_at_one_place_are_no_array(tmp_path):
+    """A Fourier transform of no lags ended in the library's words."""
+    site = array_site(SphereGrid.hemisphere(4, 6), np.zeros((4, 3)))
+    data = measure(site, walk(12), np.ones((12, 4), complex))
+    with pytest.raises(ValueError, match="all antennas of the declared array are at one place"):
+        ArrayField(cache=False).fit(data, _fold(12), tmp_path)
+
+
 def test_packets_slopes():
     c, w = torch.rand(6, 3).double(), torch.randn(6, 3).double()
     packets = WavePackets(c, torch.full((6,), 0.3).double(), w, torch.zeros(3), 2).double()

@@ -1,5 +1,7 @@
 """The method end to end on rooms whose every source is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +13,7 @@ from gsparc.coherent.pictures import plot_visibility
 from gsparc.coherent.rows import gather
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.splits import Fold
+from gsparc.effects import probe_phase
 from gsparc.registry import method_class
 
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0}
@@ -229,3 +232,13 @@ def learned_and_true_visibility(method, told, data, index, most=6):
             seen.append(told.visible[index, i])
             names.append(f"image {told.images.cell[i].tolist()}")
     return np.stack(learned, 1), np.stack(seen, 1), names
+
+
+def test_silent_training_channels_are_refused_in_words(tmp_path):
+    """The library's words about a matrix that is not positive definite came; `auto` takes the plain field."""
+    _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
+    silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
+    with pytest.raises(ValueError, match="every channel to learn from is silent"):
+        VirtualSourceGP(**QUICK).fit(silent, fold, tmp_path)
+    decision = probe_phase(VirtualSourceGP(**QUICK), method_class("gp")(), silent, fold, 0)
+    assert not decision.on and "silent" in decision.reason

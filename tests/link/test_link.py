@@ -12,10 +12,12 @@ from cities import city, fold
 
 from gsparc import checkpoint, load
 from gsparc.calibration.threshold import binomial_interval
+from gsparc.link.adaptation import Rates
 from gsparc.link.beams import gain, loss_db
 from gsparc.link.channels import truth
 from gsparc.link.grid import centred, interpolated, resource_grid
 from gsparc.link.statistics import crossing
+from gsparc.link.study import beam_facts, rate_facts
 from gsparc.uplink.method import UplinkField
 from gsparc.uplink.search import SearchSettings
 
@@ -70,6 +72,30 @@ def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
     noise = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
     # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
     assert abs(float(loss_db(true, true + noise).mean()) - 3.0) < 0.3
+
+
+def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
+    """A prediction of exactly 0, or one silent test channel, ended the command: -inf is no figure."""
+    true = torch.randn(4, 2, 3, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    silent = true.clone()
+    silent[1] = 0
+    nothing = beam_facts(true, torch.zeros_like(true), np.ones(4, bool))
+    assert nothing["beams/2/loss_db"] == pytest.approx(100) == nothing["beams/2/loss_db_mean"]
+    some = beam_facts(silent, silent, np.array([False, True, False, False]))
+    assert some["beams/silent"] == 1 and some["beams/2/loss_db_max"] == pytest.approx(0, abs=1e-5)
+    assert some["beams/2/loss_db_accepted"] is None
+    assert beam_facts(0 * true, true, np.ones(4, bool)) == {"beams/positions": 4, "beams/silent": 4}
+    for facts in (nothing, some):
+        assert all(value is None or np.isfinite(value) for value in facts.values())
+
+
+def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
+    """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
+    none = np.zeros(2)
+    rates = Rates(-50.0, none, none, none, none, none, none + 1, none, none == 0, 0.0)
+    facts = rate_facts({"expected": [rates]}, np.array([True, False]), np.array([0.2, 0.4]))
+    assert facts["mcs/-50dB/shortfall"] is None and facts["mcs/-50dB/shortfall_calm_30%"] is None
+    assert all(value is None or np.isfinite(value) for value in facts.values())
 
 
 def test_crossing_and_intervals() -> None:

@@ -179,3 +179,12 @@ def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
     method._solve()
     there = method.predict(rows.tx, rows.rx).mean
     assert torch.allclose(there, rows.target, atol=1e-2 * float(rows.target.abs().max()))
+
+
+def test_kriging_of_silent_training_channels_is_silent(tmp_path, campaign, folds):
+    """Silence has no decibels: a traceback about infinities came."""
+    data, fold = campaign("csi", 40), folds(40).folds[0]
+    data.target[np.concatenate([fold.train, fold.val])] = 0
+    method = fitted("kriging", data, fold, tmp_path)
+    batch = data.batch(fold.test)
+    assert method.predict(batch.tx, batch.rx).mean.abs().max() < 1e-15
