@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsparc.metrics import score_of
-from gsparc.report.runs import Run
+from gsparc.report.runs import Run, number
 from gsparc.report.table import Column, Table
-from gsparc.report.tables import FORMS, HEADS, number
+from gsparc.report.tables import FORMS, HEADS
 
 MINUTES = (1, 2, 5, 10)
 

@@ -15,7 +15,7 @@ from jinja2 import Environment
 from PIL import Image
 
 from gsparc.report import effects, learning, plots, tables
-from gsparc.report.runs import Run, told_apart
+from gsparc.report.runs import Run, by_study, told_apart
 from gsparc.report.table import Table
 from gsparc.summary import BUSY, remarks
 
@@ -49,12 +49,9 @@ def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarra
         runs: of any datasets.
         fronts: `tradeoff.csv` by column, each with the name of its dataset.
     """
-    by_study: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        by_study.setdefault(run.study, []).append(run)
     return [
         _study(f"{dataset}, split {split}", group, [columns for name, columns in fronts if name == dataset])
-        for (dataset, split), group in by_study.items()
+        for (dataset, split), group in by_study(runs).items()
     ]
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.report.runs import Run
+from gsparc.report.runs import Run, by_study
 from gsparc.report.table import Table
 from gsparc.report.tables import results, seeds
 
@@ -37,10 +37,8 @@ def refresh(path: Path, runs: Sequence[Run]) -> None:
 
 def tables(runs: Sequence[Run]) -> str:
     """A short table per study: settings over seeds, then the baselines."""
-    by_study: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        by_study.setdefault(run.study, []).append(run)
-    return "\n".join(_short(f"{name}, split {split}", group) for (name, split), group in by_study.items())
+    groups = by_study(runs).items()
+    return "\n".join(_short(f"{name}, split {split}", group) for (name, split), group in groups)
 
 
 def _short(title: str, runs: Sequence[Run]) -> str:

@@ -68,15 +68,15 @@ class Run:
         return str(self.facts.get("dataset/name")), str(self.facts.get("split/name"))
 
     def figure_of(self, name: str) -> float | None:
-        """A test figure; `render_ms` measured alone wins over the one of the busy sweep."""
-        return _number(self.facts.get(f"test/{name}"))
+        """A test figure; None where it is absent or undefined."""
+        return number(self.facts.get(f"test/{name}"))
 
     @property
     def latency(self) -> tuple[float | None, float | None]:
-        """Median and 95th percentile of single queries [ms]."""
+        """Median and 95th percentile of single queries [ms]; those measured alone, where they were."""
         if len(self.render_ms):
             return float(np.median(self.render_ms)), float(np.quantile(self.render_ms, 0.95))
-        return _number(self.facts.get("time/render_ms_p50")), _number(self.facts.get("time/render_ms_p95"))
+        return number(self.facts.get("time/render_ms_p50")), number(self.facts.get("time/render_ms_p95"))
 
     @property
     def measured(self) -> int:
@@ -127,6 +127,14 @@ def _simulated(files: Iterable[Path]) -> dict[str, float]:
         for facts in every
         if "time/total_s" in facts and "dataset/receivers" in facts
     }
+
+
+def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
+    """Runs whose figures can be compared, by dataset and split, in order of appearance."""
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault(run.study, []).append(run)
+    return groups
 
 
 def told_apart(runs: Sequence[Run]) -> list[Run]:
@@ -189,5 +197,6 @@ def _overrides(path: Path) -> tuple[str, ...]:
     return tuple(str(line) for line in yaml.safe_load(path.read_text(encoding="utf-8")) or ())
 
 
-def _number(value: Any) -> float | None:
+def number(value: object) -> float | None:
+    """As a float, None for anything that is no number."""
     return float(value) if isinstance(value, (int, float)) else None

@@ -69,7 +69,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
     from gsparc.report import plots
     from gsparc.report.page import studies, write
-    from gsparc.report.runs import find_runs, told_apart
+    from gsparc.report.runs import by_study, find_runs, told_apart
     from gsparc.report.tables import seeds
     from gsparc.report.timing import retime
 
@@ -79,10 +79,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     origin = provenance()
     write(folder, title, f"{len(runs)} runs at commit {str(origin['git'])[:8]}", studies(runs))
     facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
-    by_study: dict[tuple[str, str], list] = {}
-    for run in runs:
-        by_study.setdefault(run.study, []).append(run)
-    for number, (study, together) in enumerate(by_study.items()):
+    for number, (study, together) in enumerate(by_study(runs).items()):
         group = told_apart(together)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = seeds(group)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gsparc.report.intervals import Interval, interval, over_seeds
-from gsparc.report.runs import PER_SAMPLE, SIDE, Run
+from gsparc.report.runs import PER_SAMPLE, SIDE, Run, number
 from gsparc.report.table import Column, Table
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
@@ -140,8 +140,3 @@ def worst(runs: Sequence[Run]) -> Table:
 def _over(values: Sequence[float | None]) -> Interval | None:
     known = [v for v in values if v is not None]
     return over_seeds(known) if known else None
-
-
-def number(value: object) -> float | None:
-    """As a float, None for anything that is no number."""
-    return float(value) if isinstance(value, (int, float)) else None
