@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc import checkpoint
+from gsparc.atomic import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.method import Method
@@ -113,11 +113,8 @@ def _stored_scores(path: Path) -> Scores | None:
 
 
 def _store_scores(path: Path, scores: Scores) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial = tempfile.mkstemp(suffix=".npz", dir=path.parent)
-    with os.fdopen(handle, "wb") as file:
+    with whole_file(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **scores.arrays())
-    os.replace(partial, path)
 
 
 def mean_seconds(seconds: Sequence[float]) -> float:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import platform
 import subprocess
 from collections.abc import Mapping
@@ -15,6 +14,8 @@ from typing import Any
 
 import numpy as np
 from rich.table import Table
+
+from gsparc.atomic import whole_file
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 
@@ -28,7 +29,8 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
         ValueError: a value is not a number, a string or None, or is NaN or infinite; the key is named.
     """
     text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
-    _replace(Path(path), text + "\n")
+    with whole_file(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
 
 
 def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
@@ -36,14 +38,10 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns of different lengths: {lengths}")
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as partial, partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows([_cell(v) for v in row] for row in zip(*columns.values(), strict=True))
-    os.replace(partial, path)
 
 
 def provenance() -> dict[str, str | None]:
@@ -127,16 +125,6 @@ def _value(key: str, value: Any) -> int | float | str | None:
 
 def _cell(value: Any) -> Any:
     return "" if isinstance(value, (float, np.floating)) and math.isnan(value) else value
-
-
-def _replace(path: Path, text: str) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
 
 
 def _git() -> str | None:

@@ -6,13 +6,13 @@ import difflib
 import hashlib
 import json
 import logging
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.atomic import whole_file
 from gsparc.data.errors import DataError
 
 log = logging.getLogger(__name__)
@@ -197,11 +197,8 @@ def write_split(path: str | Path, split: Split, rows: int, dataset_sha256: str =
         "sha256": split.sha256,
         "folds": [{k: getattr(f, k).tolist() for k in ("train", "val", "test")} for f in split.folds],
     }
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
 
 
 def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
-import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, fields
@@ -14,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from gsparc.atomic import whole_file
 from gsparc.data.assemble import content_hash
 from gsparc.data.errors import DataError
 from gsparc.encoder.autoencoder import Autoencoder, EncoderSettings, train
@@ -26,17 +25,14 @@ FORMAT = "gsparc-encoder-1"
 
 def save(path: Path, model: Autoencoder) -> None:
     """Write an encoder atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     content = {
         "format": FORMAT,
         "settings": asdict(model.settings),
         "width": len(model.mean),
         "model": model.state_dict(),
     }
-    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-    with os.fdopen(handle, "wb") as file:
-        torch.save(content, file)
-    os.replace(partial, path)
+    with whole_file(path) as partial:
+        torch.save(content, partial)
 
 
 def load(path: str | Path) -> Autoencoder:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from gsparc.atomic import whole_file
 from gsparc.report.runs import Run, by_study
 from gsparc.report.table import Table
 from gsparc.report.tables import results, seeds
@@ -30,9 +30,8 @@ def refresh(path: Path, runs: Sequence[Run]) -> None:
     _, end, after = rest.partition(END)
     if not begin or not end:
         raise ValueError(f"{path}: the lines {BEGIN} and {END} are needed, in this order")
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(f"{before}{BEGIN}\n\n{tables(runs)}\n{END}{after}", encoding="utf-8")
-    os.replace(partial, path)
+    with whole_file(path) as partial:
+        partial.write_text(f"{before}{BEGIN}\n\n{tables(runs)}\n{END}{after}", encoding="utf-8")
 
 
 def tables(runs: Sequence[Run]) -> str:

@@ -8,14 +8,13 @@ release's files (`csidata.npy` of 8 antennas, `base-station.yml`) there are all 
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+from gsparc.atomic import whole_folder
 from gsparc.simulate.streets import LIGHT, Rays, Streets, trace
 
 STAND_IN = "argos-sim"  # `dataset_name` of the simulated replacement
@@ -151,35 +150,29 @@ def write_argos_sim(
     """Write `count` snapshots in the release's layout; the folder must not exist."""
     truth = world(count, seed, scatterers)
     measured = snapshots(truth, offsets, seed)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    partial.mkdir(parents=True)
-    np.save(partial / "csidata.npy", measured[:, :SIDE])
-    np.save(partial / "csidata-64.npy", measured)
-    np.save(partial / "positions.npy", truth.users)
-    description = {
-        "dataset_name": STAND_IN,
-        "carrier_hz": CARRIER_HZ,
-        "spacing_hz": SPACING_HZ,
-        "tones": TONES.tolist(),
-        "noise_power": truth.noise_power,
-        "base_station": (scene(seed).base + array()[:SIDE]).round(6).tolist(),
-        "base_station_64": (scene(seed).base + array()).round(6).tolist(),
-        "count": count,
-        "seed": seed,
-        "scatterers": scatterers,
-    }
-    (partial / "base-station.yml").write_text(yaml.safe_dump(description, sort_keys=False), encoding="utf-8")
-    order = np.random.default_rng(seed).permutation(count)
-    test = max(round(0.2 * count), 1)
-    for name, rows in (("test", order[:test]), ("train", order[test:])):
-        np.savetxt(partial / f"{name}_index.txt", np.sort(rows), fmt="%d")
-    try:
-        os.rename(partial, folder)
-    except OSError:
-        # Another run made the same folder meanwhile; the content is the same by construction.
-        shutil.rmtree(partial)
-        if not folder.is_dir():
-            raise
+    with whole_folder(folder) as partial:
+        np.save(partial / "csidata.npy", measured[:, :SIDE])
+        np.save(partial / "csidata-64.npy", measured)
+        np.save(partial / "positions.npy", truth.users)
+        description = {
+            "dataset_name": STAND_IN,
+            "carrier_hz": CARRIER_HZ,
+            "spacing_hz": SPACING_HZ,
+            "tones": TONES.tolist(),
+            "noise_power": truth.noise_power,
+            "base_station": (scene(seed).base + array()[:SIDE]).round(6).tolist(),
+            "base_station_64": (scene(seed).base + array()).round(6).tolist(),
+            "count": count,
+            "seed": seed,
+            "scatterers": scatterers,
+        }
+        (partial / "base-station.yml").write_text(
+            yaml.safe_dump(description, sort_keys=False), encoding="utf-8"
+        )
+        order = np.random.default_rng(seed).permutation(count)
+        test = max(round(0.2 * count), 1)
+        for name, rows in (("test", order[:test]), ("train", order[test:])):
+            np.savetxt(partial / f"{name}_index.txt", np.sort(rows), fmt="%d")
 
 
 def ensure_argos_sim(

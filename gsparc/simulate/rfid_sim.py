@@ -7,8 +7,6 @@ image is `|A^H h|` over the hemisphere divided by its maximum, in 8 bits.
 
 from __future__ import annotations
 
-import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +15,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from gsparc.atomic import whole_folder
 from gsparc.data.rfid import HEIGHT, LIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace
@@ -90,34 +89,27 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     """Write `count` spectra in the release's layout; the folder must not exist."""
     positions = hand_moved(count, seed)
     vectors = simulate_rfid(positions, seed)
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
-    (partial / "spectrum").mkdir(parents=True)
-    matrix = steering(planar_array(), SphereGrid.hemisphere(HEIGHT, WIDTH), WAVELENGTH)
-    for i, vector in enumerate(vectors):
-        image = bartlett(vector, matrix).reshape(HEIGHT, WIDTH)
-        grey = np.round(255 * image / image.max()).astype(np.uint8)
-        Image.fromarray(grey).save(partial / "spectrum" / f"{i + 1:05d}.png", compress_level=1)
-    lines = ["x,y,z", *(",".join(f"{v:.4f}" for v in p) for p in positions)]
-    (partial / "tx_pos.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (partial / "gateway_info.yml").write_text(
-        f"dataset_name: {STAND_IN}\n"
-        "gateway1:\n"
-        f"  position: {GATEWAY.tolist()}\n"
-        f"  orientation: {ORIENTATION.tolist()}  # quaternion, scalar last\n",
-        encoding="utf-8",
-    )
-    order = np.random.default_rng(seed).permutation(count)
-    test = max(round(0.2 * count), 1)
-    for name, rows in (("test", order[:test]), ("train", order[test:])):
-        text = "".join(f"{i + 1:05d}\n" for i in np.sort(rows))
-        (partial / f"{name}_index.txt").write_text(text, encoding="utf-8")
-    try:
-        os.rename(partial, folder)
-    except OSError:
-        # Another run made the same folder meanwhile; the content is the same by construction.
-        shutil.rmtree(partial)
-        if not folder.is_dir():
-            raise
+    with whole_folder(folder) as partial:
+        (partial / "spectrum").mkdir()
+        matrix = steering(planar_array(), SphereGrid.hemisphere(HEIGHT, WIDTH), WAVELENGTH)
+        for i, vector in enumerate(vectors):
+            image = bartlett(vector, matrix).reshape(HEIGHT, WIDTH)
+            grey = np.round(255 * image / image.max()).astype(np.uint8)
+            Image.fromarray(grey).save(partial / "spectrum" / f"{i + 1:05d}.png", compress_level=1)
+        lines = ["x,y,z", *(",".join(f"{v:.4f}" for v in p) for p in positions)]
+        (partial / "tx_pos.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (partial / "gateway_info.yml").write_text(
+            f"dataset_name: {STAND_IN}\n"
+            "gateway1:\n"
+            f"  position: {GATEWAY.tolist()}\n"
+            f"  orientation: {ORIENTATION.tolist()}  # quaternion, scalar last\n",
+            encoding="utf-8",
+        )
+        order = np.random.default_rng(seed).permutation(count)
+        test = max(round(0.2 * count), 1)
+        for name, rows in (("test", order[:test]), ("train", order[test:])):
+            text = "".join(f"{i + 1:05d}\n" for i in np.sort(rows))
+            (partial / f"{name}_index.txt").write_text(text, encoding="utf-8")
 
 
 def ensure_rfid_sim(parent: Path, count: int = 640, seed: int = 0) -> Path:

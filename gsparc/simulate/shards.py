@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.atomic import whole_file
+
 
 class Shards:
     """The folder `FILE.parts` beside a dataset that is being made.
@@ -61,12 +63,8 @@ class Shards:
 
     def put(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a shard, whole or not at all."""
-        partial = self.path(number).with_suffix(".partial")
-        with partial.open("wb") as file:
+        with whole_file(self.path(number)) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, self.path(number))
 
     def get(self, number: int) -> dict[str, np.ndarray]:
         """The arrays of a finished shard."""
@@ -86,6 +84,5 @@ class Shards:
 
 
 def _write(path: Path, content: bytes) -> None:
-    partial = path.with_suffix(".partial")
-    partial.write_bytes(content)
-    os.replace(partial, path)
+    with whole_file(path) as partial:
+        partial.write_bytes(content)
