@@ -8,9 +8,9 @@ import numpy as np
 import torch
 
 from gsparc.array.render import spectra
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.ops import SphereGrid
-from gsparc.simulate.shoebox import LIGHT, Room, trace
+from gsparc.simulate.shoebox import Room, trace
 
 WAVELENGTH = 0.3259
 RECEIVER = np.array([6.0, 2.0, 1.0])

@@ -1,7 +1,7 @@
 """Measurements of one's own, and what our simulators write: one documented schema, npz or HDF5.
 
-docs/own-data.md is this schema for people; `fields.py` is its table. `read` says what a file means or
-everything that is wrong with it, `load_own` is its strict form, `write_own` refuses what `load_own` would.
+docs/own-data.md is this schema for people; `fields.py` is its table. `interpret` says what arrays mean or
+everything that is wrong with them, `load_own` is its strict form, `write_own` refuses what `load_own` would.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import Kind, Measurements
+from gsparc.data.schema import LIGHT, Kind, Measurements
 from gsparc.losses import holds_window
 
 log = logging.getLogger(__name__)
@@ -297,7 +297,7 @@ def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) ->
     if carrier_hz is None:
         return
     thickness = float(np.sqrt(np.linalg.eigvalsh(np.cov(moving.T))[0].clip(0)))
-    wavelength = 299_792_458.0 / carrier_hz
+    wavelength = LIGHT / carrier_hz
     if thickness < wavelength / 4:
         check.notes.append(
             f"the positions spread only {thickness:.2g} m ({thickness / wavelength:.2g} wavelengths) about a "

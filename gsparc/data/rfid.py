@@ -9,7 +9,6 @@ train_index.txt, test_index.txt   optional, both or none: one number per line
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -20,12 +19,11 @@ from PIL import Image
 from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.rotation import quaternion_to_matrix
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; the release's spectra themselves say 0.3258 to 0.3260
-LIGHT = 299_792_458.0  # [m/s]
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
@@ -284,11 +282,3 @@ def describe_missing(root: str | Path | None) -> str:
         "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
         "then say dataset.root=DIR."
     )
-
-
-def boresight_degrees(data: Measurements) -> tuple[np.ndarray, np.ndarray]:
-    """Elevation and azimuth (S,), (S,) [degrees] of the transmitters seen from the receiver."""
-    local = np.einsum("sji,sj->si", data.rx_rotation, data.tx - data.rx_position)
-    elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
-    azimuth = np.arctan2(local[:, 1], local[:, 0])
-    return np.degrees(elevation), np.degrees(azimuth) % math.degrees(2 * math.pi)

@@ -12,6 +12,7 @@ from torch import Tensor
 from gsparc.ops import Pose, SphereGrid
 
 Kind = Literal["spectrum", "csi", "rssi"]
+LIGHT = 299_792_458.0  # [m/s]
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,7 @@ class Site:
     @property
     def wavelength(self) -> float | None:
         """Carrier wavelength [m]; None when the carrier is unknown."""
-        return None if self.carrier_hz is None else 299_792_458.0 / self.carrier_hz
+        return None if self.carrier_hz is None else LIGHT / self.carrier_hz
 
 
 @dataclass(frozen=True)

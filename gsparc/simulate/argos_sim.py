@@ -15,7 +15,8 @@ import numpy as np
 import yaml
 
 from gsparc.atomic import whole_folder
-from gsparc.simulate.streets import LIGHT, Rays, Streets, trace
+from gsparc.data.schema import LIGHT
+from gsparc.simulate.streets import Rays, Streets, trace
 
 STAND_IN = "argos-sim"  # `dataset_name` of the simulated replacement
 CARRIER_HZ = 2.4e9

@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.schema import LIGHT
 from gsparc.simulate.effects import SPECULAR, Effects
 from gsparc.simulate.paths import Paths
-from gsparc.simulate.shoebox import LIGHT, Room, images, visible
+from gsparc.simulate.shoebox import Room, images, visible
 
 
 class Mirrors:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
 from gsparc.simulate.paths import ARRAYS, Paths, join
@@ -78,7 +79,7 @@ class RayTracer:
     ) -> None:
         self.library = llvm.prepare()
         self.sampling = sampling
-        self.wavelength = 299_792_458.0 / carrier_hz
+        self.wavelength = LIGHT / carrier_hz
         self._scene = _load(source, carrier_hz, scattering)
         self.transmitter = np.asarray(transmitter, dtype=np.float64)
         self._ports = 0

@@ -16,7 +16,8 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from gsparc.atomic import whole_folder
-from gsparc.data.rfid import HEIGHT, LIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
+from gsparc.data.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
+from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace
 

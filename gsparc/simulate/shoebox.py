@@ -12,7 +12,8 @@ from itertools import product
 
 import numpy as np
 
-LIGHT = 299_792_458.0  # [m/s]
+from gsparc.data.schema import LIGHT
+
 WALLS = ("x_low", "x_high", "y_low", "y_high", "z_low", "z_high")
 
 

@@ -14,7 +14,8 @@ from itertools import pairwise, product
 
 import numpy as np
 
-LIGHT = 299_792_458.0  # [m/s]
+from gsparc.data.schema import LIGHT
+
 SHRINK = 1e-6  # [m]; a reflection point on a wall does not lie inside the building
 LEAST_BEND = 0.1  # [rad]; Keller's coefficient has a pole on the shadow boundary
 

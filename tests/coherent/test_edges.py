@@ -11,7 +11,7 @@ from gsparc.coherent.edges import Edges, diffracted, edge_wave
 from gsparc.coherent.sources import SourceKind, box_of, kinds
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.own import from_arrays
-from gsparc.simulate.shoebox import LIGHT
+from gsparc.data.schema import LIGHT
 
 EDGE = torch.tensor([[1.9, 1.3, 1.0]], dtype=torch.float64)
 UP = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)

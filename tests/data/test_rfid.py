@@ -3,9 +3,10 @@ import logging
 import numpy as np
 import pytest
 import torch
+from poses import boresight_degrees
 
 from gsparc.data.load import load
-from gsparc.data.rfid import WAVELENGTH, boresight_degrees, load_rfid, planar_array
+from gsparc.data.rfid import WAVELENGTH, load_rfid, planar_array
 
 
 def test_tiny_folder(rfid_folder):

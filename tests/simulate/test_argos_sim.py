@@ -6,8 +6,9 @@ import numpy as np
 import yaml
 from cities import COUNT, folder
 
+from gsparc.data.schema import LIGHT
 from gsparc.simulate.argos_sim import CARRIER_HZ, SPACING_HZ, TONES, Offsets, snapshots, world
-from gsparc.simulate.streets import LIGHT, Streets, trace
+from gsparc.simulate.streets import Streets, trace
 
 
 def _street(buildings: list, **more) -> Streets:

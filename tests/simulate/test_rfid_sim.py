@@ -2,8 +2,10 @@ import hashlib
 
 import numpy as np
 import torch
+from poses import boresight_degrees
 
-from gsparc.data.rfid import HEIGHT, LIGHT, WAVELENGTH, WIDTH, boresight_degrees, load_rfid, planar_array
+from gsparc.data.rfid import HEIGHT, WAVELENGTH, WIDTH, load_rfid, planar_array
+from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
 from gsparc.simulate.rfid_sim import HAND_BOX, bartlett, ensure_rfid_sim, hand_moved, steering
 

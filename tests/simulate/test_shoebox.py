@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from gsparc.data.own import from_arrays, load_own, write_own
-from gsparc.simulate.shoebox import LIGHT, Room, images, scatter, trace, visible
+from gsparc.data.schema import LIGHT
+from gsparc.simulate.shoebox import Room, images, scatter, trace, visible
 
 ROOM = Room(
     lower=np.array([-1.0, 0.5, 0.0]),
