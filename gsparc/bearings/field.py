@@ -34,9 +34,7 @@ log = logging.getLogger(__name__)
 
 CHOOSING = 128  # components that kernels are chosen with
 POOR = 0.02  # share of the energy that lags may leave of a spectrum that the array really measured
-LEAST_GAIN = (
-    0.005  # of the left-out error: searches end when the last `PATIENCE` of them gained less together
-)
+LEAST_GAIN = 0.005  # of the left-out error: searches end when the last of them gained less
 PATIENCE = 3
 LAST = 0.8  # share of a budget after which no search may end
 

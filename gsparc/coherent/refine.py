@@ -14,9 +14,8 @@ from gsparc.coherent.process import JITTER, Factor, Posterior, Scene, add_covari
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, View
 
-REFRESH = (
-    16  # steps between two evaluations of the visibility: sources move millimetres, it varies in decimetres
-)
+# Steps between two evaluations of the visibility: sources move millimetres, it varies in decimetres.
+REFRESH = 16
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,8 @@ from gsparc.data.errors import DataError
 log = logging.getLogger(__name__)
 
 NAMES = ("random", "grouped", "block", "sparse")
-PATH_STEP_RATIO = (
-    4.0  # rows form a path while their median step is below this many nearest-neighbour distances
-)
+# Rows form a path while their median step is below this many nearest-neighbour distances.
+PATH_STEP_RATIO = 4.0
 
 
 @dataclass(frozen=True)
