@@ -27,7 +27,7 @@ from gsparc.calibration.evidence import (
 from gsparc.calibration.pictures import draw
 from gsparc.calibration.stored import Trusted, keep, threshold_of
 from gsparc.calibration.threshold import Promise
-from gsparc.calibration.trial import Trial, accept, trials
+from gsparc.calibration.trial import How, Trial, accept, divisible, trials
 from gsparc.clock import machine_facts
 from gsparc.data.argos import peers_figures, peers_normalisation
 from gsparc.data.schema import Measurements
@@ -109,7 +109,8 @@ def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[st
         }
     bar = facts["confidence/distance/area"]
     for kind in evidence.scores:
-        facts[f"confidence/{kind}/area_below_distance"] = 1 - facts[f"confidence/{kind}/area"] / bar
+        below = 1 - facts[f"confidence/{kind}/area"] / bar if bar > 0 else None  # nothing to save
+        facts[f"confidence/{kind}/area_below_distance"] = below
     facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
     for trial in found:
         facts |= {
@@ -137,6 +138,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     if config.confidence != "auto" and config.confidence not in evidence.scores:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
     promise = Promise(float(config.limit_db), float(config.alpha), float(config.delta))
+    if not divisible(evidence, "spatial"):
+        log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
+    ways: tuple[How, ...] = ("random", "spatial") if divisible(evidence, "spatial") else ("random",)
     found = [
         trials(
             evidence,
@@ -147,7 +151,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             float(config.apart_m),
             int(config.seed),
         )
-        for how in ("random", "spatial")
+        for how in ways
     ]
     facts = {
         **known,
@@ -184,9 +188,8 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
     for kind in evidence.scores:
         own = {k.rpartition("/")[2]: v for k, v in facts.items() if k.startswith(f"confidence/{kind}/")}
         rank = "-" if own["rank_correlation"] is None else f"{own['rank_correlation']:.2f}"
-        first.add_row(
-            kind, f"{own['area']:.4g}", f"{own['area_below_distance']:.0%}", f"{own['risk_at_70']:.4g}", rank
-        )
+        below = "-" if own["area_below_distance"] is None else f"{own['area_below_distance']:.0%}"
+        first.add_row(kind, f"{own['area']:.4g}", below, f"{own['risk_at_70']:.4g}", rank)
     second = Table(title=f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB")
     for column in (
         "split",

@@ -78,18 +78,44 @@ def divided(
 
     `spatial` deals out whole cells of the plane, so that a test position has no calibrated neighbour but
     across a cell's border.
+
+    Raises:
+        ValueError: too few positions, or patches, for three parts.
     """
-    unit = np.arange(len(evidence)) if how == "random" else cells(evidence.position)
-    order = rng.permutation(unit.max() + 1)
-    first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
+    unit = _units(evidence, how)
+    order = rng.permutation(unit.max(initial=-1) + 1)
+    first, second = _cuts(len(order))
+    if not 0 < first < second < len(order):
+        what = "positions" if how == "random" else "patches of the plane"
+        raise ValueError(
+            f"{len(order)} {what} cannot be parted into those to choose on, to calibrate on and to test on: "
+            f"take more test rows{'' if how == 'random' else ', or spatial=false'}"
+        )
     parts = order[:first], order[first:second], order[second:]
     choose_on, calibrate, test = (np.flatnonzero(np.isin(unit, part)) for part in parts)
     return choose_on, calibrate, test
 
 
+def divisible(evidence: Evidence, how: How) -> bool:
+    """Whether `divided` has three parts to give."""
+    count = int(_units(evidence, how).max(initial=-1)) + 1
+    first, second = _cuts(count)
+    return 0 < first < second < count
+
+
+def _units(evidence: Evidence, how: How) -> np.ndarray:
+    """What each position (n,) is dealt out with: itself, or its patch."""
+    return np.arange(len(evidence)) if how == "random" else cells(evidence.position)
+
+
+def _cuts(count: int) -> tuple[int, int]:
+    first, second = (round(share * count) for share in np.cumsum(SHARES))
+    return first, second
+
+
 def cells(position: np.ndarray) -> np.ndarray:
-    """Which patch of the plane each position (n, 3) lies in: (n,) numbers from 0."""
-    flat = position[:, :2]
+    """Which patch of the plane each position (n, 3) lies in: (n,) numbers from 0; on a plumb line, of it."""
+    flat = position[:, :2] if np.ptp(position[:, :2], axis=0).any() else position[:, [2, 2]]
     low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
     cell = np.minimum((flat - low) / np.where(extent > 0, extent, 1) * CELLS, CELLS - 1).astype(int)
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from gsparc.calibration.__main__ import figures, tables
 from gsparc.calibration.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.calibration.evidence import Evidence, gather, joined
 from gsparc.calibration.threshold import Promise, Threshold, choose, levels_of, spread_out
-from gsparc.calibration.trial import Trial, best_kind, divided, trials
+from gsparc.calibration.trial import Trial, best_kind, cells, divided, divisible, trials
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
@@ -140,3 +143,29 @@ def test_a_picture_of_nobody_accepted(tmp_path) -> None:
     mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
     draw(_evidence(), [mute], "silent", tmp_path / "confidence.png")
     assert (tmp_path / "confidence.png").stat().st_size > 1000
+
+
+def test_few_positions_or_patches_are_refused_in_words() -> None:
+    """Two clusters, or two rows, ended in an index out of bounds."""
+    rng = np.random.default_rng(0)
+    two = _evidence(40)
+    two.position[:] = np.where(np.arange(40)[:, None] < 20, 0.0, 5.0)
+    assert divisible(two, "random") and not divisible(two, "spatial")
+    with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
+        divided(two, "spatial", rng)
+    with pytest.raises(ValueError, match="2 positions cannot be parted"):
+        divided(two.at(np.arange(2)), "random", rng)
+
+
+def test_positions_on_a_plumb_line_have_patches() -> None:
+    upright = _evidence(60)
+    upright.position[:, :2] = 1.0
+    assert divisible(upright, "spatial") and len(np.unique(cells(upright.position))) == 6
+
+
+def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
+    """Predictions without any error: 0 / 0 ended the command."""
+    exact = replace(_evidence(30), error=np.zeros(30))
+    facts = figures(exact, [], Promise())
+    assert facts["confidence/learned/area_below_distance"] is None
+    assert tables(facts | {"dataset/name": "d", "model/name": "m"}, exact, [])[0].row_count == 2
