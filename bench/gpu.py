@@ -76,6 +76,7 @@ def bench(file: Path) -> None:
     update(file, batch=guarded(lambda: measure.many_poses(10_000, 16, ceilings)))
     update(file, frozen=guarded(lambda: measure.frozen(2_000, ceilings)))
     update(file, emission=guarded(lambda: measure.emission(62_000, 16, ceilings)))
+    update(file, similarity=guarded(lambda: measure.similarity(16, ceilings)))
 
 
 def short() -> None:

@@ -17,6 +17,7 @@ import torch
 from record import guarded, told
 from torch import Tensor
 
+from gsparc.losses import _Kernel, _Similarity, ssim
 from gsparc.ops import (
     Pose,
     SphereGrid,
@@ -371,6 +372,21 @@ def emission(count: int, batch: int, limits: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
+def similarity(batch: int, limits: dict[str, Any]) -> dict[str, Any]:
+    """The structural similarity of a batch with its gradient, ours beside the one written out in torch."""
+    images = torch.rand(2, batch, GRID.height, GRID.width, device="cuda")
+    prediction, target = images[0].requires_grad_(), images[1]
+    steps = {
+        name: lambda kind=kind: torch.autograd.grad(kind.apply(prediction, target).sum(), prediction)
+        for name, kind in (("ours", _Kernel), ("written_out", _Similarity))
+    }
+    found: dict[str, Any] = {name: {"end_to_end": wall_ms(step)} for name, step in steps.items()}
+    # Windows of 11 and 11 taps over five maps and, transposed, over three; images read, a gradient written.
+    pixels = prediction.numel()
+    found["ours"] |= compared(event_ms(steps["ours"]), 12 * pixels, 2 * 22 * 8 * pixels, limits)
+    return found
+
+
 def touch_everything() -> None:
     """Run every kernel once, both projections, one and several poses, few and many channels."""
     model = scene(300)
@@ -387,6 +403,8 @@ def touch_everything() -> None:
         view = freeze(make_plan(*model, origin(), grid, projection=projection), *model, version=0)
         view.render(torch.rand(300, 2, device="cuda"), 0)
         view.render(torch.rand(40, 300, 1, device="cuda"), 0)
+    images = torch.rand(2, 23, 40, device="cuda", requires_grad=True)
+    ssim(images, images.detach().flip(0)).sum().backward()
     shapes = ((300, 19, 24), (300, 24), (300, 24, 2), (300, 2))
     weights = [torch.randn(shape, device="cuda", requires_grad=True) for shape in shapes]
     for samples in (1, 21):

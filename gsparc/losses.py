@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.ops import built
-from gsparc.ops.similarity import similarity_op
+from gsparc.ops.similarity import served, similarity_op
 
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
@@ -57,7 +56,7 @@ class _Similarity(torch.autograd.Function):
 
 
 class _Kernel(torch.autograd.Function):
-    """`_Similarity` in one pass over float32 images in main memory."""
+    """`_Similarity` by a kernel for float32 images."""
 
     @staticmethod
     def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
@@ -124,8 +123,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """
     if not holds_window(prediction):
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
-    single = prediction.dtype == target.dtype == torch.float32
-    kernel = single and prediction.device.type == "cpu" and built.kernels() is not None
+    kernel = prediction.dtype == target.dtype and served(prediction)
     return (_Kernel if kernel else _Similarity).apply(prediction, target)
 
 

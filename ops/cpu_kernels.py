@@ -1,4 +1,4 @@
-"""The operators of operators.py and networks.py by the C++ kernels.
+"""The operators of this package by the C++ kernels.
 
 Tensors go to them as addresses; the caller keeps them alive, and torch's number of threads goes along.
 """
@@ -203,3 +203,16 @@ def _networks(name: str, encoded: Tensor, weight1: Tensor, *rest: Tensor | None)
 
 def _contiguous(*tensors: Tensor) -> list[Tensor]:
     return [tensor.contiguous() for tensor in tensors]
+
+
+def similarity(
+    prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
+) -> tuple[Tensor, Tensor]:
+    """`gsparc::similarity`."""
+    window = torch.tensor(taps, dtype=torch.float32)
+    images = [prediction.contiguous(), target.contiguous()]
+    value, slopes = prediction.new_empty(len(prediction)), torch.empty_like(images[0]) if slope else None
+    sizes = (*prediction.shape, len(taps) // 2)
+    tensors = addresses(window, *images, value, slopes)
+    _native.similarity(sizes, stability, torch.get_num_threads(), tensors)
+    return value, prediction.new_empty(0) if slopes is None else slopes

@@ -1,4 +1,4 @@
-"""The operators of operators.py and networks.py by the CUDA kernels, on torch's current stream.
+"""The operators of this package by the CUDA kernels, on torch's current stream.
 
 A plan's buffers have the shapes of the CPU's, with contents of their own: records, boxes and entries go by
 Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
@@ -22,6 +22,7 @@ from gsparc.ops.operators import check_memory, filled, gradients, layout, model_
 
 TILE_WIDTH, TILE_HEIGHT = 8, 4
 BYTES_PER_ENTRY = 36  # entries and what sorting them takes
+SIMILARITY_TILE, MOST_RADIUS = (8, 32), 5  # rows and columns of a block; its widest window
 MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
 
 libraries: dict[str, cuda_library.Library] = {}
@@ -295,3 +296,24 @@ def networks_backward(
     if slope.numel():
         run("networks_backward", encoded, *inputs, *grads, whole=(width, hidden), sizes=sizes)
     return grads[0], grads[1], grads[2], grads[3]
+
+
+def similarity(
+    prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
+) -> tuple[Tensor, Tensor]:
+    """`gsparc::similarity` (ValueError: a window that is not symmetric, or wider than the kernels take)."""
+    half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
+    radius = len(half) - 1
+    if radius > MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
+        most = 2 * MOST_RADIUS + 1
+        raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
+    rows, columns = height - 2 * radius, width - 2 * radius
+    sums = prediction.new_empty(samples, -(-rows // SIMILARITY_TILE[0]) * -(-columns // SIMILARITY_TILE[1]))
+    slopes = torch.empty_like(prediction, memory_format=torch.contiguous_format) if slope else None
+    inputs = [prediction.contiguous(), target.contiguous(), target.mean(dim=(-2, -1))]
+    whole, real = (height, width, radius), (*stability, *half)
+    if samples:
+        tensors = (*inputs, sums, slopes)
+        run("similarity", prediction, *tensors, whole=whole, real=real, sizes={"samples": samples})
+    value = sums.sum(1) / (rows * columns)
+    return value, prediction.new_empty(0) if slopes is None else slopes

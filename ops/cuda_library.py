@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 SOURCES = Path(__file__).parent / "csrc"
-UNITS = ("plan", "composite", "frozen", "networks")
+UNITS = ("plan", "composite", "frozen", "networks", "similarity")
 FLAGS = ("-std=c++17", "-O3", "-fmad=false", "--expt-relaxed-constexpr", "-Xcompiler=-fPIC", "-shared", "-t0")
 LOG = logging.getLogger(__name__)
 

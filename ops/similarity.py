@@ -8,27 +8,28 @@ import torch
 from torch import Tensor
 from torch.library import custom_op
 
-from gsparc.ops import built
+from gsparc.ops import backends, built
+from gsparc.ops.operators import KERNELS
 
 
-@custom_op("gsparc::similarity", mutates_args=(), device_types="cpu")
+def served(images: Tensor) -> bool:
+    """Whether a kernel takes these images: float32, on a CPU or on a GPU that renders."""
+    if images.dtype != torch.float32:
+        return False
+    if images.device.type == "cpu" and built.kernels() is not None:
+        backends.named("cpu")  # its kernels are then in the table
+    return images.device.type in KERNELS
+
+
+@custom_op("gsparc::similarity", mutates_args=())
 def similarity_op(
     prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
 ) -> tuple[Tensor, Tensor]:
     """Similarity (B,) of float32 images (B, H, W), and its gradient by the prediction (empty unless `slope`).
 
-    `taps` is one axis of a separable window of odd length, `stability` the constants C1 and C2.
+    `taps` is one axis of a separable, symmetric window of odd length, `stability` the constants C1 and C2.
     """
-    kernels = built.kernels()
-    assert kernels is not None, "the caller has looked"
-    inputs = [torch.tensor(taps, dtype=torch.float32), prediction.contiguous(), target.contiguous()]
-    value = prediction.new_empty(len(prediction))
-    slopes = torch.empty_like(inputs[1]) if slope else None
-    outputs = [value.data_ptr(), 0 if slopes is None else slopes.data_ptr()]
-    sizes = (*prediction.shape, len(taps) // 2)
-    addresses = [tensor.data_ptr() for tensor in inputs] + outputs
-    kernels.similarity(sizes, stability, torch.get_num_threads(), addresses)
-    return value, prediction.new_empty(0) if slopes is None else slopes
+    return KERNELS[prediction.device.type].similarity(prediction, target, taps, stability, slope)
 
 
 @similarity_op.register_fake

@@ -1,7 +1,7 @@
 // Mean structural similarity of images and its gradient (Wang et al. 2004), a separable window.
 #pragma once
 #include "kernels.h"
-#include "simd.h"
+#include "similar.h"
 #include "strips.h"
 
 namespace gsparc {
@@ -52,24 +52,15 @@ template <int kTaps> inline float similarity_row(const SimilarityArgs& a, const 
         }
         for (int k = 0; k < 5; ++k) store(s.columns.row(k) + x, m[k]);
     }
-    const Vec<float> none = splat(0.0f);
-    Vec<float> total = none;
+    Vec<float> total = splat(0.0f);
     for (int x = 0; x < valid; x += n) {
         Vec<float> m[5] = {};
         for (int k = 0; k < taps; ++k)
             for (int c = 0; c < 5; ++c) m[c] = fma(splat(a.taps[k]), load(s.columns.row(c) + x + k), m[c]);
-        const Vec<float> raw = m[2] - m[0] * m[0];
-        const Vec<float> spread = greater<float>(raw, none) + greater<float>(m[3] - m[1] * m[1], none) + a.c2;
-        const Vec<float> covariance = 2.0f * (m[4] - m[0] * m[1]) + a.c2, light_p = m[0] + shift, light_t = m[1] + shift;
-        const Vec<float> power = light_p * light_p + light_t * light_t + a.c1, product = 2.0f * light_p * light_t + a.c1;
-        const Vec<float> similar = product * covariance / (power * spread);
-        total += first_of(similar, valid - x);
+        Vec<float> by[3];
+        total += first_of(similar_at(m, shift, a.c1, a.c2, share, a.slope != nullptr, by), valid - x);
         if (!a.slope) continue;
-        const Vec<float> by_cross = 2.0f * share * product / (power * spread);
-        const Vec<float> by_square = select(at_most(none, raw), -share * similar / spread, none);
-        const Vec<float> by_light = 2.0f * share * (light_t * covariance / spread - light_p * similar) / power;
-        const Vec<float> all[3] = {by_light - m[1] * by_cross - 2.0f * m[0] * by_square, by_square, by_cross};
-        for (int c = 0; c < 3; ++c) store(s.by[c].row(y + a.radius) + x + a.radius, first_of(all[c], valid - x));
+        for (int c = 0; c < 3; ++c) store(s.by[c].row(y + a.radius) + x + a.radius, first_of(by[c], valid - x));
     }
     return sum<float>(total);
 }

@@ -22,6 +22,7 @@ int64_t gsparc_weights_backward(const Call*);
 int64_t gsparc_thaw(const Call*);
 int64_t gsparc_networks(const Call*);
 int64_t gsparc_networks_backward(const Call*);
+int64_t gsparc_similarity(const Call*);
 const char* gsparc_error(int64_t);
 }
 
@@ -32,7 +33,7 @@ struct Kernel {
 const Kernel kernels[] = {
     {"plan", gsparc_plan}, {"bin", gsparc_bin}, {"composite", gsparc_composite}, {"composite_backward", gsparc_composite_backward},
     {"weights", gsparc_weights}, {"weights_backward", gsparc_weights_backward}, {"thaw", gsparc_thaw}, {"networks", gsparc_networks},
-    {"networks_backward", gsparc_networks_backward},
+    {"networks_backward", gsparc_networks_backward}, {"similarity", gsparc_similarity},
 };
 
 int main(int, char** arguments) {
@@ -54,6 +55,7 @@ int main(int, char** arguments) {
             if (bytes > 0 && fread(at, bytes, 1, file) != 1) return 2;
             call.tensors[k] = reinterpret_cast<uintptr_t>(at);
         }
+        const int before = calls;
         for (const Kernel& kernel : kernels) {
             if (std::string(name) != kernel.name) continue;
             call.scratch = 0;
@@ -63,6 +65,7 @@ int main(int, char** arguments) {
             if (result < 0) return printf("%s: %s\n", name, gsparc_error(-result)), 3;
             ++calls;
         }
+        if (calls == before) return printf("%s: a kernel that is not in the list above\n", name), 4;
     }
     printf("%d calls\n", calls);
     return calls ? 0 : 2;

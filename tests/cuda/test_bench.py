@@ -75,7 +75,7 @@ def measure(monkeypatch):
         monkeypatch.setattr(torch.cuda, name, value)
     import measure
 
-    monkeypatch.setattr(measure, "GRID", SphereGrid.hemisphere(8, 24))
+    monkeypatch.setattr(measure, "GRID", SphereGrid.hemisphere(12, 24))
     monkeypatch.setattr(measure, "BATCHES", (1, 9))
     monkeypatch.setattr(
         measure, "kernel_ms", lambda call, **how: call() is not None and {"p50": 1.0, "p95": 2.0}
@@ -142,3 +142,9 @@ def test_json_survives_failing_stages(measure, tmp_path, capsys):
     assert facts["stages"]["tests"] == {"exit": 1, "seconds": 7, "said": ["3 passed, 1 failed in 2 s"]}
     gpu.table(file)
     assert "| tests.exit | 1 |" in capsys.readouterr().out
+
+
+def test_similarity_is_timed_beside_the_one_written_out(measure):
+    found = measure.similarity(2, LIMITS)
+    no_errors(found)
+    assert found["ours"]["ratio"] > 0 and {"end_to_end"} <= found["written_out"].keys()

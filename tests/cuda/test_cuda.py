@@ -9,6 +9,7 @@ import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
+from gsparc.losses import _Kernel, _Similarity
 from gsparc.ops import SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
@@ -89,6 +90,37 @@ def test_nothing_is_read_before_it_is_written(where, dtype):
         torch.use_deterministic_algorithms(False)
     for a, b in zip(want, got, strict=True):
         assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+@pytest.mark.parametrize("shape", [(1, 11, 11), (2, 23, 37), (1, 40, 12), (2, 12, 70), (0, 20, 20)], ids=str)
+def test_similarity_equals_the_written_out_one_in_float64(where, shape):
+    draw = torch.Generator().manual_seed(0)
+    a, b = (torch.rand(shape, generator=draw, dtype=torch.float64) for _ in range(2))
+    found = []
+    for kind, dtype in ((_Kernel, torch.float32), (_Similarity, torch.float64)):
+        leaf = a.to(dtype).requires_grad_()
+        value = kind.apply(leaf, b.to(dtype))
+        (value * torch.arange(1, len(value) + 1)).sum().backward()
+        found.append((value.detach().double(), leaf.grad.double()))
+    (value, slope), (wanted, wanted_slope) = found
+    assert torch.allclose(value, wanted, atol=1e-5)
+    assert not slope.numel() or (slope - wanted_slope).abs().max() < 1e-4 * wanted_slope.abs().max()
+    assert torch.equal(_Kernel.apply(a.float(), b.float()), value.float())  # the same without a gradient
+
+
+def test_similarity_of_flat_images_stays_finite(where):
+    a, b = torch.full((1, 20, 20), 0.6), torch.full((1, 20, 20), 0.6 + 1e-7)
+    leaf = a.requires_grad_()
+    value = _Kernel.apply(leaf, b)
+    value.sum().backward()
+    assert abs(float(value.detach()) - 1) < 1e-5 and torch.isfinite(leaf.grad).all()
+
+
+@pytest.mark.parametrize("taps", [[0.2, 0.5, 0.3], [1 / 13] * 13], ids=["askew", "wide"])
+def test_windows_that_the_kernel_does_not_take_are_refused(where, taps):
+    images = torch.rand(1, 20, 20)
+    with pytest.raises(ValueError, match="symmetric and has at most 11 taps"):
+        cuda_kernels.similarity(images, images, taps, (1e-4, 9e-4), True)
 
 
 def test_more_positions_than_a_grid_has_rows(where):

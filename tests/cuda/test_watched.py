@@ -20,6 +20,7 @@ from rasters import GRIDS, origin, poses, random_scene, render
 from shim import FLAGS, KEPT, serving
 
 from gsparc.ops import SphereGrid, cuda_kernels, cuda_library, freeze, make_plan, mean_weights, networks
+from gsparc.ops.similarity import similarity_op
 
 SHIM = cuda_library.SOURCES / "cuda" / "host_shim.cpp"
 REPLAY = Path(__file__).parent / "replay.cpp"
@@ -114,6 +115,9 @@ def everything(dtype: torch.dtype) -> None:
             view.render(torch.ones(150, channels, dtype=dtype), 0)
             raster = random_scene(n=30, channels=channels).to(dtype)
             render(raster, origin(), SMALL, projection=projection)
+    images = torch.rand(2, 23, 40, generator=torch.Generator().manual_seed(0))
+    for slope in (True, False):
+        similarity_op(images, images.flip(0), [0.1, 0.2, 0.4, 0.2, 0.1], [1e-4, 9e-4], slope)
     weights = [torch.ones(shape, requires_grad=True) for shape in ((9, 19, 24), (9, 24), (9, 24, 2), (9, 2))]
     for samples in (1, 21):
         networks.networks_op(torch.ones(samples, 19), *weights).sum().backward()

@@ -5,8 +5,10 @@ import torch
 from torch.library import opcheck
 
 from gsparc.losses import _Kernel, _Similarity
-from gsparc.ops import _native
+from gsparc.ops import _native, backends
 from gsparc.ops.similarity import similarity_op
+
+backends.named("cpu")  # the operators find its kernels
 
 
 def images(shape, seed=0):

@@ -20,6 +20,7 @@ template <class S> GSPARC_INLINE S select(bool mask, S a, S b) { return mask ? a
 GSPARC_INLINE bool any(bool mask) { return mask; }
 template <class S> GSPARC_INLINE S sum(S x) { return x; }
 template <class S> GSPARC_INLINE S lesser(S a, S b) { return a <= b ? a : b; }
+template <class S> GSPARC_INLINE S greater(S a, S b) { return a >= b ? a : b; }
 GSPARC_INLINE float fma(float a, float b, float c) { return ::fmaf(a, b, c); }
 GSPARC_INLINE double fma(double a, double b, double c) { return ::fma(a, b, c); }
 template <class S> GSPARC_INLINE S reciprocal(S x) { return S(1) / x; }
