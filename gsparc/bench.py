@@ -10,7 +10,6 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.console import Console
 
 from gsparc import cli
 from gsparc.benchmark import kernels, layers, steps
@@ -63,7 +62,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
         )
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
-    machine, console = Machine(), Console()
+    machine, console = Machine(), cli.console()
     before = machine_facts()["machine/load"]
     rows: list[Row] = []
     gc.collect()

@@ -159,7 +159,8 @@ class Gsparc(LearnedField):
     def _decide(self, data: Measurements, fold: Fold) -> tuple[Decision, ...]:
         hidden = self.settings.emission.hidden
         splatting = f"emission.hidden={hidden}" if hidden else None
-        phase = decide_phase(self.switches.phase, data.site, splatting)
+        antennas = data.target.shape[1] if data.site.kind == "csi" else 1
+        phase = decide_phase(self.switches.phase, data.site, splatting, antennas)
         array = decide_array(self.switches.array, data.site, splatting)
         sources = phase.on and self.switches.phase != SPLAT
         directions = decide_directions(self.switches.directions, sources, data)

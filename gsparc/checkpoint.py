@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import pickle
-import tempfile
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -16,6 +14,7 @@ import torch
 import yaml
 from torch import Tensor
 
+from gsparc.atomic import whole_file
 from gsparc.data.schema import Site
 from gsparc.method import Method
 from gsparc.ops import SphereGrid
@@ -23,6 +22,8 @@ from gsparc.registry import METHODS, build, method_class
 
 SCHEMA_VERSION = 1
 FORMAT = "gsparc-checkpoint"
+MODEL = "model.ckpt"  # of a run's folder
+SEARCHES = "searches"  # what `gsparc.coherent.shelf` calls its own in a last.ckpt
 
 
 class CheckpointError(ValueError):
@@ -105,21 +106,11 @@ def amend(path: str | Path, extra: Mapping[str, Any]) -> None:
 
 
 def _write(path: Path, content: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with whole_file(path) as partial, partial.open("wb") as file:
             torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except BaseException as error:
-        Path(partial).unlink(missing_ok=True)
-        if isinstance(error, (OSError, RuntimeError)):  # torch's writer makes the second of the first
-            raise CheckpointError(
-                f"{path}: cannot be written ({_why(error)}); what was there is kept"
-            ) from error
-        raise
+    except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
+        raise CheckpointError(f"{path}: cannot be written ({_why(error)}); what was there is kept") from error
 
 
 def _why(error: BaseException | None) -> str:
@@ -136,10 +127,15 @@ def read(path: str | Path) -> Stored:
         CheckpointError: missing, not a checkpoint, damaged, hostile, or of a newer gsparc.
     """
     path = Path(path)
+    if path.is_dir():
+        inside = [*path.glob(MODEL), *sorted(path.glob(f"fold*/{MODEL}"))]
+        hint = f"say {inside[0]}" if inside else f"give the file itself, {MODEL} of a run"
+        raise CheckpointError(f"{path}: a folder; {hint}")
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint")
     if not zipfile.is_zipfile(path):
         raise CheckpointError(f"{path}: not a gsparc checkpoint, or cut short")
+    _check_archive(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
@@ -151,6 +147,10 @@ def read(path: str | Path) -> Stored:
         raise CheckpointError(
             f"{path}: cannot be read ({reason[0] if reason else type(error).__name__})"
         ) from None
+    if isinstance(content, dict) and SEARCHES in content:
+        raise CheckpointError(
+            f"{path}: the finished searches of a run, to go on from with ckpt_path=; the model is {MODEL}"
+        )
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
     version = content.get("schema_version")
@@ -170,6 +170,20 @@ def read(path: str | Path) -> Stored:
         )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
+
+
+def _check_archive(path: Path) -> None:
+    """Refuse archives of others and bytes that changed since they were written; torch checks neither."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            foreign = not any(name.endswith("/data.pkl") for name in archive.namelist())
+            damaged = None if foreign else archive.testzip()
+    except Exception as error:  # whatever a damaged archive raises
+        raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}: {error})") from None
+    if foreign:
+        raise CheckpointError(f"{path}: an archive, but not a gsparc checkpoint")
+    if damaged is not None:
+        raise CheckpointError(f"{path}: damaged (the checksum of {damaged} is wrong)")
 
 
 def restore(stored: Stored) -> Method:

@@ -29,6 +29,7 @@ from gsparc.registry import suggest
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
+WIDE = 120
 
 
 class _Failed(BaseException):
@@ -67,6 +68,14 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+def console() -> Console:
+    """Where commands print: sentences in one piece, tables as wide as the terminal, or `WIDE` in a log."""
+    to_people = Console(soft_wrap=True)
+    if to_people.is_terminal or "COLUMNS" in os.environ:
+        return to_people
+    return Console(soft_wrap=True, width=WIDE)  # a log has no width: 80 columns cut headings short
 
 
 def one_line(error: BaseException) -> str:

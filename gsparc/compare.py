@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.markdown import Markdown
 
 from gsparc import cli
@@ -213,7 +212,7 @@ def report(
             facts[f"{room}/{row.method}/train_s"] = row.train_s
             facts[f"{room}/{row.method}/query_ms_p50"] = row.query_ms
     write_summary(run_dir / "summary.json", facts)
-    console = Console()
+    console = cli.console()
     console.print(Markdown(page))
     console.print(f"written to {run_dir}", highlight=False)
     return rows

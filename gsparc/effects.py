@@ -66,13 +66,14 @@ class Decision:
         return f"effects.{self.effect} -> {'on' if self.on else 'off'}: {self.reason}{cost}"
 
 
-def decide_phase(switch: Switch, site: Site, splatting: str | None) -> Decision:
+def decide_phase(switch: Switch, site: Site, splatting: str | None, antennas: int = 1) -> Decision:
     """Whether the channels' phase is to come from source positions, before any probe.
 
     Args:
         switch: as configured.
         site: what the dataset declares.
         splatting: setting that asks for the splatted field, or None.
+        antennas: of the receiver.
 
     Raises:
         ValueError: asked for where it has no meaning.
@@ -80,8 +81,10 @@ def decide_phase(switch: Switch, site: Site, splatting: str | None) -> Decision:
     obstacle = None
     if site.kind != "csi":
         obstacle = f"the target is {site.kind}, which carries no phase"
-    elif site.static_end != "tx":
-        obstacle = "the transmitter moves; carrier phase is modelled for a moving receiver"
+    elif site.static_end == "rx" and antennas > 1:
+        obstacle = f"the transmitter moves before {antennas} antennas; sources are found for one of them"
+    elif site.static_end == "rx" and switch == SPLAT:
+        obstacle = "the transmitter moves; splatted phase is modelled for a moving receiver"
     elif site.carrier_hz is None and site.subcarriers_hz is None:
         obstacle = "the dataset declares no frequency"
     elif switch == "auto" and splatting is not None:

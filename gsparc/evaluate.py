@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
 from gsparc import checkpoint, cli, limits
 from gsparc.baselines import platform_cache
@@ -117,7 +116,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    console = Console()
+    console = cli.console()
     console.print(results_table(facts, facts["model/name"], title, config.eval_on))
     console.print(f"written to {run_dir}", highlight=False)
     return facts

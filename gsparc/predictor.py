@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsparc import checkpoint
 from gsparc.calibration.stored import Trusted, kept
+from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import Kind, Site
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
@@ -268,14 +269,16 @@ def _positions(end: str, value: Any) -> np.ndarray:
     """(3,) or (B, 3) float64 [m]; float64 until the origin is subtracted, or far sites lose millimetres."""
     try:
         array = value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
-        array = array.astype(np.float64)
+        array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
     except (TypeError, ValueError):
-        raise ValueError(f"{end}= must be numbers [m], got {type(value).__name__}") from None
+        raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None
     if array.ndim not in (1, 2) or array.shape[-1] != 3 or not array.size:
         raise ValueError(f"{end}= must be (3,) or (B, 3) [m], got shape {array.shape}")
     if not np.isfinite(array).all():
         row = "" if array.ndim == 1 else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
         raise ValueError(f"{end}= holds NaN or Inf{row}")
+    if np.abs(array).max() > FARTHEST:
+        raise ValueError(f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}")
     return array
 
 

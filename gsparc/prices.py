@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from gsparc import cli
@@ -145,7 +144,7 @@ def task(config: DictConfig) -> list[Price]:
     for p in found:
         numbers = (p.value, p.train_s, p.train_ratio, p.query_ms, p.query_p95_ms, p.query_ratio)
         table.add_row(p.name, p.effects, *(f"{number:.3g}" for number in numbers))
-    console = Console()
+    console = cli.console()
     console.print(table)
     console.print(f"ratios to {config.plain!r}; written to {where.run_dir}", highlight=False)
     return found

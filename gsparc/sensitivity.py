@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from omegaconf import DictConfig
-from rich.console import Console
 from rich.table import Table
 
 from gsparc import cli
@@ -147,7 +146,7 @@ def task(config: DictConfig) -> list[Row]:
         table.add_column(column, justify="left" if column in ("method", "disturbed") else "right")
     for row in rows:
         table.add_row(row.method, row.where, f"{row.error_m:g}", f"{row.value:.4g}", f"{row.train_s:.3g}")
-    console = Console()
+    console = cli.console()
     console.print(table)
     console.print(f"written to {run_dir}", highlight=False)
     return rows

@@ -81,6 +81,11 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """What a reader of the table must know besides: stand-ins, a busy machine, a simpler method that wins."""
+    return circumstances(facts) + simpler_wins(facts, prefix)
+
+
+def circumstances(facts: Mapping[str, Any]) -> list[str]:
+    """Stand-ins, and a busy machine."""
     found = []
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
@@ -88,14 +93,20 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     load = facts.get("machine/load")
     if load is not None and load > BUSY:
         found.append(f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so")
-    figure, sign = ("psnr_db", -1) if f"{prefix}/psnr_db" in facts else ("nmse", 1)
+    return found
+
+
+def simpler_wins(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
+    """The baseline that beats the method, if one does."""
+    figure = next((name for name in ("psnr_db", "rmse_db") if f"{prefix}/{name}" in facts), "nmse")
+    sign = -1 if figure == "psnr_db" else 1
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
     known = {k.split("/")[1]: sign * float(facts[k]) for k in keys if facts[k] is not None}
     best = min(known, key=lambda name: known[name], default=None)
-    if best is not None and own is not None and known[best] < sign * float(own):
-        found.append(f"{best} has the better {figure} here: for this data and split it is the better choice")
-    return found
+    if best is None or own is None or known[best] >= sign * float(own):
+        return []
+    return [f"{best} has the better {figure} here: for this data and split it is the better choice"]
 
 
 def _rank(name: str) -> tuple[int, str]:

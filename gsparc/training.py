@@ -14,7 +14,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
 from gsparc import checkpoint, cli, limits
 from gsparc.baselines import platform_cache
@@ -185,7 +184,7 @@ def task(config: DictConfig) -> float | None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     facts, objects = train(config, run_dir)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    console = Console()
+    console = cli.console()
     console.print(results_table(facts, facts["model/name"], title, config.eval_on))
     for remark in remarks(facts, config.eval_on):
         console.print(remark, highlight=False)

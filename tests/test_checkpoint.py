@@ -6,6 +6,7 @@ import collections
 import os
 import pickle
 import re
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -178,3 +179,41 @@ def test_missing_and_damaged_files(fitted, tmp_path):
     path.write_bytes(whole)
     with pytest.raises(CheckpointError, match="cannot be restored"):
         checkpoint.load(rewritten(path, state={"shape": [1]}))
+
+
+def test_others_may_read_a_checkpoint_as_the_umask_says(fitted, tmp_path):
+    """Models were readable by their owner alone (mode 600), unlike every other file of a run."""
+    before = os.umask(0o027)
+    try:
+        checkpoint.save(tmp_path / "m.ckpt", fitted[0])
+    finally:
+        os.umask(before)
+    assert (tmp_path / "m.ckpt").stat().st_mode & 0o777 == 0o640
+
+
+def test_one_changed_byte_is_seen(fitted, tmp_path):
+    """A byte that changed in a tensor was loaded and answered with."""
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    with zipfile.ZipFile(path) as archive:
+        largest = max(archive.infolist(), key=lambda member: member.file_size)
+    content = bytearray(path.read_bytes())
+    content[largest.header_offset + len(content) // 100 + 200] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(CheckpointError, match="checksum"):
+        checkpoint.read(path)
+
+
+def test_what_is_not_the_model_is_named(tmp_path):
+    """The searches in a last.ckpt were called weights of another program, a folder no checkpoint at all."""
+    torch.save({"key": "k", "spent_s": 1.0, "searches": {}}, tmp_path / "last.ckpt")
+    with pytest.raises(CheckpointError, match=r"ckpt_path=; the model is model\.ckpt"):
+        checkpoint.read(tmp_path / "last.ckpt")
+    np.savez(tmp_path / "data.npz", rx_position=np.zeros(3))
+    with pytest.raises(CheckpointError, match="an archive, but not a gsparc checkpoint"):
+        checkpoint.read(tmp_path / "data.npz")
+    with pytest.raises(CheckpointError, match="a folder; give the file itself"):
+        checkpoint.read(tmp_path)
+    (tmp_path / "model.ckpt").touch()
+    with pytest.raises(CheckpointError, match=r"a folder; say .*model\.ckpt"):
+        checkpoint.read(tmp_path)

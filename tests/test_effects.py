@@ -46,8 +46,12 @@ def test_array_needs_spectra_of_a_static_receiver(spectra, channels) -> None:
 def test_phase_needs_channels_of_a_moving_receiver(spectra, channels) -> None:
     assert decide_phase("auto", channels, None).on
     assert not decide_phase("auto", spectra.site, None).on
-    with pytest.raises(ValueError, match=r"effects\.phase=true is not possible"):
-        decide_phase(True, replace(channels, static_end="rx"), None)
+    moving_tx = replace(channels, static_end="rx")
+    assert decide_phase("auto", moving_tx, None, antennas=1).on  # by reciprocity
+    with pytest.raises(ValueError, match=r"effects\.phase=true is not possible: .* before 2 antennas"):
+        decide_phase(True, moving_tx, None, antennas=2)
+    with pytest.raises(ValueError, match="splatted phase"):
+        decide_phase("splat", moving_tx, None)
     with pytest.raises(ValueError, match="choose auto, splat, true or false"):
         decide_phase("on", channels, None)  # type: ignore[arg-type]
 

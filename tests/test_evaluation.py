@@ -152,6 +152,15 @@ def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatc
         baseline("gp", other, split, cache=tmp_path)
 
 
+def test_a_cheap_fit_is_timed_anew(campaign, folds, tmp_path, monkeypatch):
+    """A fit that once took a second on a busy machine stood in every later table with that second."""
+    data, split = campaign("csi", 40), folds(40)
+    steps = iter(range(100))
+    monkeypatch.setattr("gsparc.peers.interpolation.time.perf_counter", lambda: 5.0 * next(steps))
+    baseline("gp", data, split, cache=tmp_path)
+    assert not list(tmp_path.rglob("fold*.ckpt")) and list(tmp_path.rglob("test.npz"))
+
+
 def test_the_cache_knows_the_local_frame(campaign, folds, tmp_path, monkeypatch):
     data, split = campaign("csi", 40), folds(40)
     monkeypatch.setattr("gsparc.baselines.STORE_ABOVE_S", 0.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 
@@ -108,3 +109,25 @@ def test_importing_costs_nothing():
 
 def test_load_restores_the_class(spectra):
     assert isinstance(spectra[1].method, GaussianProcess)
+
+
+def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tmp_path):
+    """One tone was repeated at whatever frequency was asked for, with a phase that belongs to another."""
+    data = campaign("csi", 30, "tx")
+    site = dataclasses.replace(data.site, subcarriers_hz=np.array([2.4e9]))
+    data = dataclasses.replace(data, site=site, target=data.target[:, :, :1])
+    predictor = loaded(data, folds(30).folds[0], tmp_path)
+    place = data.rx_position[0] + data.site.origin
+    assert np.array_equal(predictor.csi(rx=place, frequency_hz=2.4e9)[0], predictor.csi(rx=place))
+    with pytest.raises(ValueError, match=r"measured at 2400\.000 MHz alone"):
+        predictor.csi(rx=place, frequency_hz=[2.4e9, 2.41e9])
+
+
+@pytest.mark.parametrize(
+    ("place", "said"),
+    [([1j, 0, 0], "must be real numbers"), ([1e300, 0, 0], "expected metres, none beyond 1e")],
+)
+def test_positions_that_are_none_are_refused(spectra, place, said):
+    """Complex numbers lost their imaginary part, and what overflows float32 was answered with NaN."""
+    with pytest.raises(ValueError, match=said):
+        spectra[1].spectrum(tx=place)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import logging
-import os
-import tempfile
 import time
 from dataclasses import fields
 from pathlib import Path
@@ -14,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.array.recovery import Recovered, recover
+from gsparc.atomic import whole_file
 from gsparc.data.schema import Measurements, Site
 from gsparc.peers.encoding import training_targets
 
@@ -108,8 +107,5 @@ def _read(path: Path | None, count: int) -> dict[str, np.ndarray] | None:
 
 
 def _write(path: Path, arrays: dict[str, np.ndarray]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial = tempfile.mkstemp(suffix=".npz", dir=path.parent)
-    with os.fdopen(handle, "wb") as file:
+    with whole_file(path) as partial, partial.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
-    os.replace(partial, path)

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Table
 
 from gsparc import cli
@@ -162,7 +161,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }
     write_summary(run_dir / "summary.json", facts)
     draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
-    console = Console()
+    console = cli.console()
     for table in tables(facts, evidence, found):
         console.print(table)
     if config.store:

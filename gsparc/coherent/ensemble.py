@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -84,7 +85,6 @@ def search_many(
     """
     threads = torch.get_num_threads()
     errors: list[float] = []
-    enough = max(ENOUGH, 2 * noise_floor)
 
     def search(number: int) -> Member | None:
         done = None if shelf is None else shelf.find(f"{stage} {number}")
@@ -92,7 +92,7 @@ def search_many(
             return done
         if number > 0 and budget.spent > LAST_START * budget.seconds:
             return None
-        if sum(error < enough for error in errors) > 1:
+        if agreed(errors, noise_floor):
             return None
         rows = draw[number]
         deadline = budget.started + ROUNDS_END * budget.seconds
@@ -125,6 +125,11 @@ def search_many(
     finally:
         torch.set_num_threads(threads)
     return sorted(found, key=lambda member: member.left_out)
+
+
+def agreed(left_out: Sequence[float], noise_floor: float) -> bool:
+    """Whether two searches ended at the noise floor, so that another one would say the same."""
+    return sum(error < max(ENOUGH, 2 * noise_floor) for error in left_out) > 1
 
 
 def weights(members: list[Member]) -> Tensor:

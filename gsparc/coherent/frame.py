@@ -45,13 +45,13 @@ def frame_of(site: Site, rows: Rows) -> Frame:
     return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 
-def refuse(site: Site, name: str) -> None:
+def refuse(site: Site, name: str, antennas: int = 1) -> None:
     """ValueError, in the name of a method, where sources with carrier phase explain nothing."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
         raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
-    if site.static_end == "rx" and site.array is not None and len(site.array) > 1:
+    if site.static_end == "rx" and antennas > 1:
         raise ValueError(
-            f"{name}: in {site.name} the transmitter moves before an array; that needs mirrored arrays"
+            f"{name}: in {site.name} the transmitter moves before {antennas} antennas; take one of them"
         )

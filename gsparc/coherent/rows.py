@@ -75,7 +75,7 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     so that together they see all of it. When even one each is too much, some measurements stay out.
 
     Args:
-        data: kind csi, static transmitter.
+        data: kind csi; a transmitter that moves before one antenna is, by reciprocity, a moving receiver.
         index: (S,) measurements to draw from.
         limit: largest number of rows.
         seed: of the draw.
@@ -84,7 +84,7 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     index = np.asarray(index)
     antennas, tones = data.target.shape[1:]
     frequency = tones_of(data.site)
-    places = elements(data.site, data.rx_position[index], data.rx_rotation[index], antennas)
+    places = elements(data.site, data.moving[index], data.rx_rotation[index], antennas)
     per = places.shape[1]
     if len(index) * per > limit:
         kept = np.sort(rng.permutation(len(index))[: max(limit // per, 1)])

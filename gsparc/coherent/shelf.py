@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -12,6 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+
+from gsparc.atomic import whole_file
+from gsparc.checkpoint import SEARCHES
 
 if TYPE_CHECKING:
     from gsparc.coherent.ensemble import Member
@@ -58,7 +59,7 @@ class Shelf:
     def _open(self, file: Path) -> None:
         try:
             stored = torch.load(file, weights_only=True)
-            key, kept, spent = str(stored["key"]), dict(stored["searches"]), float(stored["spent_s"])
+            key, kept, spent = str(stored["key"]), dict(stored[SEARCHES]), float(stored["spent_s"])
         except Exception as error:  # whatever another or a damaged file raises
             raise ValueError(
                 f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"
@@ -83,8 +84,5 @@ class Shelf:
             if self._path is None:
                 return
             spent = time.monotonic() - self._started
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            handle, partial = tempfile.mkstemp(suffix=".pt", dir=self._path.parent)
-            with os.fdopen(handle, "wb") as file:
-                torch.save({"key": self._key, "spent_s": spent, "searches": self._kept}, file)
-            os.replace(partial, self._path)
+            with whole_file(self._path) as partial, partial.open("wb") as file:
+                torch.save({"key": self._key, "spent_s": spent, SEARCHES: self._kept}, file)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsparc.coherent.edges import Edges, diffracted, edge_wave, find_edges, with_gains, without
-from gsparc.coherent.ensemble import Budget, Member, search_many, weights
+from gsparc.coherent.ensemble import Budget, Member, agreed, search_many, weights
 from gsparc.coherent.frame import Frame, frame_of, refuse
 from gsparc.coherent.furniture.clutter import Clutter
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
@@ -44,7 +44,7 @@ ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
 
 
 class VirtualSourceGP(Method):
-    """The virtual-source Gaussian process for a moving receiver.
+    """The virtual-source Gaussian process for a moving receiver, or for a transmitter before one antenna.
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
@@ -98,7 +98,7 @@ class VirtualSourceGP(Method):
     def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
         started = time.monotonic()
-        refuse(data.site, self.name)
+        refuse(data.site, self.name, data.target.shape[1])
         known = np.concatenate([fold.train, fold.val])
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
@@ -121,9 +121,9 @@ class VirtualSourceGP(Method):
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
-        notes.append(
-            f"vsgp: {len(found)} of {self.searches} searches within {budget.seconds:.0f} s, {counts} sources"
-        )
+        agree = agreed([member.left_out for member in found], self.noise_floor)
+        ended = "more would say the same" if agree else f"within {budget.seconds:.0f} s"
+        notes.append(f"vsgp: {len(found)} of {self.searches} searches ({ended}), {counts} sources")
         scene = self.members[0].scene
         told = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
         told[SourceKind.EDGE] = len(self.edges)

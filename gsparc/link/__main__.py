@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc import cli
@@ -161,7 +160,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
     facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
     write_summary(run_dir / "summary.json", facts)
-    console = Console()
+    console = cli.console()
     for table in tables(facts, title, list(wanted), levels):
         console.print(table)
     console.print(f"written to {run_dir}", highlight=False)

@@ -104,6 +104,12 @@ def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None)
         if site.subcarriers_hz is None:
             raise ValueError("frequency_hz= needs a model that knows its own frequencies")
         wanted = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
+        tone = site.subcarriers_hz[0]
+        if len(site.subcarriers_hz) == 1 and not np.allclose(wanted, tone, rtol=1e-9, atol=0):
+            raise ValueError(
+                f"frequency_hz=: {site.name} was measured at {tone / 1e6:.3f} MHz alone and tells "
+                "nothing of others; where a field is made of sources, .paths(...) has their gains and delays"
+            )
         channel = interpolated(channel, site.subcarriers_hz, wanted)
     return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
 

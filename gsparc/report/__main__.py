@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.console import Console
 
 from gsparc import cli
 from gsparc.report.page import studies, write
@@ -45,7 +44,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         }
         facts |= {f"{stem}/render_ms_p50": p50, f"{stem}/render_ms_p95": p95}
     write_summary(out / "summary.json", facts)
-    console = Console(soft_wrap=True)
+    console = cli.console()
     if config.readme:
         refresh(Path(config.readme), runs)
         console.print(f"table in {config.readme} written anew", highlight=False)

@@ -17,7 +17,7 @@ from PIL import Image
 from gsparc.report import effects, learning, plots, tables
 from gsparc.report.runs import Run, by_study, told_apart
 from gsparc.report.table import Table
-from gsparc.summary import BUSY, remarks
+from gsparc.summary import BUSY, circumstances, simpler_wins
 
 PICTURE_PX = 1000  # width at which pictures are kept
 MOST_PICTURES = 6
@@ -89,7 +89,11 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 
 def warnings(runs: Sequence[Run]) -> list[str]:
     """What a reader must know first, each once: the loads of a busy machine are one range."""
-    said = [remark for run in runs for remark in remarks({**run.facts, "machine/load": None})]
+    said = [remark for run in runs for remark in circumstances({**run.facts, "machine/load": None})]
+    scored = [(figure, run) for run in runs if (figure := run.figure_of(run.figure)) is not None]
+    if scored:  # what beats the worse runs of a page alone is no better choice
+        last = max if runs[0].kind == "spectrum" else min
+        said += simpler_wins(last(scored, key=lambda one: one[0])[1].facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
     if loads and max(loads) > BUSY:
         ends = " to ".join(dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads))))

@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table as Shown
 
-from gsparc.cli import one_line
+from gsparc import cli
 from gsparc.report.intervals import Interval
 from gsparc.report.table import Column, Table
 from gsparc.summary import provenance, write_summary
@@ -42,7 +42,7 @@ class SweepReport(Callback):
         if config.hydra.mode != RunMode.MULTIRUN or job_return.status != JobStatus.FAILED:
             return
         error = job_return._return_value
-        said = one_line(error) if isinstance(error, BaseException) else str(error)
+        said = cli.one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
         (folder / FAILURE).write_text(said + "\n", encoding="utf-8")
         log.error("failed", exc_info=error)  # the job's own log keeps the traceback
@@ -56,7 +56,7 @@ class SweepReport(Callback):
         """Time, tabulate and draw what the sweep made."""
         folder = Path(config.hydra.sweep.dir)
         failed = sorted(folder.rglob(FAILURE))
-        console = Console(soft_wrap=True)
+        console = cli.console()
         if any(path.parent != folder for path in folder.rglob("summary.json")):
             report(folder, str(config.get("title") or folder.name), console, self)
         if failed:

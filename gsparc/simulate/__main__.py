@@ -12,7 +12,6 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 
 from gsparc import cli, summary
 from gsparc.simulate import pictures
@@ -66,7 +65,7 @@ def task(config: DictConfig) -> Outcome:
     outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
-    console = Console()
+    console = cli.console()
     if outcome.choice is not None:
         pictures.worth(outcome.choice, run_dir / "effects.png")
         console.print(choice_table(outcome.choice))

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from rich.table import Table
 
 from gsparc import checkpoint, cli
@@ -184,7 +183,7 @@ def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run
         gap, error = p.difference
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
         table.add_row(p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart)
-    console = Console()
+    console = cli.console()
     console.print(table)
     slope = facts["tradeoff/per_halving"]
     if slope is not None:

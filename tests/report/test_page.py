@@ -141,3 +141,11 @@ def browser():
     running = webdriver.Chrome(options=options, service=service)
     yield running
     running.quit()
+
+
+def test_no_baseline_is_the_better_choice_than_a_run_that_beats_it(run_dir, tmp_path):
+    """A page of gsparc and worse methods called gp the better choice, because it beat the worse ones."""
+    better = run_dir(tmp_path / "a", psnr=29.5)
+    worse = run_dir(tmp_path / "b", name="nearest", psnr=26.0)
+    assert warnings(find_runs([better, worse])) == []
+    assert "gp has the better psnr_db" in warnings(find_runs([worse]))[0]
