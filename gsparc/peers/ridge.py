@@ -92,7 +92,8 @@ class Ridge(UplinkMethod):
 
 def _solve(gram: Tensor, product: Tensor, penalty: float) -> Tensor:
     level = torch.diagonal(gram, dim1=1, dim2=2).real.mean(1)
-    ridge = penalty * level[:, None, None] * torch.eye(gram.shape[1])
+    level = torch.where(level > 0, penalty * level, 1.0)  # a dead antenna has nothing to solve for
+    ridge = level[:, None, None] * torch.eye(gram.shape[1])
     return torch.linalg.solve(gram + ridge, product)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -110,6 +112,19 @@ def test_peers_answer_and_keep(make, tmp_path) -> None:
     checkpoint.save(tmp_path / "m.ckpt", method)
     again, _ = checkpoint.load(tmp_path / "m.ckpt")
     assert torch.allclose(again.answer(batch).mean, before)
+
+
+@pytest.mark.parametrize("inputs", ["own", "all"])
+def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
+    """A Gram matrix of zeros ended in the library's words about singular matrices."""
+    data = city("all")
+    uplink = data.uplink.copy()
+    uplink[:, 0] = 0
+    method = Ridge(inputs)
+    method.fit(replace(data, uplink=uplink), fold(), None)
+    said = method.listen(torch.from_numpy(uplink[fold().test])).mean
+    assert torch.isfinite(torch.view_as_real(said)).all() and said[:, 1:].abs().min() > 0
+    assert inputs == "all" or (said[:, 0] == 0).all()
 
 
 def test_kept_and_restored(fitted, tmp_path) -> None:
