@@ -54,7 +54,11 @@ class Stored:
 
     @property
     def configuration(self) -> dict[str, Any]:
-        """The configuration as plain containers; empty when there was none."""
+        """The configuration as plain containers; empty when there was none.
+
+        Raises:
+            CheckpointError: it is not YAML.
+        """
         try:
             loaded = yaml.safe_load(self.config) or {}
         except yaml.YAMLError:
@@ -208,7 +212,11 @@ def restore(stored: Stored) -> Method:
 
 
 def load(path: str | Path) -> tuple[Method, Stored]:
-    """`restore(read(path))`, with what else the file holds."""
+    """`restore(read(path))`, with what else the file holds.
+
+    Raises:
+        CheckpointError: as these two.
+    """
     stored = read(path)
     return restore(stored), stored
 

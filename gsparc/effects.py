@@ -151,7 +151,7 @@ def _settle(effect: str, switch: Switch, obstacle: str | None) -> Decision:
 
 
 def spacing_in_wavelengths(data: Measurements, rows: np.ndarray) -> float:
-    """Median distance from a training position to the nearest other one, in wavelengths."""
+    """Median distance of rows (n,) to the nearest other, in wavelengths; infinite without a carrier."""
     positions = data.moving[rows]
     if len(positions) < 2 or data.site.wavelength is None:
         return float("inf")

@@ -47,7 +47,11 @@ class SampleMetric(Metric):
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
     def update(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
-        """Add B samples; shapes and types of the kind's targets, mask like them (True where measured)."""
+        """Add B samples; shapes and types of the kind's targets, mask like them (True where measured).
+
+        Raises:
+            ValueError: shapes differ, or a prediction is not finite.
+        """
         if prediction.shape != target.shape:
             raise ValueError(
                 f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)} must have one shape"
@@ -60,7 +64,11 @@ class SampleMetric(Metric):
             getattr(self, name).append(torch.as_tensor(value, dtype=torch.float64))
 
     def compute(self) -> dict[str, np.ndarray]:
-        """Per-sample quantities, each (S,) float64."""
+        """Per-sample quantities, each (S,) float64.
+
+        Raises:
+            ValueError: no sample was added.
+        """
         if not getattr(self, self.quantities[0]):
             raise ValueError("no sample was scored: the chosen subset is empty")
         return {name: dim_zero_cat(getattr(self, name)).numpy() for name in self.quantities}

@@ -50,7 +50,7 @@ KINDS = {
 
 
 def kind_of(name: str) -> str:
-    """Which rate a parameter follows, from its dotted name."""
+    """Which rate a parameter follows, from its dotted name; `KeyError` when none is declared for it."""
     for prefix, kind in KINDS.items():
         if name == prefix or name.startswith(prefix + "."):
             return kind

@@ -34,7 +34,11 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
 
 
 def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
-    """Write equally long columns as CSV, atomically; NaN becomes an empty cell."""
+    """Write equally long columns as CSV, atomically; NaN becomes an empty cell.
+
+    Raises:
+        ValueError: columns of different lengths.
+    """
     lengths = {name: len(values) for name, values in columns.items()}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns of different lengths: {lengths}")

@@ -14,7 +14,7 @@ class BackendUnavailable(RuntimeError):
 
 
 def choose(name: str | None, device: torch.device) -> ModuleType:
-    """The backend called `name`, or the one of `device`."""
+    """The backend called `name`, or the one of `device` (BackendUnavailable, ValueError)."""
     if name is None:
         name = device.type
     backend = named(name)

@@ -50,7 +50,7 @@ def freeze(
 
 
 def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
-    """Image (K, H, W) of features (V, K) in the order of `freeze`."""
+    """Image (K, H, W) of features (V, K) in the order of `freeze`, in its precision (TypeError)."""
     if features.dtype != buffers[3].dtype:
         raise TypeError(f"features are {features.dtype}, this view was frozen in {buffers[3].dtype}")
     features = features.contiguous()

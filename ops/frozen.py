@@ -48,7 +48,7 @@ class FrozenPlan:
 
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
-        """The same of the features (V, C) or (B, V, C) of those in `order` alone, whoever else there is."""
+        """Image (C, H, W) or (B, C, H, W) of the features (V, C) or (B, V, C) of those in `order` alone."""
         batch = seen if seen.dim() == 3 else seen.unsqueeze(0)
         samples, count, channels = batch.shape
         columns = batch.transpose(0, 1).reshape(count, samples * channels)

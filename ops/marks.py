@@ -17,7 +17,11 @@ def exponentials(tasks: int) -> int:
 
 
 def copy(source: Tensor, target: Tensor) -> int:
-    """Copy a contiguous tensor on torch's number of threads; returns the bytes read and written."""
+    """Copy a contiguous tensor on torch's number of threads; returns the bytes read and written.
+
+    Raises:
+        ValueError: one is not contiguous, or their sizes differ.
+    """
     size = source.numel() * source.element_size()
     if not source.is_contiguous() or not target.is_contiguous() or size != target.nbytes:
         raise ValueError("copying needs two contiguous tensors of the same size")
@@ -26,7 +30,11 @@ def copy(source: Tensor, target: Tensor) -> int:
 
 
 def pairs(plan: Plan) -> int:
-    """Pixel-Gaussian pairs inside the exact footprints of a CPU plan, over all its poses."""
+    """Pixel-Gaussian pairs inside the exact footprints of a CPU plan, over all its poses.
+
+    Raises:
+        ValueError: a plan of another backend.
+    """
     if plan.backend != "cpu":
         raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
     whole, real = numbers(plan.grid, plan.optics)

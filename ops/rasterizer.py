@@ -68,7 +68,10 @@ def composite(
 ) -> Raster:
     """Blend features front to back over a plan made from the same Gaussians; differentiable in every tensor.
 
-    `features` is (N, C) or (B, N, C). With one pose the weights are formed once for all B C channels.
+    `features` is (N, C) or (B, N, C), real. With one pose the weights are formed once for all B C channels.
+
+    Raises:
+        ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
     """
     door.gaussians(means, quats, scales, opacities, extinctions, None)
     values = door.features(features, means, plan.pose)
@@ -125,7 +128,11 @@ def mean_weights(
     *,
     extinctions: Tensor | None = None,
 ) -> Weights:
-    """How much of each Gaussian every pose sees, over a plan made from the same Gaussians; differentiable."""
+    """How much of each Gaussian every pose sees, over a plan made from the same Gaussians; differentiable.
+
+    Raises:
+        ValueError, TypeError: as `composite`.
+    """
     door.gaussians(means, quats, scales, opacities, extinctions, None)
     if plan.num_gaussians != means.shape[0]:
         raise ValueError(f"this plan holds {plan.num_gaussians} Gaussians, got {means.shape[0]}; plan again")
@@ -149,6 +156,9 @@ def freeze(
 
     `version` is the field's own counter, raised whenever its geometry or opacity changes; a tensor's hidden
     counter misses writes through `.data`.
+
+    Raises:
+        ValueError: a plan of more than one pose.
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")

@@ -93,7 +93,7 @@ class MirroredArrays(nn.Module):
 
     @torch.no_grad()
     def pruned(self, x: Tensor, least: float) -> MirroredArrays:
-        """The sources that contribute at least the share `least` at x; the first always stays."""
+        """The sources that contribute at least the share `least` at x (n, 3) [m]; the first always stays."""
         keep = self.contributions(x) >= least
         keep[0] = True
         return MirroredArrays(

@@ -31,12 +31,16 @@ class RiskCoverage:
 
 
 def bounded(relative_error: np.ndarray) -> np.ndarray:
-    """Losses in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
+    """Losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
     return np.minimum(relative_error, 1.0)
 
 
 def risk_coverage(score: np.ndarray, loss: np.ndarray) -> RiskCoverage:
-    """Accept by falling score (n,); equal scores share their mean loss, so that their order cannot matter."""
+    """Accept by falling score (n,); equal scores share their mean loss (n,): their order cannot matter.
+
+    Raises:
+        ValueError: not as many scores as losses, or none.
+    """
     if len(score) != len(loss) or not len(score):
         raise ValueError(f"expected as many scores as losses, and some: got {len(score)} and {len(loss)}")
     order = np.argsort(-score, kind="stable")
@@ -48,12 +52,12 @@ def risk_coverage(score: np.ndarray, loss: np.ndarray) -> RiskCoverage:
 
 
 def perfect_area(loss: np.ndarray) -> float:
-    """Area of a confidence that knows the losses."""
+    """Area of a confidence that knows the losses (n,)."""
     return risk_coverage(-loss, loss).area
 
 
 def rank_correlation(score: np.ndarray, loss: np.ndarray) -> float | None:
-    """Spearman's correlation of being sure and being right; None where one of them is constant."""
+    """Spearman's correlation of being sure (n,) and being right, minus the loss (n,); None of a constant."""
     if np.ptp(score) == 0 or np.ptp(loss) == 0:
         return None
     return float(spearmanr(score, -loss).statistic)

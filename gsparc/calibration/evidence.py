@@ -69,7 +69,8 @@ def gather(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> 
 
 
 def rivals(data: Measurements, fold: Fold, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """The two cheap confidences: minus the distance to the nearest training point, minus a GP's variance."""
+    """The two cheap confidences (n,) of rows (n,): minus the distance to the nearest training point [m], and
+    minus the variance of a Gaussian process, as a share of the prior's."""
     known = known_positions(data, fold)
     distance = cKDTree(known).query(data.moving[rows])[0]
     variance = process_variance(position_kernel(data, fold), known, data.moving[rows])

@@ -75,7 +75,7 @@ class Trusted:
 
 
 def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
-    """Scores of `Evidence` as confidences in [0, 1] in the same order."""
+    """Scores (n,) of `Evidence` as confidences (n,) in [0, 1] in the same order."""
     if kind == "learned":
         return score
     if kind == "gp_variance":

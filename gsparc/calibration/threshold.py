@@ -74,7 +74,7 @@ def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[flo
 
 
 def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
-    """Thresholds to try, strict to lax: quantiles of scores that are not the calibration's."""
+    """Thresholds (at most `count`,) to try, strict to lax: quantiles of scores (n,) not the calibration's."""
     return np.unique(np.quantile(score, np.linspace(0, 1, count)))[::-1]
 
 
@@ -107,7 +107,7 @@ def choose(
 
 
 def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
-    """Variance of the share of bad ones between groups over that of independent draws; at least 1.
+    """Variance of the share of bad ones (n,) between groups (n,) over that of independent draws; at least 1.
 
     A variance between few groups is itself uncertain: what is returned is its one-sided bound at
     `SURE_OF_EFFECT`, as of a normal variance.

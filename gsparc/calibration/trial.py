@@ -130,7 +130,11 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 def accept(
     evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int
 ) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
-    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside."""
+    """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
+
+    Raises:
+        ValueError: `kind` is no confidence of this evidence.
+    """
     rng = np.random.default_rng(seed)
     choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
     used = best_kind(evidence, choose_on) if kind == "auto" else kind

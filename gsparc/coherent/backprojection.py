@@ -113,7 +113,7 @@ def polish(rows: Rows, candidates: Tensor, factor: Factor, effort: Effort) -> Te
 
 
 def pick_apart(position: Tensor, scores: Tensor, apart: float, most: int, least: float = 0.0) -> list[int]:
-    """Numbers of the best scores of at least `least`, pairwise at least `apart` [m] from each other."""
+    """Rows of the best scores (n,) of at least `least`, places (n, 3) pairwise `apart` [m] or more apart."""
     chosen: list[int] = []
     for i in scores.argsort(descending=True).tolist():
         if scores[i] < least or len(chosen) == most:

@@ -37,7 +37,7 @@ def reduced_phase(distance: Tensor, frequency_hz: Tensor | float) -> Tensor:
 
 
 def wave(distance: Tensor, frequency_hz: Tensor | float) -> Tensor:
-    """`exp(-j 2 pi f r / c) / r`, complex64, for distances and frequencies broadcast against each other."""
+    """`exp(-j 2 pi f r / c) / r`, complex64, of distances [m] and frequencies [Hz] that broadcast."""
     return torch.polar((1 / distance).float(), reduced_phase(distance, frequency_hz))
 
 

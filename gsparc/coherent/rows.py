@@ -61,7 +61,7 @@ def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: i
 
 
 def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> np.ndarray:
-    """The same for queries: `count` poses, or one shared by all."""
+    """The same (count, E, 3) for queries: `count` poses, or one shared by all."""
     position = rx.position.detach().cpu().double().numpy().reshape(-1, 3)
     rotation = rx.rotation.detach().cpu().double().numpy().reshape(-1, 3, 3)
     places = elements(site, position, rotation, antennas)

@@ -104,7 +104,7 @@ def _covariance(sources: Sources) -> tuple[Tensor, Tensor]:
 
 
 def prior_of(data: Measurements, known: np.ndarray, gains: Gains, anchors: int, seed: int) -> Prior:
-    """Features of the emission: up to `anchors` receivers, the gains' own length."""
+    """Features of the emission: up to `anchors` of the rows `known` (n,), the gains' own length."""
     rng = np.random.default_rng(seed)
     chosen = known if len(known) <= anchors else np.sort(rng.choice(known, anchors, replace=False))
     return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), gains.length, gains.noise)

@@ -72,7 +72,7 @@ class SeenByAll:
 
 
 def matern32(squared: Tensor) -> Tensor:
-    """Matern-3/2 of a squared scaled distance."""
+    """Matern-3/2 of squared distances (...) in units of the length; like them."""
     root = (3 * squared + 1e-9).sqrt()
     return (1 + root) * torch.exp(-root)
 

@@ -35,7 +35,11 @@ def load_newrf(path: str | Path) -> Measurements:
 
 
 def read_newrf(raw: Raw, path: str | Path) -> Reading:
-    """The same from arrays already read, with notes."""
+    """The same from arrays already read, with notes.
+
+    Raises:
+        DataError: as `load_newrf`.
+    """
     missing = [name for name in (*NAMES, "csi", "frequency_hz") if name not in raw.arrays]
     if missing:
         raise DataError(

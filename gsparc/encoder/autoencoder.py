@@ -75,7 +75,10 @@ class Autoencoder(nn.Module):
 
 
 def spread(codes: Tensor) -> Tensor:
-    """Mean of -log of the distance to the nearest other code (Kozachenko and Leonenko's entropy, 1987)."""
+    """Mean of -log of the distance from codes (B, 3) to the nearest other; small where they fill space.
+
+    Minus the entropy of Kozachenko and Leonenko (1987), up to constants.
+    """
     apart = torch.cdist(codes, codes) + torch.eye(len(codes), device=codes.device) * 1e3
     return -(apart.min(dim=1).values + 1e-4).log().mean()
 

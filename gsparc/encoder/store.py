@@ -74,7 +74,11 @@ def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
 def encoder_for(
     folder: Path, settings: EncoderSettings, file: str | Path | None = None
 ) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """What `load_argos` asks for places: a given encoder file, or one trained once and kept in `folder`."""
+    """What `load_argos` asks for places: uplinks (S, U, L) and training rows (n,) to places (S, 3) [m].
+
+    By a given encoder `file`, or one trained once on these rows and kept in `folder`. Asking raises
+    `DataError` where the file is no encoder of such uplinks.
+    """
 
     def encode(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
         if file is not None:

@@ -56,7 +56,11 @@ def channels(
     frequency_hz: np.ndarray,
     antennas: slice = slice(None),
 ) -> Channels:
-    """True and predicted channels of `rows` at absolute frequencies (K,) [Hz], of some of the antennas."""
+    """True and predicted channels of rows (n,) at absolute frequencies (K,) [Hz], of some of the antennas.
+
+    Raises:
+        ValueError: a frequency outside the measured band.
+    """
     assert data.site.subcarriers_hz is not None
     predicted, variance, confidence = [], [], []
     for start in range(0, len(rows), CHUNK):

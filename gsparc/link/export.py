@@ -99,7 +99,11 @@ def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
 
 
 def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
-    """Channels (B, A, K) at other frequencies, and with `symbols` as [rx, rx_ant, tx, tx_ant, symbols, K]."""
+    """Channels (B, A, K) at other frequencies, and with `symbols` as [rx, rx_ant, tx, tx_ant, symbols, K].
+
+    Raises:
+        ValueError: the model does not know its own frequencies, or those wanted lie outside its band.
+    """
     if frequency_hz is not None:
         if site.subcarriers_hz is None:
             raise ValueError("frequency_hz= needs a model that knows its own frequencies")

@@ -278,7 +278,10 @@ def _xy(curve: Curve) -> tuple[np.ndarray, np.ndarray]:
 
 
 def acceptance(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> dict[str, np.ndarray]:
-    """Block error rates of the surest shares at the Eb/N0 where perfect knowledge fails in about a tenth."""
+    """Block error rates of the surest `shares` by `score` (P,), by receiver, with `share` and `ebno_db`.
+
+    At the Eb/N0 where perfect knowledge fails in about a tenth.
+    """
     rates = np.array([b.failed["perfect"].mean() for b in found])
     at = found[int(np.argmin(np.abs(np.log(np.maximum(rates, 1e-3) / 0.1))))]
     curves = {name: np.full(len(shares), np.nan) for name in at.failed}

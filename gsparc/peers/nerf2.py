@@ -100,7 +100,7 @@ class MarchedField(Network):
         return ((arrived * signal).sum(1).abs().square() + TINY).sqrt()
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
-        """Mean squared error of rays drawn at random."""
+        """Mean squared error () of rays drawn at random."""
         sample = torch.randint(len(batch), (self.rays,), generator=draw)
         pixel = torch.randint(len(self.directions), (self.rays,), generator=draw)
         origin, heading = self._rays(batch.rx, sample, pixel)

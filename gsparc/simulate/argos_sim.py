@@ -106,7 +106,11 @@ class World:
 
 
 def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
-    """`count` users that the base station hears, in streets open to it and blocked from it."""
+    """`count` users that the base station hears, in streets open to it and blocked from it.
+
+    Raises:
+        ValueError: fewer than `count` of all places are audible.
+    """
     streets, rng = scene(seed, scatterers), np.random.default_rng([seed, 2])
     drawn = rng.uniform(LOWER, UPPER, (8 * count, 2))
     drawn = drawn[streets.open(drawn)][: 2 * count]

@@ -136,7 +136,7 @@ class Heard(View):
 
 
 def closeness(answers: Tensor, whole: Tensor) -> float:
-    """How near answers are to those of the full model [dB]: what decides without a single measurement."""
+    """How near answers (n, ...) are to those of the full model [dB]: decides without a single measurement."""
     apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
     return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
 

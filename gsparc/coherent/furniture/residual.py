@@ -112,7 +112,7 @@ class Residual:
         return self.root @ torch.cat([scaled.real, scaled.imag])
 
     def nll(self, shade: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
-        """Negative log likelihood; differentiable."""
+        """Negative log likelihood (), in nats; differentiable."""
         return _cost(self.columns(shade, log_amplitude, waves), self.white, self._determinant)
 
     def gains_of_each(self, shade: Tensor, log_amplitude: Tensor) -> Tensor:

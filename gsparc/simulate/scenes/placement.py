@@ -48,7 +48,7 @@ def place(
 
 
 def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
-    """A test that keeps receivers `margin` [m] away from the boxes of a scene and off its sheets."""
+    """A test of places (n, 3) [m]: which (n,) stand `margin` [m] away from all boxes and off all sheets."""
     boxes = np.array([s.keep_out for s in solids if s.keep_out is not None]).reshape(-1, 2, 3)
     walls = [s.vertices for s in solids if s.keep_out is None]
 

@@ -34,7 +34,7 @@ def sheet(name: str, material: str, corner: np.ndarray, first: np.ndarray, secon
 
 
 def box(name: str, material: str, lower: np.ndarray, upper: np.ndarray, turn: float = 0.0) -> Solid:
-    """A box between two corners [m], turned about its upright axis by `turn` [rad]; faces look outwards."""
+    """A box between corners (3,) [m], turned about its upright axis by `turn` [rad]; faces look outwards."""
     lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     unit = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
     middle = (lower + upper) / 2
