@@ -21,7 +21,7 @@ from gsparc.learned import LearnedField
 from gsparc.training import Objects, train
 
 ROOT = Path(__file__).parents[1]
-CONTRACT = {  # DESIGN.md, "Commands"
+CONTRACT = {  # what scripts read of a summary
     "time/train_s", "time/render_ms_p50", "time/render_ms_p95", "time/includes", "machine/threads",
     "machine/load", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
     "dataset/sha256", "dataset/stand_in", "dataset/convergence_error", "split/name", "split/sha256", "seed",
