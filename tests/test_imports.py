@@ -51,6 +51,15 @@ def test_imports_point_one_way(room, file):
         assert not {n.split(".")[0] for n in imported(tree)} & heavy
 
 
+def test_data_know_nothing_of_models_and_losses():
+    """Loaders may ask for a simulation or an encoder, by name; they learn nothing and judge nothing."""
+    allowed = {"data", "ops", "atomic", "simulate", "encoder"}
+    for file in sorted((ROOT / "gsparc" / "data").glob("*.py")):
+        names = [name for name in imported(ast.parse(file.read_text(encoding="utf-8"))) if "." in name]
+        used = {name.split(".")[1] for name in names if name.startswith("gsparc.")}
+        assert used <= allowed, f"{file.name} knows {used - allowed}"
+
+
 @pytest.mark.parametrize("file", [file for _, file in FILES] + [ROOT / "train.py"], ids=lambda p: p.name)
 def test_nothing_prints_and_nothing_happens_at_import(file):
     tree = ast.parse(file.read_text(encoding="utf-8"))

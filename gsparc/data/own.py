@@ -20,10 +20,10 @@ from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import LIGHT, Kind, Measurements
-from gsparc.losses import holds_window
 
 log = logging.getLogger(__name__)
 
+SSIM_WINDOW = 11  # pixels along each side; of losses and metrics, which data do not know
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
@@ -127,10 +127,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     assert static_end is not None and rotation is not None
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
-    if kind == "spectrum" and not holds_window(values):
+    if kind == "spectrum" and min(values.shape[1:]) < SSIM_WINDOW:
         check.notes.append(
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
-            "11 x 11: losses are L1 alone, and no SSIM is told"
+            f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, and no SSIM is told"
         )
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)

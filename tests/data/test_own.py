@@ -3,7 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.newrf import load_newrf
-from gsparc.data.own import from_arrays, load_own, write_own
+from gsparc.data.own import SSIM_WINDOW, from_arrays, load_own, write_own
+from gsparc.losses import WINDOW_RADIUS
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])
@@ -66,6 +67,11 @@ def test_spectra_are_brought_to_unit_scale(spectrum_arrays):
     assert tiny.target.max() == 1 and tiny.site.target_scale == spectrum_arrays["spectrum"].max() * 1e-9
     grey = from_arrays({**spectrum_arrays, "spectrum": (spectrum_arrays["spectrum"] * 255).astype(np.uint8)})
     assert grey.target.dtype == np.uint8 and grey.site.grid.width == 36 and grey.site.grid.periodic
+
+
+def test_images_smaller_than_the_losses_window_are_noted():
+    """The two numbers must be one: data do not know of losses."""
+    assert SSIM_WINDOW == 2 * WINDOW_RADIUS + 1
 
 
 def test_orientation_is_scalar_first_and_local_to_world(csi_arrays):
