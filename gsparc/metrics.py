@@ -22,6 +22,9 @@ from gsparc.data.schema import Kind
 log = logging.getLogger(__name__)
 
 DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
+SMALLEST_UNIT = (
+    1e-140  # squares of channels of a smaller or of its inverse are no numbers: told in stored units
+)
 SILENCE = 1e-6  # of the true power: a silent prediction is 60 dB off, not infinitely
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
@@ -91,7 +94,7 @@ class SpectrumMetrics(SampleMetric):
         p, t = prediction.double().numpy(), target.double().numpy()
         m = np.ones(t.shape, bool) if mask is None else mask.numpy()
         p = np.where(m, p, t)  # an unmeasured pixel can be neither right nor wrong
-        count = np.maximum(m.sum((1, 2)), 1)
+        count = _counted(m.sum((1, 2)))
         mse = ((p - t) ** 2).sum((1, 2)) / count
         return {
             "ssim": [_ssim(a, b, w, SSIM_WINDOW) for a, b, w in zip(p, t, m, strict=True)],
@@ -136,20 +139,21 @@ class ChannelMetrics(SampleMetric):
         # Of stored units, which are near 1: fourth powers of a channel of 1e-90 or 1e90 are no numbers.
         p, t = (x.to(torch.complex128).flatten(1).numpy() for x in (prediction, target))
         m = np.ones(t.shape, bool) if mask is None else mask.flatten(1).numpy()
-        p, t, count = np.where(m, p, 0), np.where(m, t, 0), np.maximum(m.sum(1), 1)
+        p, t, count = np.where(m, p, 0), np.where(m, t, 0), _counted(m.sum(1))
         error, power = (np.abs(p - t) ** 2).sum(1), (np.abs(t) ** 2).sum(1)
         own, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
         explained = np.divide(cross, own, out=np.zeros_like(own), where=own > 0)
         # One free number fits one number: for a single-entry channel the figure would say nothing.
         left = np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan
-        unit = self.scale**2
+        scale = self.scale if SMALLEST_UNIT <= self.scale <= 1 / SMALLEST_UNIT else 1.0
+        unit = scale**2
         return {
             "error_power": error * unit,
             "target_power": power * unit,
             "scalar_error_power": left * unit,
             "snr_db": _db(power, error),
             "mse": error / count * unit,
-            "mae": np.abs(p - t).sum(1) / count * self.scale,
+            "mae": np.abs(p - t).sum(1) / count * scale,
             "power_db": np.where(power > 0, _db(np.maximum(own, power * SILENCE), power), np.nan),
         }
 
@@ -266,10 +270,15 @@ def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, wind
 
 
 def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """10 log10(signal / noise) within +-DB_CAP; NaN where there is no signal."""
+    """10 log10(signal / noise) within +-DB_CAP; NaN where there is no signal or nothing is known."""
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = 10 * (np.log10(signal) - np.log10(noise))
-    return np.where(signal > 0, np.clip(np.where(noise > 0, ratio, np.inf), -DB_CAP, DB_CAP), np.nan)
+    return np.where(signal > 0, np.clip(np.where(noise == 0, np.inf, ratio), -DB_CAP, DB_CAP), np.nan)
+
+
+def _counted(entries: np.ndarray) -> np.ndarray:
+    """Numbers of measured entries (B,) to divide by; NaN where nothing was measured: that is not perfect."""
+    return np.where(entries > 0, entries, np.nan)
 
 
 def _mean(values: np.ndarray) -> float | None:
