@@ -7,6 +7,7 @@ import pytest
 import torch
 from rooms import PILLAR, WAVELENGTH, shoebox
 
+from gsparc.coherent.furniture import mirrors
 from gsparc.coherent.furniture.boxes import find_box
 from gsparc.coherent.furniture.clutter import Clutter, Screens, shade, tangents
 from gsparc.coherent.furniture.descent import Accord
@@ -192,15 +193,20 @@ def test_the_pillar_is_found_by_its_shadow():
     torch.testing.assert_close(middle, torch.tensor([1.8, 1.4]), atol=0.25, rtol=0)
 
 
-def test_a_table_top_is_found_by_its_reflections():
+def _beside_a_table(count: int) -> tuple:
+    """Rows of a room with a table, what its walls alone leave unexplained, the table, and the walls."""
     planes, clutter = _table()
     words = (*_words(1), (6,), (6, 5), (2, 6))
     true = Scene(TRANSMITTER, planes, words, torch.zeros(len(words)), -4.0, clutter=clutter)
-    rows = _truth(true, _rows(200))
+    rows = _truth(true, _rows(count))
     residual = Residual(rows, PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2))
     scene = residual.phased.scene
-    explained = residual.explained(torch.ones(7, 200), scene.log_amplitude)
-    numbers = walls(scene.planes, scene.words)
+    explained = residual.explained(torch.ones(7, count), scene.log_amplitude)
+    return rows, explained, clutter, walls(scene.planes, scene.words)
+
+
+def test_a_table_top_is_found_by_its_reflections():
+    rows, explained, clutter, numbers = _beside_a_table(200)
     best = find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, _room(), 3)[0]
     assert best.plane[2].abs() == 1
     assert (best.plane[3] * best.plane[2] - 0.75).abs() < WAVELENGTH
@@ -210,6 +216,18 @@ def test_a_table_top_is_found_by_its_reflections():
     torch.testing.assert_close(
         middle, (clutter.patches[0, :2] + clutter.patches[0, 2:]) / 2, atol=0.4, rtol=0
     )
+
+
+def test_mirrors_of_a_wide_site_are_not_looked_for(monkeypatch, caplog):
+    """A raster of 35 cm cells over 40 km asked for six terabytes."""
+    rows, explained, _, numbers = _beside_a_table(60)
+    whole = find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, _room(), 3)
+    monkeypatch.setattr(mirrors, "BLOCK_CELLS", 2e4)  # the raster in parts is the same
+    parts = find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, _room(), 3)
+    assert len(whole) > 0 and [m.score for m in parts] == [m.score for m in whole]
+    with caplog.at_level("INFO"):
+        assert find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, 1e4 * _room(), 3) == []
+    assert "not looked for" in caplog.text
 
 
 def test_an_endless_mirror_gets_its_ends():

@@ -6,6 +6,7 @@ every receiver whose reflection would lie elsewhere is left out of the sum.
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from itertools import product
@@ -21,6 +22,8 @@ from gsparc.coherent.phase import LIGHT, NEAR_M
 from gsparc.coherent.planes import Word, reflect
 from gsparc.coherent.rows import Rows
 
+log = logging.getLogger(__name__)
+
 SMALLEST, LARGEST = 0.2, 3.0  # [m] sides of random patches
 LEAST_SIDE = 0.05  # [m]
 PARALLEL = 0.999  # cosine of normals that are one
@@ -28,6 +31,8 @@ CELL = 0.35  # [m] of the raster on which small mirrors are looked for
 STEP = 0.08  # of a wavelength, between planes tried
 BEHIND = 0.4  # [m], how far behind the receivers' box planes are tried
 LONGEST = 6  # cells along each side of a rectangle
+MOST_CELLS = 2e8  # of all rasters along one wall's normal; a site with more is no room
+BLOCK_CELLS = 2e7  # of the rasters held at a time, four numbers each
 TINY = 4  # receivers that a small mirror must serve
 
 
@@ -130,6 +135,7 @@ def find_mirrors(
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its words (itself, after and
     before each wall) are collected in a raster of where it is met; integral images give every rectangle.
+    In a site so wide, or of waves so short, that these are more than `MOST_CELLS` none is looked for.
 
     Args:
         rows: n.
@@ -149,7 +155,17 @@ def find_mirrors(
             float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
         )
         candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
-        total, corners = _raster(rows, pulled, scale, transmitter, candidates, known, room)
+        each = math.prod(_cells(room, tangents(candidates[0]))) * (1 + 2 * len(known))
+        if each * len(candidates) > MOST_CELLS:
+            log.info(
+                "small mirrors are not looked for: %.0e cells in a site this wide", each * len(candidates)
+            )
+            continue
+        parts = [
+            _raster(rows, pulled, scale, transmitter, block, known, room)
+            for block in candidates.split(max(1, int(BLOCK_CELLS / each)))
+        ]
+        total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * most, len(total))).indices.tolist():
             found.append(SmallMirror(candidates[number], corners[number], float(total[number])))
     return _apart(found, 0.5 * wavelength)[:most]
@@ -182,9 +198,7 @@ def _raster(
 ) -> tuple[Tensor, Tensor]:
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
     along = tangents(candidates[0])
-    ends = room @ along.T
-    low, high = ends.amin(0), ends.amax(0)
-    cells = ((high - low) / CELL).ceil().long().clamp_min(1).tolist()
+    low, cells = (room @ along.T).amin(0), _cells(room, along)
     matched: list[Tensor] = []
     power: list[Tensor] = []
     served: list[Tensor] = []
@@ -217,6 +231,12 @@ def _raster(
         total = torch.where(better, value, total)
         best = torch.where(better[:, None], corners, best)
     return total, best
+
+
+def _cells(room: Tensor, along: Tensor) -> list[int]:
+    """Cells of a raster along each of two tangents (2, 3)."""
+    ends = room @ along.T
+    return ((ends.amax(0) - ends.amin(0)) / CELL).ceil().long().clamp_min(1).tolist()
 
 
 def _sources(
