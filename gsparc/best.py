@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import time
 from dataclasses import replace
@@ -19,6 +20,7 @@ from gsparc.effects import (
     SPLAT,
     Decision,
     EffectSettings,
+    contest_array,
     decide_array,
     decide_directions,
     decide_phase,
@@ -172,7 +174,17 @@ class Gsparc(LearnedField):
             phase = probe_phase(self._probe, GaussianProcess(), data, fold, self.training.seed)
         if array.on and self.switches.array == "auto":
             array = probe_array(data, fold, self.training.seed)
+            if array.on and data.site.static_end == "rx":
+                array = self._contest(array, data, fold)
         return phase, array, directions
+
+    def _contest(self, array: Decision, data: Measurements, fold: Fold) -> Decision:
+        """The array's vectors explain the spectra; whether they also foretell them."""
+        trial = copy.deepcopy(self._models["array"])
+        contest = contest_array(trial, GaussianProcess(), data, fold, self.training.seed)
+        if contest.on:
+            return replace(array, seconds=array.seconds + contest.seconds)
+        return replace(contest, seconds=array.seconds + contest.seconds)
 
     def _search_beside(self, data: Measurements, fold: Fold) -> Decision:
         """Whether a search is worth its time beside measured directions."""

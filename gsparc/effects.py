@@ -24,6 +24,8 @@ SPLAT = "splat"
 
 DENSE = 0.25  # neighbours closer than this many wavelengths can be interpolated without a carrier
 PROBE_IMAGES = 12
+LOOSE = 0.5  # wavelengths between neighbours beyond which their vectors need not tell of one another
+CONTEST_ROWS = 400  # neighbouring training spectra that a contest of two methods is held on
 ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
 
 
@@ -216,6 +218,38 @@ def probe_array(data: Measurements, fold: Fold, seed: int) -> Decision:
     elements = len(data.site.array)
     reason = f"{share:.0%} of {len(rows)} probed images are explained by {elements} complex numbers each"
     return Decision("array", share >= ARRAY_SHARE, reason, time.perf_counter() - started)
+
+
+def contest_array(trial: Method, rival: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
+    """Let the array and a process of images predict a held-out fifth of training spectra that lie far apart.
+
+    Leaving out single vectors does not tell: their phases were settled together, and among neighbours
+    wavelengths apart that alone makes them agree.
+
+    Args:
+        trial: an unfitted array field.
+        rival: an unfitted interpolator.
+        data, fold: only training rows are looked at.
+        seed: of the draw.
+    """
+    started, rows = time.perf_counter(), fold.train
+    apart = spacing_in_wavelengths(data, rows)
+    if apart < LOOSE or len(rows) < 10:
+        return Decision("array", True, "neighbours are near enough to tell of one another")
+    if len(rows) > CONTEST_ROWS:
+        places = data.moving[rows]
+        middle = places[np.random.default_rng(seed).integers(len(rows))]
+        rows = np.sort(rows[np.argsort(np.linalg.norm(places - middle, axis=1))[:CONTEST_ROWS]])
+    inner = fifths(rows, seed)[0]
+    batch, errors = data.batch(inner.test), []
+    for method in (trial, rival):
+        method.fit(data, inner, Path())
+        errors.append(float((method.predict(batch.tx, batch.rx).mean - batch.target).square().mean()))
+    reason = (
+        f"neighbours are {apart:.2f} wavelengths apart; on a held-out fifth of the training spectra the "
+        f"array's squared error is {errors[0]:.4f}, the Gaussian process's {errors[1]:.4f}"
+    )
+    return Decision("array", errors[0] < errors[1], reason, time.perf_counter() - started)
 
 
 def _probe_moving_array(data: Measurements, rows: np.ndarray, started: float) -> Decision:

@@ -183,13 +183,14 @@ def run_stage(
 
 
 def _hush() -> None:
-    """Lightning advertises and repeats what the progress line says; its warnings stay, but for five."""
+    """Lightning advertises and repeats what the progress line says; its warnings stay, but for six."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     for pointless in (
         r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
         r".*does not have many workers.*",  # data this small is faster without
         r".*callbacks used to create the checkpoint need to be provided.*",  # a rhythm may change
         r".*The dirpath has changed.*",  # a resumed run may have a directory of its own
+        r".*smaller than the logging interval.*",  # small campaigns have few batches
         r".*Checkpoint directory .* exists and is not empty.*",  # it is the run directory
     ):
         warnings.filterwarnings("ignore", pointless)

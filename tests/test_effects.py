@@ -7,12 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boxes import room_of_spectra
+from known_arrays import array_site, measure, room_vectors
 from rooms import directed
 
-from gsparc.data.rfid import load_rfid
+from gsparc.array.field import ArrayField
+from gsparc.data.rfid import load_rfid, planar_array
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.effects import (
+    contest_array,
     decide_array,
     decide_directions,
     decide_phase,
@@ -20,6 +23,8 @@ from gsparc.effects import (
     probe_array,
     spacing_in_wavelengths,
 )
+from gsparc.ops import SphereGrid
+from gsparc.peers.gp import GaussianProcess
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
 
 
@@ -93,6 +98,20 @@ def test_probe_accepts_the_array_that_measured_and_refuses_another(spectra) -> N
         probe_array(replace(spectra, target=blanked), fold, seed=0).reason
         == probe_array(spectra, fold, seed=0).reason
     )
+
+
+def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images() -> None:
+    """Spectra of places wavelengths apart went through the array: 18.0 dB, where a process has 23.8."""
+    site = array_site(SphereGrid.hemisphere(15, 60), planar_array())
+    apart = np.random.default_rng(0).uniform([0.5, 0.5, 0.5], [5.5, 4.5, 2.0], (40, 3))
+    data = measure(site, apart, room_vectors(apart, 1, site.array)[0], sha256="apart")
+    fold = Fold(np.arange(36), np.arange(0), np.arange(36, 40))
+    trial = ArrayField(cache=False)
+    assert probe_array(data, fold, seed=0).on  # it explains them all the same
+    decision = contest_array(trial, GaussianProcess(), data, fold, seed=0)
+    assert not decision.on and "wavelengths apart" in decision.reason
+    near = replace(data, tx=apart / 20)
+    assert contest_array(trial, GaussianProcess(), near, fold, seed=0).seconds == 0.0  # not held
 
 
 def test_spacing_is_in_wavelengths(spectra) -> None:
