@@ -7,20 +7,22 @@ from pathlib import Path
 
 import pytest
 from invented import divide, invent
+from releases import real
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-
-REAL_DATA = Path(__file__).parents[1] / ".." / "shared" / "data"
 
 
 @pytest.fixture(scope="session")
 def real_rfid() -> Path:
     """Folder of the real subset."""
-    folder = REAL_DATA / "rfid-s23-160"
-    if not folder.is_dir():
-        pytest.skip(f"real data not present at {folder}")
-    return folder
+    return real("rfid-s23-160")
+
+
+@pytest.fixture(scope="session")
+def real_newrf() -> Path:
+    """File of the conference room."""
+    return real("newrf-conference.npz")
 
 
 @pytest.fixture(scope="session")

@@ -2,50 +2,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-
-from gsparc.data.rfid import HEIGHT, WIDTH
-
-SHARED = Path(__file__).resolve().parents[2] / ".." / "shared" / "data"
-
-
-def _real(name: str) -> Path:
-    path = SHARED / name
-    if not path.exists():
-        pytest.skip(f"real data not found at ../shared/data/{name}")
-    return path
-
-
-@pytest.fixture
-def real_rfid() -> Path:
-    return _real("rfid-s23-160")
-
-
-@pytest.fixture
-def real_newrf() -> Path:
-    return _real("newrf-conference.npz")
+from releases import write_release
 
 
 @pytest.fixture
 def rfid_folder(tmp_path) -> Path:
     """Six spectra in the release's layout."""
-    root = tmp_path / "release"
-    (root / "spectrum").mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    for i in range(1, 7):
-        image = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8))
-        image.save(root / "spectrum" / f"{i:05d}.png", compress_level=1)
-    (root / "gateway_info.yml").write_text(
-        "dataset_name: s23\n"
-        "gateway1:\n  position: [5.0, 0.26, 0]\n"
-        "  orientation: [0.51291602, -0.48674136, -0.48674136, 0.51291602]\n"
-        "gateway2:\n  position: [0, 0, 2]\n  orientation: [0, 0, 0, 1]\n"
-    )
-    rows = "".join(f"{0.1 * i:.4f},0.2000,1.0000\n" for i in range(6))
-    (root / "tx_pos.csv").write_text("x,y,z\n" + rows)
-    (root / "train_index.txt").write_text("00001\n00003\n00004\n00006\n")
-    (root / "test_index.txt").write_text("00002\n00005\n")
-    return root
+    return write_release(tmp_path / "release")
 
 
 @pytest.fixture

@@ -1,106 +1,18 @@
 """Everything a disk can hand us: refused in one clear line that names file, row and expectation."""
 # ruff: noqa: E501 (a case is a row of a table)
 
-import io
 import json
-import shutil
 
 import h5py
 import numpy as np
 import pytest
-from PIL import Image
+from releases import SPOILT
 
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.load import load
 from gsparc.data.newrf import load_newrf
 from gsparc.data.own import from_arrays, load_own, write_own
 from gsparc.data.rfid import load_rfid
-
-
-def _replace(name, old, new):
-    def spoil(root):
-        text = (root / name).read_text(encoding="utf-8")
-        assert old in text
-        (root / name).write_text(text.replace(old, new, 1), encoding="utf-8")
-
-    return spoil
-
-
-def _write(name, content):
-    return lambda root: (root / name).write_bytes(content)
-
-
-def _remove(name):
-    def spoil(root):
-        path = root / name
-        shutil.rmtree(path) if path.is_dir() else path.unlink()
-
-    return spoil
-
-
-def _image(array, mode=None, kind="PNG"):
-    buffer = io.BytesIO()
-    Image.fromarray(array, mode).save(buffer, format=kind)
-    return _write("spectrum/00003.png", buffer.getvalue())
-
-
-def _truncated(root):
-    path = root / "spectrum/00003.png"
-    path.write_bytes(path.read_bytes()[:5000])
-
-
-def _flipped(root):
-    path = root / "spectrum/00003.png"
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 0xFF
-    path.write_bytes(bytes(content))
-
-
-grey = np.zeros((90, 360), dtype=np.uint8)
-RFID = {
-    "gateway missing": (_remove("gateway_info.yml"), r"gateway_info\.yml: missing"),
-    "gateway not yaml": (_write("gateway_info.yml", b"a: [1, 2"), "not readable as YAML"),
-    "gateway binary": (_write("gateway_info.yml", b"\xff\xfe\x00\x80"), "not readable as YAML"),
-    "gateway empty": (_write("gateway_info.yml", b""), "expected entries like"),
-    "no gateway": (_write("gateway_info.yml", b"dataset_name: s23\n"), "no gateway in it"),
-    "two coordinates": (_replace("gateway_info.yml", "[5.0, 0.26, 0]", "[5.0, 0.26]"), "three finite numbers"),
-    "gateway nan": (_replace("gateway_info.yml", "0.26", ".nan"), "three finite numbers"),
-    "gateway on Mars": (_replace("gateway_info.yml", "0.26", "3.0e+38"), "none beyond 1e[+]07"),
-    "gateway words": (_replace("gateway_info.yml", "0.26", "north"), "three finite numbers"),
-    "no orientation": (_replace("gateway_info.yml", "orientation", "turned"), "four finite numbers"),
-    "zero quaternion": (_replace("gateway_info.yml", "[0.51291602, -0.48674136, -0.48674136, 0.51291602]",
-                                 "[0, 0, 0, 0]"), "length 1"),
-    "csv missing": (_remove("tx_pos.csv"), r"tx_pos\.csv: missing"),
-    "csv empty": (_write("tx_pos.csv", b""), "line 1: expected the header x,y,z, found an empty file"),
-    "csv no header": (_replace("tx_pos.csv", "x,y,z\n", ""), "line 1: expected the header x,y,z"),
-    "csv no rows": (_write("tx_pos.csv", b"x,y,z\n"), "no rows"),
-    "csv binary": (_write("tx_pos.csv", b"x,y,z\n\xff\xfe"), "not readable as CSV"),
-    "csv nan": (_replace("tx_pos.csv", "0.3000", "nan"), "line 5 = .*three finite coordinates"),
-    "csv infinite": (_replace("tx_pos.csv", "0.3000", "-inf"), "line 5 = .*three finite coordinates"),
-    "csv 1e38": (_replace("tx_pos.csv", "0.3000", "1e38"), "line 5 = .*none beyond"),
-    "csv word": (_replace("tx_pos.csv", "0.3000", "three"), "line 5: expected three numbers"),
-    "csv two columns": (_replace("tx_pos.csv", "0.3000,", ""), "line 5: expected three numbers"),
-    "csv blank row": (_replace("tx_pos.csv", "0.3000,0.2000,1.0000", ""), "line 5: expected three numbers"),
-    "csv row missing": (_replace("tx_pos.csv", "0.3000,0.2000,1.0000\n", ""), "00006.png: no row for it in tx_pos"),
-    "spectra missing": (_remove("spectrum"), "spectrum: missing"),
-    "spectrum missing": (_remove("spectrum/00003.png"), "00003.png: missing, but tx_pos.csv has 6 rows"),
-    "spectrum truncated": (_truncated, "00003.png: expected an 8-bit grey PNG.*not readable"),
-    "spectrum bit flipped": (_flipped, "00003.png: expected an 8-bit grey PNG.*not readable"),
-    "spectrum empty": (_write("spectrum/00003.png", b""), "00003.png: .*not readable"),
-    "spectrum is text": (_write("spectrum/00003.png", b"hello"), "00003.png: .*not readable"),
-    "spectrum 16 bit": (_image(grey.astype(np.uint16)), "8-bit grey PNG.*found mode I;16"),
-    "spectrum colour": (_image(np.zeros((90, 360, 3), np.uint8)), "8-bit grey PNG.*found mode RGB"),
-    "spectrum turned": (_image(grey.T.copy()), "360 x 90 pixels, found 90 x 360"),
-    "spectrum is jpeg": (_image(grey, kind="JPEG"), "not readable"),
-    "index out of range": (_replace("train_index.txt", "00006", "00007"), "line 4: index 00007 is out of range"),
-    "index zero": (_replace("train_index.txt", "00001", "00000"), "line 1: index 00000 is out of range"),
-    "index twice": (_replace("train_index.txt", "00006", "00003"), "line 4: index 00003 appears twice.*line 2"),
-    "index word": (_replace("train_index.txt", "00006", "six"), "line 4: expected the number.*'six'"),
-    "index superscript": (_replace("train_index.txt", "00006", "6²"), "line 4: expected the number"),
-    "index in both": (_replace("test_index.txt", "00002", "00003"), "00003: also in train_index.txt"),
-    "index file empty": (_write("train_index.txt", b""), "no usable index"),
-    "index file alone": (_remove("test_index.txt"), "test_index.txt: missing, but train_index.txt is there"),
-}  # fmt: skip
 
 
 def _one_clear_line(error, pattern):
@@ -112,9 +24,9 @@ def _one_clear_line(error, pattern):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("case", RFID)
+@pytest.mark.parametrize("case", SPOILT)
 def test_rfid_folder(rfid_folder, case):
-    spoil, pattern = RFID[case]
+    spoil, pattern = SPOILT[case]
     spoil(rfid_folder)
     with pytest.raises(DataError) as error:
         load_rfid(rfid_folder)
@@ -129,7 +41,7 @@ def test_rfid_unknown_gateway(rfid_folder):
 
 def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
     for case in ("csv nan", "spectrum truncated", "index twice"):
-        RFID[case][0](rfid_folder)
+        SPOILT[case][0](rfid_folder)
     with pytest.raises(DataError, match=r"and 2 more: python -m gsparc\.check") as error:
         load_rfid(rfid_folder)
     assert len(error.value.problems) == 3

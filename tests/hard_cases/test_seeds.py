@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 from campaigns import brief, channels, compose, spectra
 from ledger import LEDGER
+from releases import REAL
 
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.load import load, split_for
 from gsparc.registry import build
 from gsparc.trainer import TrainerSettings, Training
-
-REAL = Path(__file__).parents[3] / "shared" / "data"
 
 
 def dataset(name: str, folder: Path) -> tuple[str, dict]:

@@ -7,41 +7,22 @@ Remedy: gsparc/data/rfid.py. The cases of tests/data/test_bad_input.py come agai
 from __future__ import annotations
 
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from doors import assert_found_bad, assert_refused, knock
 from PIL import Image
+from releases import GREY, SPOILT, write_release
 
 from gsparc.check import main as check
 from gsparc.training import main as train
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "data"))
-from test_bad_input import RFID
-
 
 @pytest.fixture(scope="module")
 def sound(tmp_path_factory) -> Path:
-    """Eight spectra, in a folder whose name is not ASCII."""
-    root = tmp_path_factory.mktemp("Messung Größe 米") / "release"
-    (root / "spectrum").mkdir(parents=True)
-    rng = np.random.default_rng(0)
-    for i in range(1, 7):
-        grey = Image.fromarray(rng.integers(0, 256, (90, 360), dtype=np.uint8))
-        grey.save(root / "spectrum" / f"{i:05d}.png", compress_level=1)
-    (root / "gateway_info.yml").write_text(
-        "dataset_name: s23\n"
-        "gateway1:\n  position: [5.0, 0.26, 0]\n"
-        "  orientation: [0.51291602, -0.48674136, -0.48674136, 0.51291602]\n"
-        "gateway2:\n  position: [0, 0, 2]\n  orientation: [0, 0, 0, 1]\n"
-    )
-    rows = "".join(f"{0.1 * i:.4f},0.2000,1.0000\n" for i in range(6))
-    (root / "tx_pos.csv").write_text("x,y,z\n" + rows)
-    (root / "train_index.txt").write_text("00001\n00003\n00004\n00006\n")
-    (root / "test_index.txt").write_text("00002\n00005\n")
-    return root
+    """Six spectra, in a folder whose name is not ASCII."""
+    return write_release(tmp_path_factory.mktemp("Messung Größe 米") / "release")
 
 
 @pytest.fixture
@@ -61,7 +42,6 @@ def rename(old: str, new: str):
     return lambda root: (root / old).rename(root / new)
 
 
-GREY = np.zeros((90, 360), dtype=np.uint8)
 MORE = {
     "palette": (lambda r: Image.fromarray(GREY).convert("P").save(r / "spectrum/00003.png"), "found mode P"),
     "one bit": (lambda r: Image.fromarray(GREY).convert("1").save(r / "spectrum/00003.png"), "found mode 1"),
@@ -94,7 +74,7 @@ MORE = {
     "quaternion of length 2": (rewrite("gateway_info.yml", "0.51291602, -0.48674136", "2, -0.48674136"), "length 1"),
     "true as a coordinate": (rewrite("gateway_info.yml", "0.26", "true"), "three finite numbers"),
 }  # fmt: skip
-CASES = {**RFID, **MORE}
+CASES = {**SPOILT, **MORE}
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -1,0 +1,130 @@
+"""The RFID release's layout, sound and spoilt, and where real data lie."""
+# ruff: noqa: E501 (a case is a row of a table)
+
+from __future__ import annotations
+
+import io
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from gsparc.data.rfid import HEIGHT, WIDTH
+
+REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
+
+
+def real(name: str) -> Path:
+    """A file or folder of real data; the test is skipped, loudly, where it is not."""
+    path = REAL / name
+    if not path.exists():
+        pytest.skip(f"real data not found at {path}")
+    return path
+
+
+def write_release(root: Path) -> Path:
+    """Six spectra in the release's layout; returns the folder."""
+    (root / "spectrum").mkdir(parents=True)
+    rng = np.random.default_rng(0)
+    for i in range(1, 7):
+        image = Image.fromarray(rng.integers(0, 256, (HEIGHT, WIDTH), dtype=np.uint8))
+        image.save(root / "spectrum" / f"{i:05d}.png", compress_level=1)
+    (root / "gateway_info.yml").write_text(
+        "dataset_name: s23\n"
+        "gateway1:\n  position: [5.0, 0.26, 0]\n"
+        "  orientation: [0.51291602, -0.48674136, -0.48674136, 0.51291602]\n"
+        "gateway2:\n  position: [0, 0, 2]\n  orientation: [0, 0, 0, 1]\n"
+    )
+    rows = "".join(f"{0.1 * i:.4f},0.2000,1.0000\n" for i in range(6))
+    (root / "tx_pos.csv").write_text("x,y,z\n" + rows)
+    (root / "train_index.txt").write_text("00001\n00003\n00004\n00006\n")
+    (root / "test_index.txt").write_text("00002\n00005\n")
+    return root
+
+
+def _replace(name, old, new):
+    def spoil(root):
+        text = (root / name).read_text(encoding="utf-8")
+        assert old in text
+        (root / name).write_text(text.replace(old, new, 1), encoding="utf-8")
+
+    return spoil
+
+
+def _write(name, content):
+    return lambda root: (root / name).write_bytes(content)
+
+
+def _remove(name):
+    def spoil(root):
+        path = root / name
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return spoil
+
+
+def _image(array, mode=None, kind="PNG"):
+    buffer = io.BytesIO()
+    Image.fromarray(array, mode).save(buffer, format=kind)
+    return _write("spectrum/00003.png", buffer.getvalue())
+
+
+def _truncated(root):
+    path = root / "spectrum/00003.png"
+    path.write_bytes(path.read_bytes()[:5000])
+
+
+def _flipped(root):
+    path = root / "spectrum/00003.png"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(bytes(content))
+
+
+GREY = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
+SPOILT = {  # how a sound folder is spoilt, and what is then said
+    "gateway missing": (_remove("gateway_info.yml"), r"gateway_info\.yml: missing"),
+    "gateway not yaml": (_write("gateway_info.yml", b"a: [1, 2"), "not readable as YAML"),
+    "gateway binary": (_write("gateway_info.yml", b"\xff\xfe\x00\x80"), "not readable as YAML"),
+    "gateway empty": (_write("gateway_info.yml", b""), "expected entries like"),
+    "no gateway": (_write("gateway_info.yml", b"dataset_name: s23\n"), "no gateway in it"),
+    "two coordinates": (_replace("gateway_info.yml", "[5.0, 0.26, 0]", "[5.0, 0.26]"), "three finite numbers"),
+    "gateway nan": (_replace("gateway_info.yml", "0.26", ".nan"), "three finite numbers"),
+    "gateway on Mars": (_replace("gateway_info.yml", "0.26", "3.0e+38"), "none beyond 1e[+]07"),
+    "gateway words": (_replace("gateway_info.yml", "0.26", "north"), "three finite numbers"),
+    "no orientation": (_replace("gateway_info.yml", "orientation", "turned"), "four finite numbers"),
+    "zero quaternion": (_replace("gateway_info.yml", "[0.51291602, -0.48674136, -0.48674136, 0.51291602]",
+                                 "[0, 0, 0, 0]"), "length 1"),
+    "csv missing": (_remove("tx_pos.csv"), r"tx_pos\.csv: missing"),
+    "csv empty": (_write("tx_pos.csv", b""), "line 1: expected the header x,y,z, found an empty file"),
+    "csv no header": (_replace("tx_pos.csv", "x,y,z\n", ""), "line 1: expected the header x,y,z"),
+    "csv no rows": (_write("tx_pos.csv", b"x,y,z\n"), "no rows"),
+    "csv binary": (_write("tx_pos.csv", b"x,y,z\n\xff\xfe"), "not readable as CSV"),
+    "csv nan": (_replace("tx_pos.csv", "0.3000", "nan"), "line 5 = .*three finite coordinates"),
+    "csv infinite": (_replace("tx_pos.csv", "0.3000", "-inf"), "line 5 = .*three finite coordinates"),
+    "csv 1e38": (_replace("tx_pos.csv", "0.3000", "1e38"), "line 5 = .*none beyond"),
+    "csv word": (_replace("tx_pos.csv", "0.3000", "three"), "line 5: expected three numbers"),
+    "csv two columns": (_replace("tx_pos.csv", "0.3000,", ""), "line 5: expected three numbers"),
+    "csv blank row": (_replace("tx_pos.csv", "0.3000,0.2000,1.0000", ""), "line 5: expected three numbers"),
+    "csv row missing": (_replace("tx_pos.csv", "0.3000,0.2000,1.0000\n", ""), "00006.png: no row for it in tx_pos"),
+    "spectra missing": (_remove("spectrum"), "spectrum: missing"),
+    "spectrum missing": (_remove("spectrum/00003.png"), "00003.png: missing, but tx_pos.csv has 6 rows"),
+    "spectrum truncated": (_truncated, "00003.png: expected an 8-bit grey PNG.*not readable"),
+    "spectrum bit flipped": (_flipped, "00003.png: expected an 8-bit grey PNG.*not readable"),
+    "spectrum empty": (_write("spectrum/00003.png", b""), "00003.png: .*not readable"),
+    "spectrum is text": (_write("spectrum/00003.png", b"hello"), "00003.png: .*not readable"),
+    "spectrum 16 bit": (_image(GREY.astype(np.uint16)), "8-bit grey PNG.*found mode I;16"),
+    "spectrum colour": (_image(np.zeros((90, 360, 3), np.uint8)), "8-bit grey PNG.*found mode RGB"),
+    "spectrum turned": (_image(GREY.T.copy()), "360 x 90 pixels, found 90 x 360"),
+    "spectrum is jpeg": (_image(GREY, kind="JPEG"), "not readable"),
+    "index out of range": (_replace("train_index.txt", "00006", "00007"), "line 4: index 00007 is out of range"),
+    "index zero": (_replace("train_index.txt", "00001", "00000"), "line 1: index 00000 is out of range"),
+    "index twice": (_replace("train_index.txt", "00006", "00003"), "line 4: index 00003 appears twice.*line 2"),
+    "index word": (_replace("train_index.txt", "00006", "six"), "line 4: expected the number.*'six'"),
+    "index superscript": (_replace("train_index.txt", "00006", "6²"), "line 4: expected the number"),
+    "index in both": (_replace("test_index.txt", "00002", "00003"), "00003: also in train_index.txt"),
+    "index file empty": (_write("train_index.txt", b""), "no usable index"),
+    "index file alone": (_remove("test_index.txt"), "test_index.txt: missing, but train_index.txt is there"),
+}  # fmt: skip
