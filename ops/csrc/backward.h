@@ -10,7 +10,7 @@ namespace GSPARC_ISA {
 
 // A cell holds what one tile needs: transmittance, what is still to come, upstream gradient per channel.
 template <class S, bool kTangent, bool kHides, int kChannels>
-void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch,
+void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch,
                               S* cells, S* sums_memory, S* moments, S* feature_slots) {
     constexpr int n = Lanes<S>::n;
     const CompositeArgs<S>& a = b.forward;
@@ -32,17 +32,17 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>&
             for (int j = 0; j < count; ++j) behind[j] += b.grad_transmittance[at + j] * a.transmittance[at + j];
     });
     const Lights<S> lights = {cells, cell, floor};
-    const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
         Vec<S> feature[kChannels ? kChannels : 1], local[kChannels ? kChannels : 1];
         for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]), local[k] = splat(S(0));
         if (!kChannels) fill(sums_memory, int64_t(k_count) * n, S(0));
         MomentSums<S, kTangent, kHides> sums;
         for (; hit < end; ++hit) {
-            S* mine = cells + int64_t(hit->tile) * cell;
+            S* mine = cells + int64_t(*hit) * cell;
             typename Shape<S, kTangent>::Seen seen;
             const Vec<S> light = load(mine);
-            const Mask<S> counts = shape.look(columns + hit->at, seen) & at_most(floor, light);
+            const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
             const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha;
             Vec<S> gain = splat(S(0));
@@ -133,13 +133,13 @@ template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
     const CompositeArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
     const Rises<S> stage(a.lens);
-    const Lines<S> lines(plan, a.model, a.lens, a.features, a.samples, a.channels, a.threads);
+    const Lines<S> lines(plan, a.model, stage, a.lens, a.features, a.samples, a.channels, a.threads);
     const int k_count = channels_of(a);
     const int64_t area = int64_t(stage.tiles) * Lanes<S>::n * (2 + k_count), scratch = area + int64_t(k_count) * Lanes<S>::n;
     const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
     Buffer<S> memory(scratch * a.threads), moments(entries * kMoments), feature_slots(entries * k_count);
     with_switches(a.lens.tangent, a.model.extinctions, k_count, [&](auto tangent, auto hides, auto channels) {
-        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
+        Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             S* mine = memory.data + worker * scratch;
             composite_backward_strip<S, tangent.value, hides.value, channels.value>(b, lines, stage, task, batches[worker], mine, mine + area, moments.data, feature_slots.data);
@@ -167,7 +167,7 @@ template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
 }
 
 template <class S, bool kTangent, bool kHides>
-void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* cells,
+void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells,
                           S* moments) {
     constexpr int n = Lanes<S>::n;
     const WeightArgs<S>& a = b.forward;
@@ -176,15 +176,15 @@ void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines,
     fill(cells, int64_t(stage.tiles) * 2 * n, S(0));
     for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
         for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
-        const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
             const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
             const Vec<S> per_seen = splat(line[kFeatures]), per_alpha = splat(line[kFeatures + 1]);
             MomentSums<S, kTangent, kHides> sums;
             for (; hit < end; ++hit) {
-                S* mine = cells + int64_t(hit->tile) * 2 * n;
+                S* mine = cells + int64_t(*hit) * 2 * n;
                 typename Shape<S, kTangent>::Seen seen;
                 const Vec<S> light = load(mine);
-                const Mask<S> inside = shape.look(columns + hit->at, seen), lit = at_most(floor, light);
+                const Mask<S> inside = shape.look(*hit, seen), lit = at_most(floor, light);
                 const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
                 const Vec<S> gain = select(lit, per_seen, none), weight = light * layer.alpha, part = weight * gain;
                 store(mine, select(lit, layer.behind(light, weight), light));
@@ -212,11 +212,11 @@ template <class S> void weights_backward(const WeightBackwardArgs<S>& b) {
     const int64_t all = int64_t(plan.poses) * plan.count;
     Buffer<S> upstream(2 * all, false);
     for (int64_t i = 0; i < all; ++i) upstream[2 * i] = b.grad_visible_sum[i], upstream[2 * i + 1] = b.grad_total[i];
-    const Lines<S> lines(plan, a.model, a.lens, upstream.data, 1, 2, a.threads);
+    const Lines<S> lines(plan, a.model, stage, a.lens, upstream.data, 1, 2, a.threads);
     const int64_t area = int64_t(stage.tiles) * 2 * Lanes<S>::n;
     Buffer<S> memory(area * a.threads, false), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
     with_switches(a.lens.tangent, a.model.extinctions, 2, [&](auto tangent, auto hides, auto) {
-        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
+        Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             weigh_backward_strip<S, tangent.value, hides.value>(b, lines, stage, task, batches[worker], memory.data + area * worker, moments.data);
         };

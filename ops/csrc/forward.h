@@ -24,7 +24,7 @@ template <class F> inline void with_switches(bool tangent, bool hides, int chann
 
 // A cell holds what one tile accumulates: transmittance, then the channels, Lanes<S>::n numbers each.
 template <class S, bool kTangent, bool kHides, int kChannels>
-void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* cells) {
+void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const int k_count = kChannels ? kChannels : channels_of(a), cell = (1 + k_count) * n;
@@ -32,15 +32,15 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
     fill(cells, int64_t(stage.tiles) * cell, S(0));
     for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
     const Lights<S> lights = {cells, cell, floor};
-    const auto visit = [&](const S* line, int, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+    const auto visit = [&](const S* line, int, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
         Vec<S> feature[kChannels ? kChannels : 1];
         for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]);
         for (; hit < end; ++hit) {
-            S* mine = cells + int64_t(hit->tile) * cell;
+            S* mine = cells + int64_t(*hit) * cell;
             typename Shape<S, kTangent>::Seen seen;
             const Vec<S> light = load(mine);
-            const Mask<S> counts = shape.look(columns + hit->at, seen) & at_most(floor, light);
+            const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
             const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha;
             store(mine, layer.behind(light, weight));
@@ -62,11 +62,11 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
 
 template <class S> void composite(const CompositeArgs<S>& a) {
     const Rises<S> stage(a.lens);
-    const Lines<S> lines(a.plan, a.model, a.lens, a.features, a.samples, a.channels, a.threads);
+    const Lines<S> lines(a.plan, a.model, stage, a.lens, a.features, a.samples, a.channels, a.threads);
     const int64_t scratch = int64_t(stage.tiles) * Lanes<S>::n * (1 + channels_of(a));
     with_switches(a.lens.tangent, a.model.extinctions, channels_of(a), [&](auto tangent, auto hides, auto channels) {
         Buffer<S> memory(scratch * a.threads, false);
-        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
+        Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             composite_strip<S, tangent.value, hides.value, channels.value>(a, lines, stage, task, batches[worker], memory.data + worker * scratch);
         };
@@ -75,19 +75,19 @@ template <class S> void composite(const CompositeArgs<S>& a) {
 }
 
 template <class S, bool kTangent, bool kHides>
-void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* before, S* sums) {
+void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before, S* sums) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
     fill(before, int64_t(stage.tiles) * n, S(1));
-    const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
         Vec<S> seen_sum = none, total = none;
         for (; hit < end; ++hit) {
-            S* mine = before + int64_t(hit->tile) * n;
+            S* mine = before + int64_t(*hit) * n;
             typename Shape<S, kTangent>::Seen seen;
             const Vec<S> light = load(mine);
-            const Mask<S> inside = shape.look(columns + hit->at, seen), lit = at_most(floor, light);
+            const Mask<S> inside = shape.look(*hit, seen), lit = at_most(floor, light);
             const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
             const Vec<S> weight = light * layer.alpha;
             total += layer.alpha, seen_sum += select(lit, weight, none);
@@ -101,11 +101,11 @@ void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& 
 
 template <class S> void weights(const WeightArgs<S>& a) {
     const Rises<S> stage(a.lens);
-    const Lines<S> lines(a.plan, a.model, a.lens, nullptr, 0, 0, a.threads);
+    const Lines<S> lines(a.plan, a.model, stage, a.lens, nullptr, 0, 0, a.threads);
     const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
     Buffer<S> memory(area * a.threads, false), sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
     with_switches(a.lens.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
-        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
+        Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             weigh_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area, sums.data);
         };

@@ -7,7 +7,7 @@ namespace GSPARC_ISA {
 
 // Counts the blocks of a strip (heads null) or writes them, tile by tile and front to back within a tile.
 template <class S, bool kTangent, bool kHides>
-void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch<S, kTangent>& batch, S* before) {
+void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.lens.height, task);
     const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
@@ -22,19 +22,19 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
             }
         }
         fill(before, int64_t(stage.tiles) * n, S(1));
-        const auto visit = [&](const S* line, int rank, const Hit* hit, const Hit* end, const Shape<S, kTangent>& shape, const S* columns) __attribute__((always_inline)) {
+        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
             const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
             for (; hit < end; ++hit) {
                 typename Shape<S, kTangent>::Seen seen;
-                const Vec<S> light = load(before + hit->tile * n);
-                const Mask<S> counts = shape.look(columns + hit->at, seen) & at_most(floor, light);
+                const Vec<S> light = load(before + *hit * n);
+                const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
                 if (!any(counts)) continue;
                 const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
                 const Vec<S> weight = light * layer.alpha;
-                store(before + hit->tile * n, layer.behind(light, weight));
-                const int64_t block = next[hit->tile]++;
+                store(before + *hit * n, layer.behind(light, weight));
+                const int64_t block = next[*hit]++;
                 if (pass == 0) continue;
-                a.heads[2 * block] = rank, a.heads[2 * block + 1] = hit->tile;
+                a.heads[2 * block] = rank, a.heads[2 * block + 1] = *hit;
                 store(a.weights + block * n, weight);
             }
         };
@@ -48,11 +48,11 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
 
 template <class S> int freeze(const FreezeArgs<S>& a) {
     const Rises<S> stage(a.lens);
-    const Lines<S> lines(a.plan, a.model, a.lens, nullptr, 0, 0, a.threads);
+    const Lines<S> lines(a.plan, a.model, stage, a.lens, nullptr, 0, 0, a.threads);
     const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
     Buffer<S> memory(area * a.threads, false);
     with_switches(a.lens.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
-        Workers<Batch<S, tangent.value>> batches(a.threads, stage.tiles);
+        Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             freeze_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area);
         };

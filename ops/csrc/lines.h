@@ -1,11 +1,9 @@
 // What the walks over strips read: numbers of each row, and one line of memory for each Gaussian in depth order.
 #pragma once
-#include "strips.h"
+#include "spans.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
-
-constexpr int kAhead = 16;  // lines of memory asked for that long before they are needed
 
 // What depends on the row alone. Directions are divided by the cosine of the elevation, so that an offset is a number
 // of the column plus a number of the row: `rise` is the tangent of the elevation, `level` the horizon so divided.
@@ -14,12 +12,19 @@ template <class S> struct Rises {
     static constexpr int n = Lanes<S>::n;
     const int tiles, strips;
     Buffer<S> plain, rise, level, middle, half;  // (strips, n) twice; a strip's rises are middle +- half, and a little: rounding may not cut a pixel off
+    Buffer<S> tile_cos, tile_sin;                // (tiles + n): of the middle of a tile; NaN beyond the last
+    const S across;                              // [rad] from there to its outermost columns
     const Tables<S> tables;
+    const Lens<Pack<S>> lens;
 
     explicit Rises(const Lens<S>& lens)
         : tiles(tiles_across<S>(lens.width)), strips((lens.height + kStripRows - 1) / kStripRows), plain(table_size(lens)),
-          rise(int64_t(strips) * n), level(int64_t(strips) * n), middle(strips), half(strips), tables(tables_at(lens, plain.data)) {
+          rise(int64_t(strips) * n), level(int64_t(strips) * n), middle(strips), half(strips), tile_cos(tiles + n), tile_sin(tiles + n),
+          across(S(kTileColumns<S> - 1) / 2 * lens.azimuth_step), tables(tables_at(lens, plain.data)), lens(widened(lens)) {
         fill_tables(lens, plain.data);
+        const double columns = kTileColumns<S>, step = lens.azimuth_step;
+        fill_circle(lens.first_azimuth + (columns - 1) / 2 * step, columns * step, tiles, tile_cos.data, tile_sin.data);
+        for (int k = tiles; k < tiles + n; ++k) tile_cos[k] = tile_sin[k] = S(NAN);
         const S least = sizeof(S) == 4 ? S(1e-7) : S(1e-12);  // a row through the pole, seen from that close to it
         for (int strip = 0; strip < strips; ++strip) {
             S low = INFINITY, high = -INFINITY;
@@ -39,50 +44,40 @@ template <class S> struct Rises {
 };
 
 // One Gaussian's line, side by side in depth order: its record up to the reach, then these. Offsets are in units of
-// kOffset, so that their square is the number of halvings of the footprint, which `bell` takes.
+// kOffset, so that their square is the number of halvings of the footprint, which `bell` takes. For `equirect` the column
+// is that of the image of the centre that is nearest to the columns up to kSeam; of those behind it the next one is.
 constexpr double kOffset = 1.1774100225154747, kHalvings = 1 / (kOffset * kOffset);  // sqrt(2 log 2)
-constexpr int kOpacity = 10, kExtinction = 11, kTiles = 12, kFeatures = 14;
+constexpr int kSeam = 5, kOpacity = 10, kExtinction = 11, kFeatures = 12;
 
-// The tiles of a footprint: [first, last] and, where it goes on past the last column, [0, wrapped].
-struct Range {
-    int16_t first, last, wrapped, unused;
-};
-static_assert(sizeof(Range) <= 2 * sizeof(float), "it takes the place of two numbers of a line");
-
-// Lines of all ranks: (P, N, width), K channels per pose; whole cache lines.
+// Of all ranks: lines (P, N, width), K channels per pose, whole cache lines; and outlines (P, N, kOutline).
 template <class S> struct Lines {
+    static constexpr int n = Lanes<S>::n;
     const int width;
-    Buffer<S> rows;
+    Buffer<S> rows, outlines;
 
-    Lines(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, const S* features, int samples, int channels, int threads)
-        : width(padded(kFeatures + per_pose(plan, samples, channels))), rows(int64_t(plan.poses) * plan.count * width, false) {
+    Lines(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const Lens<S>& lens, const S* features, int samples, int channels, int threads)
+        : width(padded(kFeatures + per_pose(plan, samples, channels))), rows(int64_t(plan.poses) * plan.count * width, false),
+          outlines(int64_t(plan.poses) * plan.count * kOutline, false) {
         constexpr int chunk = 512;
         const int chunks = (plan.count + chunk - 1) / chunk;
-        S units[kRecord];  // of a record's numbers
-        for (int k = 0; k < kRecord; ++k) units[k] = k == kReach ? S(kHalvings) : k < 6 && (lens.tangent || k > 1) ? S(1 / kOffset) : S(1);
         auto fill = [&](int task, int) {
             const int pose = task / chunks, begin = task % chunks * chunk;
             const int end = begin + chunk < plan.shown[pose] ? begin + chunk : plan.shown[pose];
             const int first = plan.poses == 1 ? 0 : pose, count = plan.poses == 1 ? samples : 1;
-            for (int rank = begin; rank < end; ++rank) {
-                const int64_t at = int64_t(pose) * plan.count + rank, i = plan.order[at];
-                S* row = rows.data + at * width;
-                if (rank + kAhead < end) {
-                    const int64_t later = plan.order[at + kAhead];
+            for (int rank = begin; rank < end; rank += n) {
+                const int some = end - rank < n ? end - rank : n;
+                const int64_t at = int64_t(pose) * plan.count + rank;
+                for (int k = n; k < 2 * n && rank + k < end; ++k) {
+                    const int64_t later = plan.order[at + k];
                     const S* soon = plan.records + (int64_t(pose) * plan.count + later) * kRecord;
                     __builtin_prefetch(soon), __builtin_prefetch(soon + kReach), __builtin_prefetch(model.opacities + later);
                     if (features) __builtin_prefetch(features + (int64_t(first) * plan.count + later) * channels);
                 }
-                const S* record = plan.records + (int64_t(pose) * plan.count + i) * kRecord;
-                for (int k = 0; k < kRecord; ++k) row[k] = units[k] * record[k];
-                if (!lens.tangent) row[3] = -row[2] * record[3];
-                row[kOpacity] = record[kGain] * model.opacities[i];
-                row[kExtinction] = model.extinctions ? record[kGain] * model.extinctions[i] : row[kOpacity];
-                const Range range = range_of(plan.boxes[at], lens.width);
-                memcpy(row + kTiles, &range, sizeof range);
-                for (int b = 0; b < count; ++b)
-                    for (int c = 0; c < channels; ++c)
-                        row[kFeatures + b * channels + c] = features[(int64_t(first + b) * plan.count + i) * channels + c];
+                fill_some(plan, model, stage, lens, pose, rank, some);
+                for (int k = 0; k < some; ++k)
+                    for (int b = 0; b < count; ++b)
+                        for (int c = 0; c < channels; ++c)
+                            rows[(at + k) * width + kFeatures + b * channels + c] = features[(int64_t(first + b) * plan.count + plan.order[at + k]) * channels + c];
             }
         };
         parallel_for(plan.poses * chunks, threads, fill);
@@ -90,17 +85,42 @@ template <class S> struct Lines {
     static int per_pose(const PlanView<S>& plan, int samples, int channels) {
         return plan.poses == 1 ? samples * channels : channels;
     }
-    static Range range_of(const Box& box, int width) {
-        constexpr int columns = kTileColumns<S>;
-        const int end = box.column0 + box.columns;
-        return {int16_t(box.column0 / columns), int16_t(((end < width ? end : width) - 1) / columns), int16_t(end > width ? (end - width - 1) / columns : -1), 0};
-    }
     static int padded(int size) {
         constexpr int line = 64 / sizeof(S);
         return (size + line - 1) / line * line;
     }
     const S* of(const PlanView<S>& plan, int pose, int rank) const {
         return rows.data + (int64_t(pose) * plan.count + rank) * width;
+    }
+
+private:
+    // Ranks [rank, rank + some): everything but their features.
+    void fill_some(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const Lens<S>& lens, int pose, int rank, int some) {
+        const int64_t at = int64_t(pose) * plan.count + rank;
+        int32_t who[n];
+        S opacities[n], extinctions[n];
+        for (int k = 0; k < n; ++k) {
+            who[k] = plan.order[at + (k < some ? k : some - 1)];
+            opacities[k] = model.opacities[who[k]];
+            if (model.extinctions) extinctions[k] = model.extinctions[who[k]];
+        }
+        Pack<S> record[kRecord];
+        gather_at(plan.records + int64_t(pose) * plan.count * kRecord, kRecord, who, kRecord, record);
+        const Outline<Pack<S>> outline = lens.tangent ? outline_of<S, true>(record, stage.lens) : outline_of<S, false>(record, stage.lens);
+        const Pack<S> numbers[kOutline] = {outline.column, outline.middle, outline.height, outline.lean, outline.width, outline.left, outline.right, outline.stretch};
+        for (int c = 0; c < kOutline; c += 4) scatter_fours(numbers + c, kOutline, some, outlines.data + at * kOutline + c);
+        const Pack<S> gain = record[kGain];
+        record[kOpacity] = gain * Pack<S>(load(opacities));
+        record[kExtinction] = model.extinctions ? gain * Pack<S>(load(extinctions)) : record[kOpacity];
+        record[kReach] = record[kReach] * S(kHalvings);
+        for (int k = lens.tangent ? 0 : 2; k < 6; ++k) record[k] = record[k] * S(1 / kOffset);
+        if (!lens.tangent) {
+            const Pack<S> turn = stage.tables.turn, column = record[0] - downward(record[0] / turn) * turn, half = turn * S(0.5);
+            const Which<S> low = column < half;
+            record[0] = pick(low, column, column - turn), record[kSeam] = pick(low, column + half, column - half);
+            record[3] = -record[2] * record[3] * S(kOffset);
+        }
+        for (int c = 0; c < kFeatures; c += 4) scatter_fours(record + c, width, some, rows.data + at * width + c);
     }
 };
 

@@ -1,4 +1,4 @@
-// A footprint before the rows of a strip: what depends on its columns alone, then the pixels of a tile.
+// A footprint before the rows of a strip, and then the pixels of a tile.
 #pragma once
 #include "lines.h"
 
@@ -23,31 +23,25 @@ template <> GSPARC_INLINE Vec<float> spread<float>(const float* p) {
 template <> GSPARC_INLINE Vec<double> spread<double>(const double* p) { return (Vec<double>)_mm256_set1_pd(*p); }
 #endif
 
-// How a footprint looks to the rows of a strip. `Reach` writes what depends on the column alone, kParts vectors for the
-// columns from `first` on, and says which may lie inside in some row: a bound. `look` finishes a tile of them and says
-// which pixels do.
+// How a footprint looks to the rows of a strip. `look` finds the offsets of a tile's pixels and says which lie inside.
 template <class S> struct Facet {  // tangent: offsets a / d and b / d
-    static constexpr int kParts = 3, n = Lanes<S>::n;
+    static constexpr int n = Lanes<S>::n;
     struct Seen {
         Vec<S> a, b, d, form;
     };
-    static GSPARC_INLINE Mask<S> reach(const S* line, const Rises<S>& at, int strip, int first, S* to) {
-        const Tables<S>& t = at.tables;
-        const Vec<S> middle = splat(at.middle.data[strip]), half = splat(at.half.data[strip]);
-        const Vec<S> c = load(t.cos_column + first), s = load(t.sin_column + first), z1 = splat(line[2]), z2 = splat(line[5]), zn = splat(line[8]);
-        const Vec<S> a = fma(splat(line[0]), c, splat(line[1]) * s), b = fma(splat(line[3]), c, splat(line[4]) * s), d = fma(splat(line[6]), c, splat(line[7]) * s);
-        store(to, a), store(to + n, b), store(to + 2 * n, d);
-        const Vec<S> none = splat(S(0)), p = greater<S>(fma(magnitude(z1), -half, magnitude(fma(z1, middle, a))), none);
-        const Vec<S> q = greater<S>(fma(magnitude(z2), -half, magnitude(fma(z2, middle, b))), none);
-        const Vec<S> most = fma(magnitude(zn), half, fma(zn, middle, d));
-        return at_most(fma(p, p, q * q), splat(line[kReach] * S(1.0001)) * most * most) & at_most(none, most);
-    }
-    Vec<S> rise, level, z1, z2, zn, inside;
+    const S *cosines, *sines;
+    Vec<S> x1, y1, z1, x2, y2, z2, xn, yn, zn, level, inside;
 
     GSPARC_INLINE Facet(const S* line, const Rises<S>& at, int strip)
-        : rise(load(at.rise.data + strip * n)), level(load(at.level.data + strip * n)), z1(splat(line[2])), z2(splat(line[5])), zn(splat(line[8])), inside(splat(line[kReach])) {}
-    GSPARC_INLINE Mask<S> look(const S* at, Seen& seen) const {
-        seen.a = fma(rise, z1, spread<S>(at)), seen.b = fma(rise, z2, spread<S>(at + n)), seen.d = fma(rise, zn, spread<S>(at + 2 * n));
+        : cosines(at.tables.cos_column), sines(at.tables.sin_column), x1(splat(line[0])), y1(splat(line[1])), x2(splat(line[3])), y2(splat(line[4])),
+          xn(splat(line[6])), yn(splat(line[7])), level(load(at.level.data + strip * n)), inside(splat(line[kReach])) {
+        const Vec<S> rise = load(at.rise.data + strip * n);
+        z1 = rise * splat(line[2]), z2 = rise * splat(line[5]), zn = rise * splat(line[8]);
+    }
+    GSPARC_INLINE Mask<S> look(int tile, Seen& seen) const {
+        const int column = tile * kTileColumns<S>;
+        const Vec<S> c = spread<S>(cosines + column), s = spread<S>(sines + column);
+        seen.a = fma(x1, c, fma(y1, s, z1)), seen.b = fma(x2, c, fma(y2, s, z2)), seen.d = fma(xn, c, fma(yn, s, zn));
         seen.form = fma(seen.a, seen.a, seen.b * seen.b) / (seen.d * seen.d);
         return at_most(seen.form, inside) & at_most(level, seen.d);
     }
@@ -58,31 +52,42 @@ template <class S> struct Facet {  // tangent: offsets a / d and b / d
 };
 
 template <class S> struct Ellipse {  // equirect: line[3] is -root_a rho, see Lines
-    static constexpr int kParts = 1, n = Lanes<S>::n;
+    static constexpr int n = Lanes<S>::n;
     struct Seen {
-        Vec<S> tau1, tau2, form;
+        Vec<S> tau1, form;
     };
-    static GSPARC_INLINE Mask<S> reach(const S* line, const Rises<S>& at, int strip, int first, S* to) {
-        const Tables<S>& t = at.tables;
-        const Vec<S> off = load(t.column + first) - splat(line[0]);
-        const Vec<S> a = splat(line[2]) * (off - t.turn * nearest(off * t.per_turn));  // the nearest image of this column
-        store(to, a);
-        const Vec<S> middle = splat(at.middle.data[strip]) - splat(line[1]), half = splat(at.half.data[strip]), none = splat(S(0));
-        const Vec<S> p = greater<S>(fma(magnitude(splat(line[3])), -half, magnitude(fma(splat(line[3]), middle, a))), none);
-        const Vec<S> q = splat(line[4]) * greater<S>(magnitude(middle) - half, none);
-        return at_most(fma(p, p, q * q), splat(line[kReach] * S(1.0001)));
-    }
-    Vec<S> rise, row, slant, root_b, inside;
+    const S* columns;
+    Vec<S> column, seam, turn, root_a, shift, tau2, square, inside;
 
     GSPARC_INLINE Ellipse(const S* line, const Rises<S>& at, int strip)
-        : rise(load(at.rise.data + strip * n)), row(splat(line[1])), slant(splat(line[3])), root_b(splat(line[4])), inside(splat(line[kReach])) {}
-    GSPARC_INLINE Mask<S> look(const S* at, Seen& seen) const {
-        const Vec<S> q = rise - row;
-        seen.tau1 = fma(slant, q, spread<S>(at)), seen.tau2 = root_b * q, seen.form = fma(seen.tau1, seen.tau1, seen.tau2 * seen.tau2);
+        : columns(at.tables.column), column(splat(line[0])), seam(splat(line[kSeam])), turn(splat(at.tables.turn)), root_a(splat(line[2])), inside(splat(line[kReach])) {
+        const Vec<S> q = load(at.rise.data + strip * n) - splat(line[1]);
+        shift = splat(line[3]) * q, tau2 = splat(line[4]) * q, square = tau2 * tau2;
+    }
+    GSPARC_INLINE Mask<S> look(int tile, Seen& seen) const {
+        const Vec<S> here = spread<S>(columns + tile * kTileColumns<S>), off = here - column;
+        seen.tau1 = fma(root_a, select(at_most(here, seam), off, off - turn), shift);  // from the nearest image of the centre
+        seen.form = fma(seen.tau1, seen.tau1, square);
         return at_most(seen.form, inside);
     }
-    GSPARC_INLINE void slopes(const Seen& seen, Vec<S>& tau1, Vec<S>& tau2) const { tau1 = seen.tau1, tau2 = seen.tau2; }
+    GSPARC_INLINE void slopes(const Seen& seen, Vec<S>& tau1, Vec<S>& tau2_) const { tau1 = seen.tau1, tau2_ = tau2; }
 };
+
+// Which of the tiles from `first` on, one a lane, a footprint of `tangent` may reach in the rows of a strip: a bound.
+template <class S> GSPARC_INLINE unsigned near_tiles(const S* line, const Rises<S>& at, int strip, int first) {
+    const Vec<S> c = load(at.tile_cos.data + first), s = load(at.tile_sin.data + first), middle = splat(at.middle.data[strip]);
+    const S half = at.half.data[strip];
+    Vec<S> offset[3];
+    S slack[3];
+    for (int k = 0; k < 3; ++k) {
+        const S *f = line + 3 * k, x = f[0], y = f[1], z = f[2];
+        offset[k] = fma(splat(x), c, fma(splat(y), s, z * middle));
+        slack[k] = at.across * root(x * x + y * y) + half * (z < 0 ? -z : z);
+    }
+    const Vec<S> none = splat(S(0)), p = greater<S>(magnitude(offset[0]) - slack[0], none), q = greater<S>(magnitude(offset[1]) - slack[1], none);
+    const Vec<S> most = offset[2] + slack[2];
+    return bits_of<S>(at_most(fma(p, p, q * q), splat(line[kReach] * S(1.0001)) * most * most) & at_most(none, most));
+}
 
 template <class S, bool kTangent> struct ShapeOf {
     using type = Facet<S>;

@@ -1,4 +1,4 @@
-// Walking a strip in batches of footprints: first which tiles each may reach, and what depends on the column alone;
+// Walking a strip in batches of footprints: first which tiles each may reach, sixteen footprints at a time;
 // then those tiles, in a loop whose lengths have long been known. A branch that waits for the arithmetic before it
 // costs more than a tile.
 #pragma once
@@ -8,33 +8,6 @@
 
 namespace gsparc {
 namespace GSPARC_ISA {
-
-constexpr int kQuad = kStripRows;  // tiles whose columns are a vector
-
-// The bits of x where mask has one, side by side.
-GSPARC_INLINE unsigned pick_bits(unsigned x, unsigned mask) {
-#if defined(__BMI2__)
-    return _pext_u32(x, mask);
-#else
-    unsigned picked = 0;
-    for (unsigned to = 1; mask; mask &= mask - 1, to <<= 1) picked |= x & mask & -mask ? to : 0;
-    return picked;
-#endif
-}
-
-// Which of the tiles whose columns are a vector have a set lane, a bit each.
-template <class S> GSPARC_INLINE unsigned tile_bits(Mask<S> columns) {
-    unsigned set = bits_of<S>(columns);
-    if (kTileColumns<S> == 4) {
-        set |= set >> 1, set |= set >> 2;
-        return pick_bits(set, 0x1111);
-    }
-    if (kTileColumns<S> == 2) {
-        set |= set >> 1;
-        return pick_bits(set, 0x55);
-    }
-    return set;
-}
 
 // Which tiles of a strip still let light through, a bit each; all of them at first.
 struct Bits {
@@ -51,121 +24,129 @@ struct Bits {
     }
 };
 
-// A vector of columns that a footprint may reach; a tile of it that it may, and where the numbers of its columns lie.
-struct Quad {
-    uint16_t tile;
-    uint8_t lit, owner;  // lit: bits of tiles
-    int32_t rank;
-};
-struct Hit {
-    int32_t tile, at;
-};
-
-constexpr int kBatch = 64;     // footprints found before their tiles are visited
-constexpr int kFewQuads = 4;  // most footprints have at most so many: found without a branch
+constexpr int kBatch = 64;  // footprints whose tiles are found before they are visited
+constexpr int kBlock = 16;  // tiles looked at together
 
 // One worker's memory for batches.
-template <class S, bool kTangent> struct Batch {
-    static constexpr int n = Lanes<S>::n, kStride = Shape<S, kTangent>::kParts * n;
-    const int most;  // quads of one batch
-    int owners;      // footprints with a lit quad
-    Buffer<Quad> quads;
-    Buffer<S> columns;
-    Buffer<Hit> hits;
+struct Batch {
+    int owners;            // footprints with a lit tile
+    Buffer<int32_t> hits;  // tiles
     Buffer<uint64_t> words;
     int32_t ranks[kBatch + 1], ends[kBatch + 1];  // of each owner: its rank, the end of its hits
 
-    explicit Batch(int tiles)
-        : most(3 * kBatch + tiles / kQuad + 2 * kFewQuads), quads(most, false), columns(int64_t(most) * kStride, false), hits(int64_t(most + 1) * kQuad, false), words(Bits::size(tiles), false) {}
+    explicit Batch(int tiles) : hits(int64_t(kBatch) * (tiles + 1) + kBlock, false), words(Bits::size(tiles), false) {}
 };
 
-// Appends the tiles of a quad that are set in a mask.
-template <class S> GSPARC_INLINE Hit* append(Hit* hit, int tile, int at, unsigned tiles) {
-    for (int k = 0; k < kQuad; ++k) {
-        *hit = {tile + k, at + k * kTileColumns<S>};
+#if defined(__AVX2__) && !defined(__AVX512F__)
+// The numbers of the bits that are set in a byte, side by side, a byte each.
+struct SetBits {
+    uint64_t of[256] = {};
+    constexpr SetBits() {
+        for (int byte = 0; byte < 256; ++byte)
+            for (int bit = 0, at = 0; bit < 8; ++bit)
+                if (byte >> bit & 1) of[byte] |= uint64_t(bit) << 8 * at++;
+    }
+};
+constexpr SetBits kSetBits;
+#endif
+
+// Appends those tiles from `first` on whose bit, of kBlock, is set.
+GSPARC_INLINE int32_t* append(int32_t* hit, int first, unsigned tiles) {
+#if defined(__AVX512F__)
+    const __m512i all = _mm512_add_epi32(_mm512_set1_epi32(first), _mm512_set_epi32(15, 14, 13, 12, 11, 10, 9, 8, 7, 6, 5, 4, 3, 2, 1, 0));
+    _mm512_storeu_si512(hit, _mm512_maskz_compress_epi32(__mmask16(tiles), all));
+    return hit + __builtin_popcount(tiles);
+#elif defined(__AVX2__)
+    for (int half = 0; half < 2; ++half, tiles >>= 8, first += 8) {  // without a branch
+        const __m128i which = _mm_loadl_epi64(reinterpret_cast<const __m128i*>(kSetBits.of + (tiles & 255)));
+        _mm256_storeu_si256(reinterpret_cast<__m256i*>(hit), _mm256_add_epi32(_mm256_set1_epi32(first), _mm256_cvtepu8_epi32(which)));
+        hit += __builtin_popcount(tiles & 255);
+    }
+    return hit;
+#else
+    for (int k = 0; k < kBlock; ++k) {
+        *hit = first + k;
         hit += tiles >> k & 1;
     }
     return hit;
-}
-#if defined(__AVX512F__)
-template <> GSPARC_INLINE Hit* append<float>(Hit* hit, int tile, int at, unsigned tiles) {
-    const __m256i all = _mm256_add_epi32(_mm256_set1_epi64x(int64_t(at) << 32 | unsigned(tile)), _mm256_set_epi32(12, 3, 8, 2, 4, 1, 0, 0));
-    _mm256_storeu_si256(reinterpret_cast<__m256i*>(hit), _mm256_maskz_compress_epi64(__mmask8(tiles), all));
-    return hit + __builtin_popcount(tiles);
-}
 #endif
+}
 
-// Appends those of the quads of 16 tiles from `first` on that are lit.
-GSPARC_INLINE Quad* append_few(Quad* quad, uint32_t lit, int rank, int owner, int first) {
-#if defined(__AVX512F__)
-    const __m256i parts = _mm256_and_si256(_mm256_srlv_epi64(_mm256_set1_epi64x(lit), _mm256_set_epi64x(12, 8, 4, 0)), _mm256_set1_epi64x(15));
-    const __m256i same = _mm256_set1_epi64x(int64_t(uint64_t(uint32_t(rank)) << 32 | uint32_t(owner) << 24 | uint32_t(first)));
-    const __m256i all = _mm256_add_epi64(_mm256_add_epi64(same, _mm256_set_epi64x(12, 8, 4, 0)), _mm256_slli_epi64(parts, 16));
-    const __mmask8 some = _mm256_test_epi64_mask(parts, parts);
-    _mm256_storeu_si256(reinterpret_cast<__m256i*>(quad), _mm256_maskz_compress_epi64(some, all));
-    return quad + __builtin_popcount(some);
-#else
-    for (int k = 0; k < kFewQuads; ++k) {
-        const uint32_t part = lit >> (k * kQuad) & 15;
-        *quad = {uint16_t(first + k * kQuad), uint8_t(part), uint8_t(owner), rank};
-        quad += part != 0;
+// Appends those of the tiles [first, first + count) that are lit.
+GSPARC_INLINE int32_t* append(int32_t* hit, Bits bits, int first, int count) {
+    for (; count > kBlock; first += kBlock, count -= kBlock) hit = append(hit, first, bits.from(first) & 0xffff);
+    return append(hit, first, bits.from(first) & ((1u << count) - 1));
+}
+
+// The same, less those that a footprint without an outline cannot reach.
+template <class S> GSPARC_INLINE int32_t* append_near(int32_t* hit, Bits bits, int first, int end, const S* line, const Rises<S>& stage, int strip) {
+    constexpr int n = Lanes<S>::n;
+    for (; first < end; first += n) {
+        const unsigned some = end - first < n ? (1u << (end - first)) - 1 : (1u << n) - 1;
+        hit = append(hit, first, bits.from(first) & some & near_tiles(line, stage, strip, first));
     }
-    return quad;
-#endif
+    return hit;
 }
 
-// Appends the quads of tiles [first, last] that are lit.
-GSPARC_INLINE Quad* append(Quad* quad, Bits bits, int rank, int owner, int first, int last) {
-    constexpr int many = kFewQuads * kQuad;
-    for (; last - first >= many; first += many) quad = append_few(quad, bits.from(first) & 0xffff, rank, owner, first);
-    return append_few(quad, bits.from(first) & ((2u << (last - first)) - 1), rank, owner, first);
-}
-
-// Finds the tiles of the next footprints of a strip; returns the first that is left over.
+// Finds the tiles of the next footprints of a strip; returns the first that is left over. Spans of all first, then what
+// becomes of them: one chain of arithmetic hides behind the next.
 template <class S, bool kTangent>
-GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, const Lines<S>& lines, const S* base, const int32_t* entry, Bits bits, Batch<S, kTangent>& batch) {
-    Quad *quad = batch.quads.data, *const full = quad + 3 * kBatch;
-    int owners = 0;
-    for (; entry < strip.last && owners < kBatch && quad < full; ++entry) {
-        if (strip.last - entry > kAhead) __builtin_prefetch(base + int64_t(entry[kAhead]) * lines.width);
-        Range range;
-        memcpy(&range, base + int64_t(*entry) * lines.width + kTiles, sizeof range);
-        const Quad* const before = quad;
-        batch.ranks[owners] = *entry;
-        quad = append(quad, bits, *entry, owners, range.first, range.last);
-        if (range.wrapped >= 0) quad = append(quad, bits, *entry, owners, 0, range.wrapped);
-        owners += quad > before;
+GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, const Lines<S>& lines, const S* base, const S* outlines, const int32_t* entry, Bits bits, Batch& batch) {
+    constexpr int n = Lanes<S>::n, columns = kTileColumns<S>;
+    static_assert(kBatch % n == 0 && n <= kBlock, "a batch is whole lanes");
+    const int some = strip.last - entry < kBatch ? int(strip.last - entry) : kBatch;
+    const S middle = stage.middle.data[strip.index], half = stage.half.data[strip.index];
+    int32_t ranks[kBatch];
+    Spans<S> spans[kBatch / n];
+    for (int k = 0; k < some; ++k) ranks[k] = entry[k];
+    for (int k = some; k % n; ++k) ranks[k] = ranks[some - 1];
+    for (int first = 0; first < some; first += n) {
+        Pack<S> numbers[kOutline];
+        gather_at(outlines, kOutline, ranks + first, kOutline, numbers);
+        const Outline<Pack<S>> outline = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7]};
+        spans[first / n] = spans_of<S, kTangent>(outline, middle - half, middle + half, stage.lens);
     }
-    Hit* hit = batch.hits.data;
-    int at = 0;
-    for (const Quad* q = batch.quads.data; q < quad; ++q, at += batch.kStride) {
-        const S* line = base + int64_t(q->rank) * lines.width;
-        const Mask<S> columns = Shape<S, kTangent>::reach(line, stage, strip.index, q->tile * kTileColumns<S>, batch.columns.data + at);
-        hit = append<S>(hit, q->tile, at, tile_bits<S>(columns) & q->lit);
-        batch.ends[q->owner] = int32_t(hit - batch.hits.data);
+    int32_t* hit = batch.hits.data;
+    int owners = 0;
+    for (int k = 0; k < some; ++k) {
+        const S* line = base + int64_t(ranks[k]) * lines.width;
+        __builtin_prefetch(line);
+        if (k + kBatch < strip.last - entry) __builtin_prefetch(outlines + int64_t(entry[k + kBatch]) * kOutline);
+        const Spans<S>& span = spans[k / n];
+        const int lane = k % n;
+        const int32_t* const before = hit;
+        if (kTangent && span.open >> lane & 1) {
+            const Runs runs = runs_of(strip.boxes[ranks[k]], stage.lens.width);
+            for (int run = 0; run < runs.count; ++run) hit = append_near(hit, bits, runs.from[run] / columns, (runs.to[run] - 1) / columns + 1, line, stage, strip.index);
+        } else {
+            hit = append(hit, bits, int(span.first[lane]), int(span.count[lane]));
+            if (span.wrapped[lane]) hit = append(hit, bits, 0, int(span.wrapped[lane]));
+        }
+        batch.ranks[owners] = ranks[k], batch.ends[owners] = int32_t(hit - batch.hits.data);
+        owners += hit > before;
     }
     batch.owners = owners;
-    return entry;
+    return entry + some;
 }
 
-// Calls visit(line, rank, hit, end, shape, columns) for each footprint of the strip that may count somewhere, front to
+// Calls visit(line, rank, hit, end, shape) for each footprint of the strip that may count somewhere, front to
 // back, with its tiles. `relight(bits)` is called between batches: it says where light still arrives, and false ends
 // the walk.
 template <class S, bool kTangent, class Relight, class Visit>
 GSPARC_INLINE void sweep(const Strip<S>& strip, const PlanView<S>& plan, const Rises<S>& stage, const Lines<S>& lines,
-                         Batch<S, kTangent>& batch, const Relight& relight, const Visit& visit) {
-    const S* base = lines.of(plan, strip.pose, 0);
+                         Batch& batch, const Relight& relight, const Visit& visit) {
+    const S *base = lines.of(plan, strip.pose, 0), *outlines = lines.outlines.data + int64_t(strip.pose) * plan.count * kOutline;
     const Bits bits = {batch.words.data, stage.tiles};
     bits.set_all();
     for (const int32_t* entry = strip.first; entry < strip.last;) {
-        entry = find<S, kTangent>(strip, stage, lines, base, entry, bits, batch);
-        const Hit* hit = batch.hits.data;
+        entry = find<S, kTangent>(strip, stage, lines, base, outlines, entry, bits, batch);
+        const int32_t* hit = batch.hits.data;
         for (int owner = 0; owner < batch.owners; ++owner) {
-            const Hit* const end = batch.hits.data + batch.ends[owner];
+            const int32_t* const end = batch.hits.data + batch.ends[owner];
             const int rank = batch.ranks[owner];
             const S* line = base + int64_t(rank) * lines.width;
             const Shape<S, kTangent> shape(line, stage, strip.index);
-            visit(line, rank, hit, end, shape, batch.columns.data);
+            visit(line, rank, hit, end, shape);
             hit = end;
         }
         if (!relight(bits)) return;

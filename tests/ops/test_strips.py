@@ -4,7 +4,7 @@ import pytest
 import torch
 from rasters import assert_close, origin, poses, random_scene, render
 
-from gsparc.ops import SphereGrid, make_plan
+from gsparc.ops import SphereGrid, _native, make_plan
 
 PROJECTIONS = pytest.mark.parametrize("projection", ["tangent", "equirect"])
 
@@ -43,6 +43,27 @@ def test_more_strips_than_search_for_their_footprints(height):
     scene, grid = random_scene(n=1100, seed=15), SphereGrid.hemisphere(height, 8)  # more ranks than a chunk
     want = render(scene, poses(3), grid, "reference")
     assert_close(render(scene, poses(3), grid), want, 1e-9)
+
+
+@pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
+@pytest.mark.parametrize("sizes", ["specks", "mixed", "needles"])
+@PROJECTIONS
+def test_spans_cut_no_pixel_off(name, sizes, projection):
+    """Columns of a strip in closed form hold every pixel of the footprint: small or as wide as the sky, upright or
+    leaning, over the seam and the poles, on whole and partial circles."""
+    fastest = _native.instruction_set()
+    if not _native.use_instruction_set(name):
+        pytest.skip(f"this machine or build has no {name}")
+    scene = random_scene(n=120, seed=19, size={"specks": 0.05, "mixed": 1.5, "needles": 0.05}[sizes])
+    if sizes == "needles":
+        scene = type(scene)(**{**vars(scene), "scales": scene.scales * torch.tensor([60.0, 1.0, 0.02])})
+    grids = (SphereGrid.full_sphere(40, 90), SphereGrid(21, 50, 0.1, 5.5, 0.03, 0.041))
+    try:
+        for grid in grids:
+            want = render(scene, poses(3), grid, "reference", projection=projection)
+            assert_close(render(scene, poses(3), grid, projection=projection), want, 1e-9)
+    finally:
+        _native.use_instruction_set(fastest)
 
 
 @pytest.mark.parametrize("height,width", [(1, 1), (3, 5), (5, 17), (4, 16), (7, 63)])
