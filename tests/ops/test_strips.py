@@ -49,8 +49,8 @@ def test_more_strips_than_search_for_their_footprints(height):
 @pytest.mark.parametrize("sizes", ["specks", "mixed", "needles"])
 @PROJECTIONS
 def test_spans_cut_no_pixel_off(name, sizes, projection):
-    """Columns of a strip in closed form hold every pixel of the footprint: small or as wide as the sky, upright
-    or leaning, over the seam and the poles, on whole and partial circles."""
+    """Columns of a strip in closed form hold every pixel of the footprint: small or as wide as the sky,
+    upright or leaning, over the seam and the poles, on whole and partial circles."""
     fastest = _native.instruction_set()
     if not _native.use_instruction_set(name):
         pytest.skip(f"this machine or build has no {name}")
