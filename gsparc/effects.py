@@ -135,14 +135,20 @@ def decide_directions(switch: Switch, sources: bool, data: Measurements) -> Deci
         obstacle = "no directions of arrival were measured"
     elif switch == "auto" and not sources:
         obstacle = "no sources with carrier phase are asked for"
-    if switch == SPLAT:
-        raise ValueError("model.effects.directions=splat: choose auto, true or false")
-    return _settle("directions", switch, obstacle)
+    return _settle("directions", switch, obstacle, ("auto", True, False))
 
 
-def _settle(effect: str, switch: Switch, obstacle: str | None) -> Decision:
-    if switch not in ("auto", SPLAT, True, False):
-        raise ValueError(f"model.effects.{effect}={switch!r}: choose auto, splat, true or false")
+def _settle(
+    effect: str,
+    switch: Switch,
+    obstacle: str | None,
+    choices: tuple[Switch, ...] = ("auto", SPLAT, True, False),
+) -> Decision:
+    if switch not in choices:
+        named = [str(choice).lower() for choice in choices]
+        raise ValueError(
+            f"model.effects.{effect}={str(switch).lower()}: choose {', '.join(named[:-1])} or {named[-1]}"
+        )
     if switch in (SPLAT, True) and obstacle is not None:
         raise ValueError(f"model.effects.{effect}={str(switch).lower()} is not possible: {obstacle}")
     if obstacle is not None:

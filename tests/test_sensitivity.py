@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import pytest
+from rooms import directed
+
+from gsparc.coherent.directed import DirectedSources
 from gsparc.data.rfid import load_rfid
 from gsparc.data.splits import Fold
 from gsparc.peers.gp import GaussianProcess
 from gsparc.peers.mean import Mean
-from gsparc.sensitivity import displaced, draw, sweep
+from gsparc.sensitivity import displaced, draw, sweep, turned
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
 
 
@@ -30,10 +35,33 @@ def test_errors_cost_an_interpolator_and_not_the_mean(tmp_path) -> None:
             seed=0,
         )
     )
-    value = {(r.method, r.where, r.error_m): r.value for r in rows_found}
+    value = {(r.method, r.where, r.error): r.value for r in rows_found}
     assert len(value) == 10
     for where in ("query", "train"):
         assert value["gp", where, 0.3] < value["gp", "none", 0.0] - 1
         assert abs(value["mean", where, 0.3] - value["mean", "none", 0.0]) < 1e-6
     draw(rows_found, tmp_path / "s.png")
     assert (tmp_path / "s.png").stat().st_size > 10_000
+
+
+def test_directions_turn_by_what_was_asked_and_nothing_else(tmp_path) -> None:
+    data, fold, _ = directed(40)
+    there = turned(data, 2.0, seed=0)
+    angle = np.linalg.norm(np.concatenate(there.directions) - np.concatenate(data.directions), axis=1)
+    assert abs(np.degrees(np.sqrt(np.mean(angle**2) / 2)) - 2) < 0.2
+    assert there.target is data.target and there.rx_position is data.rx_position
+    few = turned(data, 0.0, seed=0, missing=0.5)
+    more = turned(data, 0.0, seed=0, false=0.5)
+    counts = [sum(map(len, d.directions)) for d in (few, data, more)]
+    assert counts[0] < 0.6 * counts[1] and counts[2] > 1.4 * counts[1]
+    with pytest.raises(ValueError, match="no directions of arrival"):
+        turned(replace(few, directions=None), 1.0, seed=0)
+    found = list(
+        sweep(
+            {"directed": DirectedSources}, data, fold, [], tmp_path,
+            train_errors=False, seed=0, errors_deg=[0.5],
+        )
+    )  # fmt: skip
+    assert [r.where for r in found] == ["none", "directions"] and found[1].value < 0.1
+    draw(found, tmp_path / "s.png")
+    assert (tmp_path / "s.png").stat().st_size > 5_000

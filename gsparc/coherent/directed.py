@@ -11,6 +11,7 @@ places; each source's power, and what all share, come by marginal likelihood. At
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.coherent.bundles import Rays, meet
 from gsparc.coherent.frame import Frame, frame_of, refuse
+from gsparc.coherent.openness import Open, coherence
 from gsparc.coherent.phase import LIGHT, ranges, wave, wave_over_band
+from gsparc.coherent.pinning import Pinning
 from gsparc.coherent.process import JITTER, Factor, steering
 from gsparc.coherent.rows import Rows, gather, query_elements, tones_of
 from gsparc.coherent.sightings import Sightings
@@ -30,7 +34,6 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
-from gsparc.peers.directions import virtual_transmitters, votes
 
 # Receivers whose rays meet in a source; of more sources the most seen are kept.
 LEAST_SEEN, MOST_SOURCES = 2, 60
@@ -39,6 +42,7 @@ CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same ev
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
 NOISES = (0.001, 0.01, 0.05)  # of the rows' power
 ROUNDS = 4  # of powers and shared numbers in turn
+PINNED = 400  # rows that places are pinned by
 JUDGED = 700  # rows that the shared numbers are chosen on
 
 
@@ -62,7 +66,31 @@ class Law:
         return (self.constant + (1 - self.constant) * matern32(squared)).float()
 
 
+@dataclass(frozen=True)
+class Query:
+    """Places that channels are asked for, `count` receivers of some antennas.
+
+    Attributes:
+        places: (m, 3) float64 [m].
+        count: of the receivers.
+        away: (m, K) float64 [m], ranges to the sources.
+        likely: (m, K), probabilities to see them.
+        alike: (m, n), the law's correlation with the rows.
+        left: (K', m, n), what open places leave of it.
+    """
+
+    places: Tensor
+    count: int
+    away: Tensor
+    likely: Tensor
+    alike: Tensor
+    left: Tensor
+
+
 LAWS = tuple(Law(c, length, noise) for c in CONSTANTS for length in LENGTHS_M for noise in NOISES)
+
+
+PINNING = Law(0.97, 2.0, 0.01)  # while places are pinned
 
 
 class DirectedSources(Method):
@@ -95,8 +123,9 @@ class DirectedSources(Method):
         known = _some(np.concatenate([fold.train, fold.val]), self.seed)
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
-        centres, met = virtual_transmitters(places, rays)
-        seen = votes(places, met, len(centres)).double().clamp_max(1)
+        found = Rays.of(places, rays)
+        bundles = meet(found, self.seed)
+        seen = torch.from_numpy(bundles.seen(found))
         often = torch.nonzero(seen.sum(0) >= LEAST_SEEN).flatten()
         if not len(often):
             raise ValueError("directed: the directions of arrival meet nowhere")
@@ -104,30 +133,48 @@ class DirectedSources(Method):
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
-        self.sources = torch.from_numpy(centres)[often] - self.frame.middle
+        points, covariance = (torch.from_numpy(v)[often] for v in (bundles.points, bundles.covariance))
+        self.open = Open(points - self.frame.middle, covariance)
         self.sightings = Sightings.of(torch.from_numpy(places) - self.frame.middle, seen[:, often])
         self.rows = self.frame.inside(everything)
         at = {int(row): k for k, row in enumerate(known)}
         self.observer = torch.tensor([at[int(row)] for row in everything.receiver])
+        self._pin()
         self._learn()
         self._prepare()
         note = (
-            f"directed: {len(self.sources)} sources where rays meet; {self.law.constant:.1%} of a gain is "
-            "the same everywhere"
+            f"directed: {len(self.sources)} sources where rays meet, their directions' error "
+            f"{math.degrees(bundles.error):.2g} degrees; "
+            f"{self.law.constant:.1%} of a gain is the same everywhere"
         )
         return FitReport(time.monotonic() - started, (note,))
+
+    @property
+    def sources(self) -> Tensor:
+        """Places (K, 3) float64 [m] in the regression's frame."""
+        return self.open.points
+
+    def _pin(self) -> None:
+        """Places by the phases of the channels, where directions leave them open."""
+        step = max(1, -(-len(self.rows) // PINNED))
+        some = torch.arange(0, len(self.rows), step)
+        rows = self.rows.take(some)
+        alike = PINNING.correlation(rows.position, rows.position)
+        self.open = Pinning(rows, self.sightings.seen[self.observer[some]].float(), self.open, alike).run()
 
     def _learn(self) -> None:
         """Powers and the law of gains in turn: expectation maximisation, and likelihood on a grid."""
         step = max(1, -(-len(self.rows) // JUDGED))
         some = torch.arange(0, len(self.rows), step)
         rows, observer = self.rows.take(some), self.observer[some]
-        waves = self._seen(rows, observer)
+        waves, blurred = self._seen(rows, observer), self.open.blurred(rows.position, rows.frequency)
         loud = float(waves.abs().square().sum(1).mean())
         self.power = torch.full((len(self.sources),), 1 / max(loud, 1e-30))
         alike = {law: law.correlation(rows.position, rows.position) for law in LAWS}
+        turns = self.open.only(blurred).turns(rows.position, rows.frequency)
+        left = coherence(turns, turns)
         for _ in range(ROUNDS):
-            shared = (waves * self.power) @ waves.mH
+            shared = _shared(waves, waves, self.power, blurred, left)
             tried = [(_factor(shared * alike[law], rows, law), law) for law in LAWS]
             factor, self.law = min(tried, key=lambda one: one[0].nll)
             # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
@@ -138,13 +185,17 @@ class DirectedSources(Method):
 
     def _prepare(self) -> None:
         """What queries need beyond the state."""
-        self.waves = self._seen(self.rows, self.observer)
-        alike = self.law.correlation(self.rows.position, self.rows.position)
-        self.factor = _factor((self.waves * self.power) @ self.waves.mH * alike, self.rows, self.law)
+        rows = self.rows
+        self.waves = self._seen(rows, self.observer)
+        self.blurred = self.open.blurred(rows.position, rows.frequency)
+        self.turns = self.open.only(self.blurred).turns(rows.position, rows.frequency)
+        alike = self.law.correlation(rows.position, rows.position)
+        shared = _shared(self.waves, self.waves, self.power, self.blurred, coherence(self.turns, self.turns))
+        self.factor = _factor(shared * alike, rows, self.law)
 
-        # (n, K R), real and imaginary: what each row adds to each source's gain
+        # (n, K, R), real and imaginary: what each row adds to each source's gain
         pulled = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
-        self.pulled = [part.flatten(1).contiguous() for part in (pulled.real, pulled.imag)]
+        self.pulled = [part.contiguous() for part in (pulled.real, pulled.imag)]
 
     def _seen(self, rows: Rows, observer: Tensor) -> Tensor:
         """Waves (n, K) complex64 of the sources at every row, of those that its receiver sees."""
@@ -153,59 +204,68 @@ class DirectedSources(Method):
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the variance counts gains, noise and who is seen."""
-        flat, count = self._places(tx, rx)
-        likely = self.sightings.likely(flat).float()
-        correlation = self.law.correlation(flat, self.rows.position)
-        away = ranges(flat, self.sources)
-        arriving = wave(away, self.frame.carrier_hz)
-        variance, prior = self._variance(arriving, likely, correlation)
-        variance, prior = (v.reshape(count, -1).mean(1) for v in (variance, prior))
+        query = self._query(tx, rx)
+        variance, prior = self._variance(query)
+        variance, prior = (v.reshape(query.count, -1).mean(1) for v in (variance, prior))
         return Prediction(
-            self._sum(likely, correlation, away, count),
+            self._sum(query),
             confidence=(1 - variance / prior).clamp(0, 1),
             variance=variance * self.frame.scale**2,
         )
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64."""
-        flat, count = self._places(tx, rx)
-        likely = self.sightings.likely(flat).float()
-        correlation = self.law.correlation(flat, self.rows.position)
-        return self._sum(likely, correlation, ranges(flat, self.sources), count)
+        return self._sum(self._query(tx, rx))
 
-    def _sum(self, likely: Tensor, correlation: Tensor, away: Tensor, count: int) -> Tensor:
-        """Of the waves that places (m, ...) receive, as channels of `count` receivers."""
+    def _sum(self, query: Query) -> Tensor:
+        """Of the waves that a query's places receive, as channels of its receivers."""
         tones = torch.from_numpy(tones_of(self._fitted()))
-        gains = likely[:, :, None] * self._gains(correlation)
-        mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(away, tones))
+        gains = query.likely[:, :, None] * self._gains(query)
+        mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(query.away, tones))
         loudness = (self.frame.carrier_hz / tones).float()
-        return (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
+        return (mean * (loudness * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
         """What `predict` sums, one path a source: see `VirtualSourceGP.paths`."""
-        flat, count = self._places(tx, rx)
-        away = ranges(flat, self.sources)
-        gain = self._gains(self.law.correlation(flat, self.rows.position))
-        gain = gain * (self.sightings.likely(flat).float() * wave(away, self.frame.carrier_hz))[:, :, None]
-        gain = (gain * self.frame.scale).movedim(1, -1).reshape(count, self.antennas, -1)
-        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
-        towards = self.sources - flat.view(count, -1, 3).mean(1)[:, None]
+        query = self._query(tx, rx)
+        gain = query.likely * wave(query.away, self.frame.carrier_hz)
+        gain = self._gains(query) * gain[:, :, None]
+        gain = (gain * self.frame.scale).movedim(1, -1).reshape(query.count, self.antennas, -1)
+        away = query.away.view(query.count, -1, len(self.sources))
+        delay = (away / LIGHT).expand(-1, self.antennas, -1)
+        towards = self.sources - query.places.view(query.count, -1, 3).mean(1)[:, None]
         return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
 
-    def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
-        """Antennas of the receivers (B E, 3) float64 in the regression's frame, and B."""
+    def _query(self, tx: Tensor, rx: Pose) -> Query:
+        """What the regression needs to know of places, antennas of the receivers in its frame."""
         places = query_elements(self._fitted(), rx, len(tx), self.antennas)
-        return torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle, len(places)
+        flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
+        turns = self.open.only(self.blurred).turns(flat, torch.tensor(self.frame.carrier_hz))
+        return Query(
+            flat,
+            len(places),
+            ranges(flat, self.sources),
+            self.sightings.likely(flat).float(),
+            self.law.correlation(flat, self.rows.position),
+            coherence(turns, self.turns),
+        )
 
-    def _gains(self, correlation: Tensor) -> Tensor:
-        """Posterior mean gains (m, K, R) where the law's correlation with the rows is (m, n)."""
-        real, imag = (correlation @ part for part in self.pulled)
-        return torch.complex(real, imag).unflatten(1, (len(self.sources), -1))
+    def _gains(self, query: Query) -> Tensor:
+        """Posterior mean gains (m, K, R) at a query's places."""
+        parts = []
+        for part in self.pulled:
+            gain = (query.alike @ part.flatten(1)).unflatten(1, part.shape[1:])
+            if len(self.blurred):
+                left = query.left * query.alike
+                gain[:, self.blurred] = torch.einsum("kmn,nkr->mkr", left, part[:, self.blurred])
+            parts.append(gain)
+        return torch.complex(*parts)
 
-    def _variance(self, arriving: Tensor, likely: Tensor, correlation: Tensor) -> tuple[Tensor, Tensor]:
-        """Expected squared error and expected power (m,) of waves (m, K) seen with these probabilities."""
-        loud, expected = arriving.abs().square() * self.power, arriving * likely
-        cross = ((expected * self.power) @ self.waves.mH) * correlation
+    def _variance(self, query: Query) -> tuple[Tensor, Tensor]:
+        """Expected squared error and expected power (m,) of what a query's places receive."""
+        likely, arriving = query.likely, wave(query.away, self.frame.carrier_hz)
+        loud = arriving.abs().square() * self.power
+        cross = _shared(arriving * likely, self.waves, self.power, self.blurred, query.left) * query.alike
         gains = (loud * likely.square()).sum(1) - (self.factor.root @ cross.mH).abs().square().sum(0)
         doubt = (loud * likely * (1 - likely)).sum(1)
         return gains.clamp_min(0) + doubt + self.law.noise, (loud * likely).sum(1) + self.law.noise
@@ -218,7 +278,8 @@ class DirectedSources(Method):
         self._fitted()
         likely = self.sightings.left_out[self.observer].float()
         expected = steering(self.rows, self.sources) * likely
-        cross = (expected * self.power) @ self.waves.mH
+        left = coherence(self.turns, self.turns)
+        cross = _shared(expected, self.waves, self.power, self.blurred, left)
         cross = cross * self.law.correlation(self.rows.position, self.rows.position)
         said = cross @ self.factor.alpha
         for one in self.observer.unique():
@@ -239,6 +300,7 @@ class DirectedSources(Method):
             "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
             "observer": self.observer,
             "sources": self.sources,
+            "open": self.open.covariance,
             "power": self.power,
             "law": [self.law.constant, self.law.length, self.law.noise],
             "sightings": [seen.places, seen.seen, seen.length, seen.weights, seen.left_out],
@@ -248,7 +310,9 @@ class DirectedSources(Method):
         """See `Method.restore`."""
         self.site, self.antennas = site, int(state["antennas"])
         self.frame, self.rows = Frame(*state["frame"]), Rows(*state["rows"])
-        self.observer, self.sources, self.power = state["observer"], state["sources"], state["power"]
+        self.observer, self.power, points = state["observer"], state["power"], state["sources"]
+        # checkpoints of before directions had errors have no covariances
+        self.open = Open(points, state.get("open", torch.zeros(len(points), 3, 3, dtype=torch.float64)))
         self.law, self.sightings = Law(*state["law"]), Sightings(*state["sightings"])
         self._prepare()
 
@@ -271,5 +335,16 @@ def _some(known: np.ndarray, seed: int) -> np.ndarray:
 
 def _factor(covariance: Tensor, rows: Rows, law: Law) -> Factor:
     """Of the covariance (n, n) of the rows' channels, with the law's noise."""
-    covariance.diagonal().add_(law.noise + JITTER)
+    loud = max(1.0, float(covariance.diagonal().real.mean()))
+    covariance.diagonal().add_(law.noise + JITTER * loud)
     return Factor.of(covariance, rows.target)
+
+
+def _shared(first: Tensor, second: Tensor, power: Tensor, blurred: Tensor, left: Tensor) -> Tensor:
+    """Covariance (m, n) by sources seen as waves (m, K) and (n, K), of which (K',) keep `left` (K', m, n)."""
+    loud = power.clone()
+    loud[blurred] = 0
+    total = (first * loud) @ second.mH
+    for k, coherent in zip(blurred.tolist(), left, strict=True):
+        total += (power[k] * first[:, k])[:, None] * second[:, k].conj() * coherent
+    return total
