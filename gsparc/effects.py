@@ -142,7 +142,7 @@ def _settle(
     effect: str,
     switch: Switch,
     obstacle: str | None,
-    choices: tuple[Switch, ...] = ("auto", SPLAT, True, False),
+    choices: tuple[Switch, ...] = ("auto", "splat", True, False),
 ) -> Decision:
     if switch not in choices:
         named = [str(choice).lower() for choice in choices]

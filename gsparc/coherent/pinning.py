@@ -171,7 +171,8 @@ class Given:
 
     def apart(self, points: Tensor, distance: float) -> Tensor:
         """The best `POLISHED` of some places, `distance` [m] from each other."""
-        told, best = self.told(points), []
+        told = self.told(points)
+        best: list[Tensor] = []
         while len(best) < POLISHED and float(told.max()) > -torch.inf:
             best.append(points[int(told.argmax())])
             told[(points - best[-1]).norm(dim=1) < distance] = -torch.inf
