@@ -100,7 +100,7 @@ def test_probe_accepts_the_array_that_measured_and_refuses_another(spectra) -> N
     )
 
 
-def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images() -> None:
+def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images(tmp_path, monkeypatch) -> None:
     """Spectra of places wavelengths apart went through the array: 18.0 dB, where a process has 23.8."""
     site = array_site(SphereGrid.hemisphere(15, 60), planar_array())
     apart = np.random.default_rng(0).uniform([0.5, 0.5, 0.5], [5.5, 4.5, 2.0], (40, 3))
@@ -108,8 +108,10 @@ def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images() -> No
     fold = Fold(np.arange(36), np.arange(0), np.arange(36, 40))
     trial = ArrayField(cache=False)
     assert probe_array(data, fold, seed=0).on  # it explains them all the same
+    monkeypatch.chdir(tmp_path)
     decision = contest_array(trial, GaussianProcess(), data, fold, seed=0)
     assert not decision.on and "wavelengths apart" in decision.reason
+    assert not list(tmp_path.iterdir())  # a trial left array_recovery.csv where the user stood
     near = replace(data, tx=apart / 20)
     assert contest_array(trial, GaussianProcess(), near, fold, seed=0).seconds == 0.0  # not held
 
