@@ -26,7 +26,7 @@ class View:
     """How n places look at one source.
 
     Attributes:
-        place: (n, 3) float32 [m], relative to the middle of the scene.
+        place: (n, 3) float64 [m], relative to the middle of the scene.
         direction: (n, 3) float32, unit vectors from the source to the places.
     """
 
@@ -38,7 +38,7 @@ class View:
         """From float64 places (n, 3) and a source (3,) [m]."""
         offset = places - source
         length = torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)
-        return View(places.float(), (offset / length).float())
+        return View(places, (offset / length).float())
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,8 @@ class KernelVisibility:
     def correlation(self, first: View, second: View) -> Tensor:
         """See `Visibility`."""
         squared = _squared(first.direction, second.direction) / self.angle**2
-        squared = squared + _squared(first.place, second.place) / self.length**2
+        # In float32 the squares of a site of 5 km are a square metre off: that is no covariance.
+        squared = squared + _squared(first.place, second.place).float() / self.length**2
         return self.constant + (1 - self.constant) * matern32(squared)
 
 
@@ -68,7 +69,7 @@ class SeenByAll:
 
     def correlation(self, first: View, second: View) -> Tensor:
         """See `Visibility`."""
-        return first.place.new_ones(len(first.place), len(second.place))
+        return first.direction.new_ones(len(first.place), len(second.place))
 
 
 def matern32(squared: Tensor) -> Tensor:
@@ -78,4 +79,5 @@ def matern32(squared: Tensor) -> Tensor:
 
 
 def _squared(a: Tensor, b: Tensor) -> Tensor:
-    return (a.square().sum(-1)[:, None] + b.square().sum(-1)[None] - 2 * a @ b.T).clamp_min(0)
+    squared = torch.addmm(b.square().sum(-1), a, b.T, alpha=-2)
+    return squared.add_(a.square().sum(-1)[:, None]).clamp_min(0)

@@ -10,7 +10,7 @@ from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.process import Posterior, Scene, correlations, steering
 from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows
-from gsparc.coherent.visibility import KernelVisibility, SeenByAll, View
+from gsparc.coherent.visibility import KernelVisibility, SeenByAll, View, matern32
 
 COUNT = 24
 
@@ -176,3 +176,20 @@ def test_visibility_is_one_at_the_same_place_and_falls():
     correlation = law.correlation(view, view)
     torch.testing.assert_close(correlation.diagonal(), torch.ones(3), rtol=1e-3, atol=1e-3)
     assert 1 > correlation[0, 1] > correlation[0, 2] >= 0.3
+
+
+@pytest.mark.parametrize("extent", [5.0, 500.0, 20_000.0])
+def test_visibility_of_a_wide_site_is_a_covariance(extent):
+    """Expanded squares of places in float32: off by 0.2 of 1 and no covariance in a site of 20 km."""
+    draws = torch.Generator().manual_seed(0)
+    places = (torch.rand(200, 3, generator=draws, dtype=torch.float64) - 0.5) * extent
+    places[100:] = places[:100] + 0.01 * torch.randn(100, 3, generator=draws, dtype=torch.float64)
+    law, source = KernelVisibility(), torch.tensor([0.7 * extent, 1.0, 2.0], dtype=torch.float64)
+    view = View.of(places, source)
+    found = law.correlation(view, view)
+    rays = (places - source) / (places - source).norm(dim=1, keepdim=True)
+    squared = (rays[:, None] - rays).square().sum(-1) / law.angle**2
+    squared = squared + (places[:, None] - places).square().sum(-1) / law.length**2
+    exact = law.constant + (1 - law.constant) * matern32(squared)
+    assert found.dtype == torch.float32 and (found - exact).abs().max() < 1e-5
+    assert torch.linalg.eigvalsh(found.double()).min() > -1e-5
