@@ -25,6 +25,7 @@ ROUNDS = 12
 STEPS = 6  # of Gauss and Newton for a new point
 SHARINGS = 12  # of expectation maximisation
 SAME = 4.0  # standard deviations within which two points are one
+LEAST_SHARINGS = 3  # how many rays mean nothing must have been heard by all
 STILL = 0.02  # relative change of sigma that ends them
 LEAST_LOST = 0.02  # share of the rays that mean nothing
 LEAST_SHARE = 1e-3  # of a ray that counts for a point
@@ -118,7 +119,7 @@ def shared(rays: Rays, points: np.ndarray, error: float) -> Bundles:
     while True:
         covariance, share = np.zeros((0, 3, 3)), np.zeros((0, len(rays)))
         rate: np.ndarray | float = 1.0
-        for _ in range(SHARINGS if len(points) else 0):
+        for turn in range(SHARINGS if len(points) else 0):
             miss = rays.miss(points)
             share = _share(miss, error, rate)
             lost = max(len(rays) - share.sum(), LEAST_LOST * len(rays))
@@ -127,7 +128,7 @@ def shared(rays: Rays, points: np.ndarray, error: float) -> Bundles:
             error = math.sqrt((share * miss).sum() / max(2 * share.sum(), 1e-9))
             error = min(max(error, LEAST_ERROR), MOST_ERROR)
             points, covariance = _steps(rays, points, share, error)
-            if abs(math.log(error / before)) < STILL:
+            if turn >= LEAST_SHARINGS and abs(math.log(error / before)) < STILL:
                 break
         evidence = _evidence(share, covariance)
         order = np.argsort(-evidence, kind="stable")

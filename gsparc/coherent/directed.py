@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from gsparc.coherent.openness import Open, coherence
 from gsparc.coherent.phase import LIGHT, ranges, wave, wave_over_band
 from gsparc.coherent.pinning import Pinning
 from gsparc.coherent.process import JITTER, Factor, steering
+from gsparc.coherent.revote import Rates, flips
 from gsparc.coherent.rows import Rows, gather, query_elements, tones_of
 from gsparc.coherent.sightings import Sightings
 from gsparc.coherent.visibility import matern32
@@ -43,6 +44,7 @@ LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
 NOISES = (0.001, 0.01, 0.05)  # of the rows' power
 ROUNDS = 4  # of powers and shared numbers in turn
 PINNED = 400  # rows that places are pinned by
+REVOTES, RELEARNT = 9, 3  # rounds in which each channel changes one sighting at most
 JUDGED = 700  # rows that the shared numbers are chosen on
 
 
@@ -140,12 +142,12 @@ class DirectedSources(Method):
         at = {int(row): k for k, row in enumerate(known)}
         self.observer = torch.tensor([at[int(row)] for row in everything.receiver])
         self._pin()
-        self._learn()
-        self._prepare()
+        self._relearn()
+        changed = self._revote()
         note = (
             f"directed: {len(self.sources)} sources where rays meet, their directions' error "
             f"{math.degrees(bundles.error):.2g} degrees; "
-            f"{self.law.constant:.1%} of a gain is the same everywhere"
+            f"{changed} sightings by the channels; {self.law.constant:.1%} of a gain is the same everywhere"
         )
         return FitReport(time.monotonic() - started, (note,))
 
@@ -161,6 +163,10 @@ class DirectedSources(Method):
         rows = self.rows.take(some)
         alike = PINNING.correlation(rows.position, rows.position)
         self.open = Pinning(rows, self.sightings.seen[self.observer[some]].float(), self.open, alike).run()
+
+    def _relearn(self) -> None:
+        self._learn()
+        self._prepare()
 
     def _learn(self) -> None:
         """Powers and the law of gains in turn: expectation maximisation, and likelihood on a grid."""
@@ -196,6 +202,44 @@ class DirectedSources(Method):
         # (n, K, R), real and imaginary: what each row adds to each source's gain
         pulled = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
         self.pulled = [part.contiguous() for part in (pulled.real, pulled.imag)]
+
+    def _revote(self) -> int:
+        """Let channels vote on who sees what; returns how many sightings changed.
+
+        Where each receiver has one row: more of them tell the gains of their own receiver.
+        """
+        if len(self.observer.unique()) < len(self.observer):
+            return 0
+        rays = self.sightings.seen.float()
+        likely = self.sightings.left_out.float()
+        rates, rows = Rates.first(rays), self.observer
+        for turn in range(REVOTES):
+            if turn % RELEARNT == RELEARNT - 1:
+                self._relearn()
+            places, known = self.rows.position, self.factor.inverse.diagonal().real
+            query = Query(
+                places,
+                len(rows),
+                ranges(places, self.sources),
+                likely[rows],
+                self.law.correlation(places, places),
+                coherence(self.turns, self.turns),
+            )
+            one = self._gains(query) * steering(self.rows, self.sources)[:, :, None]
+            seen, odds = self.sightings.seen.float(), rates.odds(rays, likely)
+            left = self.factor.alpha / known[:, None]  # eq. 5.12
+            flip = flips(seen[rows], odds[rows], left, 1 / known, one)
+            if not bool(flip.any()):
+                break
+            seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])
+            rates = Rates.of(rays, seen)
+            self.sightings = replace(self.sightings, seen=seen.double())
+            self._prepare()
+        changed = int((self.sightings.seen.float() != rays).sum())
+        if changed:
+            self.sightings = Sightings.of(self.sightings.places, self.sightings.seen)
+            self._relearn()
+        return changed
 
     def _seen(self, rows: Rows, observer: Tensor) -> Tensor:
         """Waves (n, K) complex64 of the sources at every row, of those that its receiver sees."""
