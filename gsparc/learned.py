@@ -27,7 +27,7 @@ from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import Pose
 from gsparc.resolve import Choices, resolve, settled
 from gsparc.response import ResponseSettings
-from gsparc.resume import GsparcCheckpointIO
+from gsparc.resume import GsparcCheckpointIO, interrupted
 from gsparc.schedule import OptimizerSettings
 from gsparc.start import prepare
 from gsparc.trainer import Training, run_stage
@@ -102,7 +102,7 @@ class LearnedField(Method):
         self.choices, reasons = resolve(self.settings, self.warm_start, data.site)
         for reason in reasons:
             log.info("%s", reason)
-        resumed = None if training.resume is None else checkpoint.read(training.resume)
+        resumed = None if training.resume is None else interrupted(training.resume)
         stage = "train" if resumed is None else str(resumed.extra.get("stage", "train"))
         seconds, confidence, self._billed_s = 0.0, None, 0.0
         if resumed is not None:

@@ -14,6 +14,20 @@ if TYPE_CHECKING:
     from gsparc.method import Method
 
 
+def interrupted(path: Path) -> checkpoint.Stored:
+    """What an interrupted training left.
+
+    Raises:
+        ValueError: when the file holds a finished model without a trainer's state.
+    """
+    stored = checkpoint.read(path)
+    if "trainer" not in stored.extra:
+        raise ValueError(
+            f"{path} holds a finished model, not a training state: resume from last.ckpt instead"
+        )
+    return stored
+
+
 class GsparcCheckpointIO(CheckpointIO):
     """Writes a method's checkpoint with the trainer's state beside it, atomically.
 
@@ -42,12 +56,7 @@ class GsparcCheckpointIO(CheckpointIO):
         Raises:
             ValueError: when the file holds a finished model without a trainer's state.
         """
-        stored = checkpoint.read(Path(path))
-        if "trainer" not in stored.extra:
-            raise ValueError(
-                f"{path} holds a finished model, not a training state: resume from last.ckpt instead"
-            )
-        return stored.extra["trainer"]
+        return interrupted(Path(path)).extra["trainer"]
 
     def remove_checkpoint(self, path: Any) -> None:
         """Delete a superseded checkpoint."""

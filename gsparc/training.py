@@ -64,6 +64,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: bad data, settings or checkpoint; one line each.
     """
     limits.check(_plain(config))
+    _refuse_absent(config.ckpt_path)
     if config.threads is not None:
         torch.set_num_threads(int(config.threads))
     _anchor(config)
@@ -146,13 +147,17 @@ def _callbacks(config: DictConfig) -> list[Any]:
     return [instantiate(node) for node in (config.callbacks or {}).values() if node is not None]
 
 
+def _refuse_absent(path: str | None) -> None:
+    """Before anything is read or simulated: there is nothing to go on with."""
+    if path is not None and not Path(path).exists():
+        raise ValueError(f"ckpt_path={path}: no such file")
+
+
 def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     """The checkpoint to go on from; a run with several folds resumes each from its own folder."""
     if config.ckpt_path is None:
         return None
     path = Path(config.ckpt_path)
-    if not path.exists():
-        raise ValueError(f"ckpt_path={path}: no such file")
     if folds == 1:
         return path
     own = path / f"fold{number}" / "last.ckpt"

@@ -143,6 +143,15 @@ def test_a_finished_model_is_no_training_state(tmp_path):
         train(compose(*brief(file, f"ckpt_path={objects.checkpoints[0]}")), tmp_path / "again")
 
 
+def test_another_methods_model_is_no_training_state(tmp_path):
+    """It was taken for an interrupted run: `gsparc has not been trained: call fit() or load a checkpoint`."""
+    file = spectra(tmp_path / "own.npz")
+    settings = [s for s in brief(file) if not s.startswith("model.")]
+    _, objects = train(compose(*settings, "model=nearest"), tmp_path / "run")
+    with pytest.raises(ValueError, match=r"resume from last\.ckpt instead"):
+        train(compose(*brief(file, f"ckpt_path={objects.checkpoints[0]}")), tmp_path / "again")
+
+
 def test_a_missing_checkpoint_is_named(tmp_path):
     file = spectra(tmp_path / "own.npz")
     with pytest.raises(ValueError, match=r"gone\.ckpt: no such file"):

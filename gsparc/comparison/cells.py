@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -181,12 +182,19 @@ def code_version(model: Mapping[str, Any]) -> str:
         spec = find_spec(name)
         if name in sources or spec is None or spec.origin is None or spec.submodule_search_locations:
             continue
-        tree = ast.parse(Path(spec.origin).read_bytes())
+        file = Path(spec.origin)
+        sources[name], imported = _program(file, file.stat().st_mtime_ns)
         package = name.rpartition(".")[0]
-        open_ends |= {m for m in _imports(tree) if m.rpartition(".")[0] == package}
-        sources[name] = _meaning(tree)
+        open_ends |= {m for m in imported if m.rpartition(".")[0] == package}
     text = json.dumps(sources, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+@functools.cache
+def _program(file: Path, changed_ns: int) -> tuple[str, frozenset[str]]:
+    """A module's meaning and what it imports, read once for all cells while the file stays as it is."""
+    tree = ast.parse(file.read_bytes())
+    return _meaning(tree), frozenset(_imports(tree))
 
 
 def _meaning(tree: ast.Module) -> str:

@@ -15,6 +15,7 @@ from gsparc.data.rfid import load_rfid
 from gsparc.data.schema import Measurements
 from gsparc.ops import SphereGrid
 
+LONG_ARRAY = 100  # wavelengths: no array of one receiver
 ENDS = {"rx": "receiver", "tx": "transmitter"}
 
 
@@ -49,7 +50,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
         ("neighbours", _neighbours(moving, site.wavelength)),
     ]
-    lines += [("units?", hint) for hint in _units(np.concatenate([data.tx, data.rx_position]))]
+    lines += [("units?", hint) for hint in doubts(data)]
     if site.carrier_hz is not None:
         lines.append(("carrier", f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"))
     else:
@@ -99,6 +100,26 @@ def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
         text += f", {np.median(distance) / wavelength:.2g} wavelengths"
     same = int((distance == 0).sum())
     return text + (f"; {same} rows share their place with another" if same else "")
+
+
+def doubts(data: Measurements) -> list[str]:
+    """What can be read but is hardly meant: millimetres, radians, powers that are no decibels."""
+    found, site = _units(np.concatenate([data.tx, data.rx_position])), data.site
+    if site.array is not None and site.wavelength is not None:
+        reach = float(np.ptp(site.array, axis=0).max())
+        if reach > LONG_ARRAY * site.wavelength:
+            found.append(
+                f"the antennas reach over {reach:.4g} m, {reach / site.wavelength:.3g} wavelengths: in mm?"
+            )
+    if site.grid is not None:
+        turn = np.degrees(site.grid.azimuth_step * site.grid.width)
+        if abs(turn / (2 * np.pi) - 1) < 0.02:
+            found.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+    if site.kind == "rssi" and (data.target > 0).all():
+        spread = 10 * float(np.log10(data.target.max() / data.target.min()))
+        if 0 < spread < 0.1:
+            found.append(f"the powers differ by {spread:.1g} dB in all; if they are linear, call them rssi")
+    return found
 
 
 def _units(positions: np.ndarray) -> list[str]:

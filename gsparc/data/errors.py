@@ -24,7 +24,7 @@ class DataError(ValueError):
 class Problems(list[str]):
     """Collects what is wrong with one file or folder, so that a user sees all of it at once."""
 
-    LIMIT = 20  # of one sort: a file with 6,000 bad rows needs no 6,000 lines
+    LIMIT = 5  # of one sort: a file with 6,000 bad rows needs no 6,000 lines
 
     def __init__(self, source: str | Path) -> None:
         super().__init__()

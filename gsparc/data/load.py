@@ -95,9 +95,14 @@ def _newrf(config: Mapping[str, Any]) -> Measurements:
 
 
 def _own(config: Mapping[str, Any]) -> Measurements:
+    from gsparc.data.describe import doubts
     from gsparc.data.own import load_own
 
-    return load_own(_required_file(config))
+    file = _required_file(config)
+    data = load_own(file)
+    for doubt in doubts(data):
+        log.warning("%s: units? %s", file, doubt)
+    return data
 
 
 def _argos(config: Mapping[str, Any]) -> Measurements:

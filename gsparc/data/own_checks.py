@@ -76,10 +76,9 @@ class Checker:
             "; transposed?" if any(array.shape[::-1] == s for s in shapes) or array.shape[:1] == (3,) else ""
         )
         expected = FIELDS[name].shape
-        counts = " or ".join(str(s).replace("None", "any") for s in shapes)
-        self.problems.add(
-            self.where(name), f"expected shape {expected}, here {counts}, found {array.shape}{hint}"
-        )
+        told = any(count is not None for shape in shapes for count in shape)
+        here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if told else ""
+        self.problems.add(self.where(name), f"expected shape {expected}{here}, found {array.shape}{hint}")
         return False
 
     def position(self, name: str, rows: int | None, row_names: list[str]) -> np.ndarray | None:
