@@ -80,21 +80,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             method = build(config.model)
             for guess in getattr(method, "guesses", ()) if number == 0 else ():
                 log.info("guess: %s", guess)
-            if hasattr(method, "training"):
-                method.training = Training(
-                    settings=instantiate(config.trainer),
-                    seed=int(config.seed),
-                    callbacks=lambda: _callbacks(config),
-                    loggers=loggers,
-                    resume=_resume(config, number, len(split.folds)),
-                    config_yaml=config_yaml,
-                )
-            elif config.ckpt_path is not None:
-                if not hasattr(method, "resume"):
-                    raise ValueError(
-                        f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path"
-                    )
-                method.resume = _resume(config, number, len(split.folds))
+            _equip(method, config, config_yaml, loggers, number, len(split.folds))
             report = method.fit(data, fold, folder)
             for note in report.notes:
                 log.info("%s", note)
@@ -141,6 +127,29 @@ def _refuse_empty(split: Split) -> None:
                 f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
                 f"rows; at least {LEAST_ROWS} and 1 are needed"
             )
+
+
+def _equip(
+    method: Method, config: DictConfig, config_yaml: str, loggers: Sequence[Logger], number: int, folds: int
+) -> None:
+    """Hand the method of fold `number` what the run brings along, and what it goes on from.
+
+    Raises:
+        ValueError: it is to go on, but trains in one piece.
+    """
+    if hasattr(method, "training"):
+        method.training = Training(
+            settings=instantiate(config.trainer),
+            seed=int(config.seed),
+            callbacks=lambda: _callbacks(config),
+            loggers=loggers,
+            resume=_resume(config, number, folds),
+            config_yaml=config_yaml,
+        )
+    elif config.ckpt_path is not None:
+        if not hasattr(method, "resume"):
+            raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
+        method.resume = _resume(config, number, folds)
 
 
 def _callbacks(config: DictConfig) -> list[Any]:
