@@ -130,7 +130,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     if kind == "spectrum" and min(values.shape[1:]) < SSIM_WINDOW:
         check.notes.append(
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
-            f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, and no SSIM is told"
+            f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is not told"
         )
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)

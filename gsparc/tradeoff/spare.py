@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -20,6 +21,8 @@ from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.tradeoff.points import Settings
 from gsparc.tradeoff.view import View
+
+log = logging.getLogger(__name__)
 
 FAMILIES = {  # the most special class first
     "gsparc.committee.Committee": "gsparc.tradeoff.members",
@@ -101,7 +104,8 @@ def combinations(
 ) -> Iterator[dict[str, Any]]:
     """Settings: none, each of `singles` alone, and every combination in `grid`, of the knobs the method has.
 
-    A grid without values takes all that the method offers.
+    A grid without values takes all that the method offers; strides must divide the columns, others are left
+    out with a warning.
     """
     known = knobs(method)
     alone = [{knob: value} for knob, values in singles.items() if knob in known for value in values]
@@ -111,6 +115,8 @@ def combinations(
         for knob, values in grid.items()
         if knob in known
     }
+    if "stride" in axes:
+        axes["stride"] = _dividing(axes["stride"], method)
     together = [
         {k: v for k, v in zip(axes, chosen, strict=True) if AS_TRAINED.get(k) != v}
         for chosen in product(*axes.values())
@@ -120,3 +126,14 @@ def combinations(
         if settings not in seen:
             seen.append(settings)
             yield settings
+
+
+def _dividing(strides: Sequence[int], method: Method) -> list[int]:
+    grid = getattr(getattr(method, "site", None), "grid", None)
+    if grid is None:
+        return list(strides)
+    fitting = [stride for stride in strides if grid.width % stride == 0]
+    if len(fitting) < len(strides):
+        none = ", ".join(str(stride) for stride in strides if stride not in fitting)
+        log.warning("stride=%s: does not divide the %d columns of the grid, left out", none, grid.width)
+    return fitting or [1]

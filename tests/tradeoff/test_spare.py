@@ -189,6 +189,16 @@ def test_a_committee_answers_with_some_of_its_members(field):
     assert {} in found and {"members": ["gp"], "keep": 0.5} in found and len(found) == 6
 
 
+def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
+    """The command's own default strides ended it on grids of 7 x 13."""
+    method = GaussianProcess()
+    method.fit(field.data, field.split.folds[0], Path())
+    columns = field.data.site.grid.width
+    assert columns % 2 == 0 and columns % 3
+    assert list(spare.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
+    assert f"stride=3: does not divide the {columns} columns" in caplog.text
+
+
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.split.folds[0], Path())
