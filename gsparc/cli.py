@@ -50,6 +50,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         task: called with the composed configuration.
         config: name of the primary configuration.
     """
+    if {"--help", "-h"} & set(sys.argv[1:]):
+        sys.stdout.write(_explained(task, config))  # Hydra's own list of choices and values follows
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
@@ -68,6 +70,14 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+def _explained(task: Callable[[DictConfig], object], config: str) -> str:
+    """What a command does and its settings with their comments, which Hydra leaves out."""
+    what = inspect.cleandoc(inspect.getmodule(task).__doc__ or "").partition("\n\n")[0]  # type: ignore[union-attr]
+    file = Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0]) / f"{config}.yaml"
+    settings = file.read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()
+    return f"{what}\n\n{settings}\n\n"
 
 
 def console() -> Console:
@@ -96,6 +106,8 @@ def one_line(error: BaseException) -> str:
         return " ".join(str(error).split())
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return f"{error.full_key}: {_first(error)}"
+    if isinstance(error, OSError) and error.filename is not None and error.strerror:
+        return f"{error.filename}: {error.strerror}"
     text = _first(error)
     # People's errors are ValueErrors and their like; a bug's type says more than its text.
     expected = isinstance(error, (ValueError, OSError, RuntimeError)) and text

@@ -17,9 +17,11 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import gsparc.conf
+from gsparc import cli
 from gsparc.cli import one_line
 from gsparc.method import Method
 from gsparc.registry import build
+from gsparc.training import task
 
 CONF = Path(gsparc.conf.__path__[0])
 ROOT = Path(__file__).parents[1]
@@ -112,6 +114,24 @@ def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
 
 def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
     assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
+
+
+@pytest.mark.parametrize("command", ["train", "calibration", "link", "tradeoff"])
+def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monkeypatch, capsys):
+    """`--help` listed names and values without a word about them."""
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        cli.run(task, command)
+    said = capsys.readouterr().out
+    assert not ended.value.code and said.startswith("Compose, fit, test, write")
+    assert (CONF / f"{command}.yaml").read_text().splitlines()[0] in said and "  # " in said
+
+
+def test_a_folder_that_cannot_be_written_is_named_without_a_number():
+    """`[Errno 2] No such file or directory: '/proc/x'`."""
+    assert one_line(FileNotFoundError(2, "No such file or directory", "/proc/x")) == (
+        "/proc/x: No such file or directory"
+    )
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ SHARES = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 def need_sionna() -> None:
     """Refuse in words where Sionna is not installed."""
     if find_spec("sionna") is None:
-        raise ValueError("gsparc.link needs Sionna: pip install 'gsparc[sionna]'")
+        raise ValueError("gsparc.link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
 
 
 def band(found: Channels) -> Band:
