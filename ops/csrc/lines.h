@@ -74,10 +74,15 @@ template <class S> struct Lines {
                     if (features) __builtin_prefetch(features + (int64_t(first) * plan.count + later) * channels);
                 }
                 fill_some(plan, model, stage, lens, pose, rank, some);
-                for (int k = 0; k < some; ++k)
-                    for (int b = 0; b < count; ++b)
-                        for (int c = 0; c < channels; ++c)
-                            rows[(at + k) * width + kFeatures + b * channels + c] = features[(int64_t(first + b) * plan.count + plan.order[at + k]) * channels + c];
+                for (int b = 0; b < count; ++b) {
+                    S* to = rows.data + at * width + kFeatures + b * channels;
+                    const S* from = features + int64_t(first + b) * plan.count * channels;
+                    for (int k = 0; k < some; ++k, to += width) {
+                        const S* mine = from + int64_t(plan.order[at + k]) * channels;
+                        if (channels == 2) to[0] = mine[0], to[1] = mine[1];  // most often: a loop for two numbers costs more than they do
+                        else for (int c = 0; c < channels; ++c) to[c] = mine[c];
+                    }
+                }
             }
         };
         parallel_for(plan.poses * chunks, threads, fill);

@@ -40,7 +40,6 @@ template <class S> struct Stand {
 
 // `project_one` for rows [i, i + count), count at most the lanes.
 template <class S> int64_t project_some(const ProjectArgs<S>& a, const Lens<Pack<S>>& lens, const Stand<S>& stand, int64_t i, int count) {
-    constexpr int n = Pack<S>::n;
     Pack<S> opacity;
     gather_rows(a.model.opacities + i, 1, count, &opacity);
     const Gaussian<Pack<S>> g = gaussians(a.model, i, count);

@@ -22,7 +22,7 @@ template <class N> struct Outline {
 
 // The outline of records in lanes, their offsets in any unit; a little larger than life.
 template <class S, bool kTangent> GSPARC_INLINE Outline<Pack<S>> outline_of(const Pack<S>* record, const Lens<Pack<S>>& lens) {
-    const Pack<S> reach = root(record[kReach]) * S(1.001), none = S(0), one = S(1);
+    const Pack<S> reach = root(record[kReach]) * S(1.001), one = S(1);
     Outline<Pack<S>> o;
     if (!kTangent) {
         o.column = record[0], o.middle = record[1], o.stretch = one;
