@@ -155,6 +155,16 @@ def test_a_channel_says_which_source_a_receiver_missed():
     assert not bool(quiet[rays == 0].any())
 
 
+def test_checkpoints_of_before_directions_had_errors_load(pillar):
+    data, fold, _, method = pillar
+    state = method.state()
+    del state["open"]
+    other = DirectedSources()
+    other.restore(data.site, state)
+    batch = data.batch(fold.test[:5])
+    torch.testing.assert_close(other.mean_at(batch.tx, batch.rx), method.mean_at(batch.tx, batch.rx))
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
