@@ -205,7 +205,8 @@ template <> GSPARC_INLINE Vec<float> bell<float>(Vec<float> halvings) {
     p = fma(p, r, splat(0.2402474582195282f));
     p = fma(p, r, splat(0.6931218504905701f));
     p = fma(p, r, splat(0.9999992847442627f));
-    return (Vec<float>)((Int<float>)p + ((Int<float>)shifted << 23));
+    typedef uint32_t Whole __attribute__((vector_size(kBytes)));  // far beyond the cut-off the sum wraps round
+    return (Vec<float>)((Whole)p + ((Whole)shifted << 23));
 }
 #endif
 
