@@ -41,6 +41,9 @@ class View:
         return View(places, (offset / length).float())
 
 
+ROUNDED = 1e-3  # of a squared length that rounding may take from a covariance
+
+
 @dataclass(frozen=True)
 class KernelVisibility:
     """`c + (1 - c) Matern-3/2(direction, place)`: seen from everywhere, plus what comes and goes smoothly.
@@ -58,8 +61,10 @@ class KernelVisibility:
     def correlation(self, first: View, second: View) -> Tensor:
         """See `Visibility`."""
         squared = _squared(first.direction, second.direction) / self.angle**2
-        # In float32 the squares of a site of 5 km are a square metre off: that is no covariance.
-        squared = squared + _squared(first.place, second.place).float() / self.length**2
+        places = (first.place, second.place)
+        if not _is_wide(*places, float(torch.as_tensor(self.length).detach())):
+            places = (first.place.float(), second.place.float())
+        squared = squared + _squared(*places).float() / self.length**2
         return self.constant + (1 - self.constant) * matern32(squared)
 
 
@@ -78,6 +83,14 @@ def matern32(squared: Tensor) -> Tensor:
     return (1 + root) * torch.exp(-root)
 
 
+def _is_wide(first: Tensor, second: Tensor, length: float) -> bool:
+    """Whether squares in float32 would be no covariance: of 5 km they are a square metre off.
+
+    Elsewhere float64 would only cost: it doubles the time of a search.
+    """
+    reach = max(float(places.abs().max()) if places.numel() else 0.0 for places in (first, second))
+    return torch.finfo(torch.float32).eps * reach**2 > ROUNDED * length**2
+
+
 def _squared(a: Tensor, b: Tensor) -> Tensor:
-    squared = torch.addmm(b.square().sum(-1), a, b.T, alpha=-2)
-    return squared.add_(a.square().sum(-1)[:, None]).clamp_min(0)
+    return (a.square().sum(-1)[:, None] + b.square().sum(-1)[None] - 2 * a @ b.T).clamp_min(0)
