@@ -41,9 +41,10 @@ def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> Non
             label=f"{trial.how}: broken in {trial.broken_of_all:.0%} of {len(trial.realised)} draws",
         )  # fmt: skip
     if trials:
+        # a draw that accepts nobody has no share of bad ones: NaN
         worst = max(trials[0].alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
         right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
-        if not any(np.nan_to_num(trial.coverage).any() for trial in trials):
+        if not any(trial.coverage.any() for trial in trials):
             right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
         right.axhline(trials[0].alpha, color="black", linewidth=1)
         right.set_title(

@@ -247,7 +247,7 @@ def _proposed(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mo
     for a, b in drawn[drawn[:, 0] != drawn[:, 1]]:
         one, two = rays.direction[groups[a]], rays.direction[groups[b]]
         here, there = rays.places[owners[a]], rays.places[owners[b]]
-        s, t, gap = passing(here, one, there, two)
+        s, t, gap = _passing(here, one, there, two)
         near = gap < 3 * error * np.hypot(s, t)
         i, j = np.nonzero(near)
         points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)
@@ -258,7 +258,7 @@ def _proposed(rays: Rays, error: float, rng: np.random.Generator, pairs: int, mo
     return found
 
 
-def passing(
+def _passing(
     here: np.ndarray, one: np.ndarray, there: np.ndarray, two: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How far along rays (P, 3) and (Q, 3) they pass each other, and in what distance: three of (P, Q) [m].

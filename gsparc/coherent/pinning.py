@@ -50,16 +50,16 @@ class Pinning:
         self.generator = torch.Generator().manual_seed(self.seed)
         self.now, self.noise = self.prior, NOISE
         self.wavelength = LIGHT / float(self.rows.frequency.mean())
-        self.terms = torch.stack([self._term(k) for k in range(len(self.prior.points))])
-        loud = float(self.terms.diagonal(dim1=1, dim2=2).real.sum(0).mean())
-        self.power = torch.full((len(self.terms),), 1 / max(loud, 1e-30))
-        self.pinned = torch.zeros(len(self.terms), dtype=torch.bool)
 
     def run(self) -> Open:
         """What rays and channels say of the places."""
         blurred = self.prior.blurred(self.rows.position, self.rows.frequency)
         if not len(blurred):
-            return self.now
+            return self.now  # directions were exact: no covariance is worth its time
+        self.terms = torch.stack([self._term(k) for k in range(len(self.prior.points))])
+        loud = float(self.terms.diagonal(dim1=1, dim2=2).real.sum(0).mean())
+        self.power = torch.full((len(self.terms),), 1 / max(loud, 1e-30))
+        self.pinned = torch.zeros(len(self.terms), dtype=torch.bool)
         size = torch.linalg.det(self.prior.covariance)
         order = blurred[size[blurred].argsort()].tolist()
         for _ in range(SWEEPS):
