@@ -32,10 +32,8 @@ METHODS = {
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "directed": "gsparc.coherent.directed.DirectedSources",
     "array": "gsparc.array.field.ArrayField",
-    "array_mirrored": "gsparc.array.mirrored_field.MirroredField",
     "bearings": "gsparc.bearings.field.BearingField",
     "gsparc": "gsparc.best.Gsparc",
-    "committee": "gsparc.committee.Committee",
 }
 
 

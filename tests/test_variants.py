@@ -12,7 +12,7 @@ from gsparc.simulate.rfid_sim import ensure_rfid_sim
 from gsparc.variants import setting
 
 
-@pytest.mark.parametrize("model", ["gsparc", "bearings", "committee"])
+@pytest.mark.parametrize("model", ["gsparc", "bearings"])
 def test_every_method_that_takes_a_budget_gets_it(model, tmp_path, monkeypatch):
     """Only splatted fields and what is made of them did: `trainer.budget_s` was not heard by the others."""
     here = SimpleNamespace(runtime=SimpleNamespace(output_dir=tmp_path))

@@ -19,7 +19,6 @@ WORDS = {
     "confidence": lambda value: "" if value else "no confidence",
     "hybrid": lambda value: "" if value else "no rest",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
-    "members": lambda value: "+".join(value),
 }
 
 

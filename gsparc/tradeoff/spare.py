@@ -25,7 +25,6 @@ from gsparc.tradeoff.view import View
 log = logging.getLogger(__name__)
 
 FAMILIES = {  # the most special class first
-    "gsparc.committee.Committee": "gsparc.tradeoff.members",
     "gsparc.array.field.ArrayField": "gsparc.tradeoff.packets",
     "gsparc.bearings.field.BearingField": "gsparc.tradeoff.crossings",
     "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.tradeoff.sources",

@@ -8,16 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_arrays import array_site, measure, room_vectors, walk
+from known_arrays import array_site, measure, walk
 
 from gsparc import checkpoint
 from gsparc.array.field import ArrayField
-from gsparc.array.mirrored_field import MirroredField, TuningSettings
 from gsparc.array.packets import PacketSettings, WavePackets, distil
 from gsparc.array.process import Kernel, learn_process, mirror_elements, settle, twin
 from gsparc.array.render import SpectrumRenderer, spectra
 from gsparc.array.response import steering
-from gsparc.array.search import SearchSettings
 from gsparc.array.tuning import tune
 from gsparc.data.load import load, split_for
 from gsparc.data.rfid import planar_array
@@ -236,11 +234,10 @@ def test_many_rows_are_thinned(known_campaign, tmp_path):
 
 
 def test_refuses_what_has_no_array(campaign, tmp_path):
-    for kind in (ArrayField, MirroredField):
-        with pytest.raises(ValueError, match="no antenna array"):
-            kind().fit(campaign("spectrum", 12), _fold(12), tmp_path)
-        with pytest.raises(RuntimeError, match="not been trained"):
-            kind().predict(torch.zeros(1, 3), None)
+    with pytest.raises(ValueError, match="no antenna array"):
+        ArrayField().fit(campaign("spectrum", 12), _fold(12), tmp_path)
+    with pytest.raises(RuntimeError, match="not been trained"):
+        ArrayField().predict(torch.zeros(1, 3), None)
 
 
 @pytest.mark.parametrize("rows", [1, 3])
@@ -259,26 +256,6 @@ def test_duplicate_positions(known_campaign, tmp_path):
     method.fit(data, _fold(160), tmp_path)
     batch = data.batch(np.arange(4))
     assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
-
-
-def test_mirrored_arrays_learn_a_single_source(tmp_path):
-    """Free space: the direct path alone, exact everywhere, also far from every sample."""
-    site = array_site(SphereGrid.hemisphere(24, 48), planar_array())
-    tx = walk(60)
-    far = tx[:10] + np.array([0.5, 0.5, 0.2])
-    every = np.concatenate([tx, far])
-    vectors, _ = room_vectors(every, 0, planar_array())
-    data = measure(site, every, vectors, sha256="free space")
-    method = MirroredField(
-        SearchSettings(sources=3, candidates=300, polished=4), TuningSettings(steps=3), cache=False
-    )
-    method.fit(data, Fold(np.arange(50), np.arange(50, 60), np.arange(60, 70)), tmp_path)
-    batch = data.batch(np.arange(60, 70))
-    error = (method.predict(batch.tx, batch.rx).mean - batch.target).square().mean().sqrt()
-    assert error < 0.01
-    checkpoint.save(tmp_path / "mirrored.ckpt", method)
-    again, _ = checkpoint.load(tmp_path / "mirrored.ckpt")
-    assert torch.equal(again.predict(batch.tx, batch.rx).mean, method.predict(batch.tx, batch.rx).mean)
 
 
 @pytest.mark.slow

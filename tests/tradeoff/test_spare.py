@@ -17,12 +17,10 @@ from gsparc.array.packets import PacketSettings
 from gsparc.bearings.field import BearingField
 from gsparc.bearings.sources import SearchSettings
 from gsparc.coherent.vsgp import VirtualSourceGP
-from gsparc.committee import Committee
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.peers.gp import GaussianProcess
 from gsparc.peers.mean import Mean
-from gsparc.peers.nearest import Nearest
 from gsparc.tradeoff import spare, splatted
 from gsparc.training import train
 
@@ -175,18 +173,6 @@ def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings
     coarse = spare.reduced(method, {"stride": 2}, measured)
     assert answer(coarse, data, fold.test).mean.shape == data.batch(fold.test).target.shape
     assert 0 < away(method, coarse, data, fold.test) < 0.05
-
-
-def test_a_committee_answers_with_some_of_its_members(field):
-    data, fold = field.data, field.split.folds[0]
-    method = Committee({"gp": GaussianProcess(), "nearest": Nearest()})
-    method.fit(data, fold, Path())
-    alone = spare.reduced(method, {"members": ["gp"]}, {})
-    assert away(method.members["gp"], alone, data, fold.test) == 0
-    both = spare.reduced(method, {"keep": 1.0}, {})
-    assert away(method, both, data, fold.test) < 1e-9
-    found = list(spare.combinations(method, {"members": None, "keep": [1.0, 0.5]}, {}))
-    assert {} in found and {"members": ["gp"], "keep": 0.5} in found and len(found) == 6
 
 
 def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
