@@ -66,7 +66,7 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
 
 @pytest.mark.parametrize("model", ["gsparc", "bearings"])
 def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
-    """A committee of models was trained as if there were no budget, and one of 5 s was found again as one of 60 s."""
+    """A model was trained as if there were no budget: one of 5 s was found again as one of 60 s."""
     room = Remembered("own", "random", "spectrum", ("d", "s"))
     contender = Contender(model, (f"model={model}",), ("trainer.budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
