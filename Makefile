@@ -28,7 +28,7 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES)
 	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[dev,sweep]'
 	@touch $@
 
-sionna: $(VENV)/.sionna ## what `python -m gsparc.simulate` needs: Sionna and an LLVM that works with it, without root
+sionna: $(VENV)/.sionna ## what `gsparc simulate` needs: Sionna and an LLVM that works with it, without root
 
 $(VENV)/.sionna: $(VENV)/.installed
 	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna
@@ -55,7 +55,7 @@ hard-cases: setup ## every hard case on every backend, and the tables of docs/ha
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md
 
 bench: setup ## timings of the kernels as ratios
-	$(RUN) -m gsparc.bench
+	$(RUN) -m gsparc.studies.bench.command
 
 cuda: setup ## build the CUDA kernels for this machine's GPU (otherwise done when first used)
 	$(RUN) -P -m gsparc.ops.cuda_library

@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from gsparc import checkpoint
-from gsparc.calibration.stored import Trusted, kept
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import Kind, Site
 from gsparc.method import Method, Prediction
 from gsparc.ops import Pose
+from gsparc.studies.calibrate.stored import Trusted, kept
 
 if TYPE_CHECKING:
-    from gsparc.link.export import Paths
-    from gsparc.tradeoff.stored import Operating
+    from gsparc.studies.link.export import Paths
+    from gsparc.studies.tradeoff.stored import Operating
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 
@@ -88,7 +88,7 @@ class Predictor:
         """
         if uplink is None and frequency_hz is None and symbols is None:
             return self._ask("csi", tx, rx)
-        from gsparc.link import export
+        from gsparc.studies.link import export
 
         if uplink is not None:
             channel = export.heard(self.method, self.site, uplink, frequency_hz)
@@ -101,12 +101,12 @@ class Predictor:
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
-        positions; see `gsparc.link.export`.
+        positions; see `gsparc.studies.link.export`.
 
         Raises:
             ValueError: the model's channels are not made of paths.
         """
-        from gsparc.link import export
+        from gsparc.studies.link import export
 
         if uplink is not None:
             return export.heard_paths(self.method, self.site, uplink)
@@ -121,7 +121,7 @@ class Predictor:
         """How sure the model is, (B,) float32 in [0, 1], larger is surer.
 
         Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
-        `python -m gsparc.calibration` found best, else the model's own.
+        `gsparc calibrate` found best, else the model's own.
 
         Raises:
             ValueError: the method has no confidence of that kind.
@@ -136,7 +136,7 @@ class Predictor:
             ValueError: the model was never calibrated, or for another kind of confidence.
         """
         if self.trusted.promise is None:
-            raise ValueError("accepts: no threshold is stored; run python -m gsparc.calibration ckpt=FILE")
+            raise ValueError("accepts: no threshold is stored; run gsparc calibrate ckpt=FILE")
         if self.kind not in (None, self.trusted.kind):
             raise ValueError(
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
@@ -149,7 +149,7 @@ class Predictor:
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
         """Confidences (B,), whether one was asked for, and whether torch was given."""
         if uplink is not None:
-            from gsparc.link import export
+            from gsparc.studies.link import export
 
             said = export.judged(self.method, self.site, uplink)
             single, like, places = np.ndim(uplink) == 2, isinstance(uplink, Tensor), None
@@ -243,10 +243,10 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
     Args:
         path: the file.
         budget_ms: what one query may take on this machine, end to end [ms]. The operating points that
-            `python -m gsparc.tradeoff` stored with the model are timed here (a few seconds), the most
+            `gsparc tradeoff` stored with the model are timed here (a few seconds), the most
             accurate that fits answers, and torch's number of threads becomes that point's.
         confidence: `learned`, `expected`, `distance` or `gp_variance`; None takes the one that
-            `python -m gsparc.calibration` found best on positions set aside and stored with the model, and
+            `gsparc calibrate` found best on positions set aside and stored with the model, and
             the model's own where it was never calibrated.
 
     Raises:
@@ -259,7 +259,7 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
         trusted.check(confidence)
     if budget_ms is None:
         return Predictor(method, stored.site, trusted=trusted, kind=confidence)
-    from gsparc.tradeoff.choose import within
+    from gsparc.studies.tradeoff.choose import within
 
     chosen, point = within(method, stored, budget_ms)
     return Predictor(chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence)

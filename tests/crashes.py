@@ -17,7 +17,7 @@ from ledger import LEDGER
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["crashes", "campaigns", "gsparc.training", "gsparc.learned", "gsparc.callbacks"]
+    ["crashes", "campaigns", "gsparc.studies.train", "gsparc.learned", "gsparc.callbacks"]
 )
 
 
@@ -26,8 +26,8 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     import torch
     from campaigns import compose
 
-    from gsparc.cli import one_line
-    from gsparc.training import train
+    from gsparc.studies.cli import one_line
+    from gsparc.studies.train import train
 
     torch.set_num_threads(1)
     with Limited(most_bytes):
@@ -40,9 +40,9 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
 
 
 def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
-    """`python -m gsparc.simulate` of a box room in many small shards."""
-    from gsparc.cli import one_line
+    """`gsparc simulate` of a box room in many small shards."""
     from gsparc.simulate.campaign import simulate
+    from gsparc.studies.cli import one_line
 
     with Limited(most_bytes):
         try:

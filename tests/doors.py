@@ -55,7 +55,7 @@ def assert_refused(answer: Answer, says: str, folder: Path | None = None) -> Non
 
 
 def assert_found_bad(answer: Answer, says: str) -> None:
-    """`python -m gsparc.check`: status 1, one line a problem, one of which says it."""
+    """`gsparc check`: status 1, one line a problem, one of which says it."""
     assert answer.status == 1 and not answer.err, answer
     assert re.search(says, "\n".join(answer.out)), answer.out
     assert all(len(line) < 700 and "Traceback" not in line for line in answer.out), answer.out

@@ -11,8 +11,8 @@ from torch import nn
 from gsparc import budget
 from gsparc.budget import Budget, Pace, Stretched
 from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
+from gsparc.studies.train import train
 from gsparc.trainer import TrainerSettings
-from gsparc.training import train
 
 
 def test_a_schedule_of_steps_is_stretched_over_the_seconds():

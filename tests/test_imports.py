@@ -124,7 +124,7 @@ def test_a_wheel_installed_elsewhere_trains(tmp_path):
         [python, "-c", where], cwd=home, env=environment, capture_output=True, text=True, check=True
     )
     assert all(part.startswith(str(site)) for part in found.stdout.split()), found.stdout
-    run = [python, "-m", "gsparc.training", *brief(file), f"hydra.run.dir={home / 'run'}"]
+    run = [python, "-m", "gsparc", "train", *brief(file), f"hydra.run.dir={home / 'run'}"]
     done = subprocess.run(run, cwd=home, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     assert (home / "run" / "summary.json").exists()

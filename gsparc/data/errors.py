@@ -17,7 +17,7 @@ class DataError(ValueError):
         listed = (problems,) if isinstance(problems, str) else tuple(problems)
         self.problems = tuple(" ".join(problem.splitlines()) for problem in listed)
         more = len(self.problems) - 1
-        hint = f" (and {more} more: python -m gsparc.check {source or 'FILE'} lists them)" if more > 0 else ""
+        hint = f" (and {more} more: gsparc check {source or 'FILE'} lists them)" if more > 0 else ""
         super().__init__(self.problems[0] + hint)
 
 

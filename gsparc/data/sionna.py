@@ -1,4 +1,4 @@
-"""What `python -m gsparc.simulate` writes: one file with spectra, channels and paths, read as either."""
+"""What `gsparc simulate` writes: one file with spectra, channels and paths, read as either."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def judged_by(data: Measurements, truth: Measurements, named: str) -> Measuremen
 def _load(path: str | Path, target: str | None) -> Measurements:
     raw = read_raw(path)
     if "simulator" not in raw.attributes:
-        raise DataError(f"{path}: not written by python -m gsparc.simulate; read it with dataset=own")
+        raise DataError(f"{path}: not written by gsparc simulate; read it with dataset=own")
     target = str(target or raw.attributes.get("measurement"))
     if target not in TARGETS or target not in raw.arrays:
         raise DataError(

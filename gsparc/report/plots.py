@@ -21,7 +21,7 @@ from gsparc.report.intervals import interval, over_seeds
 from gsparc.report.learning import curve, validation_figure
 from gsparc.report.runs import PER_SAMPLE, Run
 from gsparc.report.tables import BASELINES, HEADS, grouped
-from gsparc.tradeoff.points import front
+from gsparc.studies.tradeoff.points import front
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95

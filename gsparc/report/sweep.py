@@ -14,9 +14,9 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table as Shown
 
-from gsparc import cli
 from gsparc.report.intervals import Interval
 from gsparc.report.table import Column, Table
+from gsparc.studies import cli
 from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)

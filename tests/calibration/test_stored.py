@@ -7,10 +7,10 @@ import pytest
 
 import gsparc
 from gsparc import checkpoint
-from gsparc.calibration.evidence import gather, known_positions, position_kernel
-from gsparc.calibration.stored import Trusted, as_confidence, keep
-from gsparc.calibration.threshold import Promise
 from gsparc.peers.gp import GaussianProcess
+from gsparc.studies.calibrate.evidence import gather, known_positions, position_kernel
+from gsparc.studies.calibrate.stored import Trusted, as_confidence, keep
+from gsparc.studies.calibrate.threshold import Promise
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from gsparc.coherent.sightings import Sightings
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.sensitivity import turned
+from gsparc.studies.study.sensitivity import turned
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
 

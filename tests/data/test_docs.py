@@ -20,7 +20,7 @@ def test_the_example_makes_a_good_file(tmp_path):
     code = re.search(r"```python\n(.*?)```", PAGE, flags=re.DOTALL).group(1)
     assert len(code.strip().splitlines()) <= 10
     subprocess.run([sys.executable, "-c", code], cwd=tmp_path, check=True)
-    command = [sys.executable, "-m", "gsparc.check", "mine.npz"]
+    command = [sys.executable, "-m", "gsparc", "check", "mine.npz"]
     said = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert said.returncode == 0, said.stdout + said.stderr
     assert "300 channels" in said.stdout and "2.4 GHz" in said.stdout and "mine.npz: good" in said.stdout

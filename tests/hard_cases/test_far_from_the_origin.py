@@ -12,7 +12,7 @@ import pytest
 from campaigns import brief, compose, spectra
 
 import gsparc
-from gsparc.training import train
+from gsparc.studies.train import train
 
 FAR = 1e5
 

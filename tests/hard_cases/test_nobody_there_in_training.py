@@ -15,8 +15,8 @@ from campaigns import brief, channels, compose, powers, spectra
 
 from gsparc.data.load import load, split_for
 from gsparc.registry import build
+from gsparc.studies.train import train
 from gsparc.trainer import TrainerSettings, Training
-from gsparc.training import train
 
 PRUNE = (
     "callbacks=densify",

@@ -21,7 +21,7 @@ import torch
 from campaigns import brief, compose, spectra
 
 from gsparc import checkpoint
-from gsparc.training import train
+from gsparc.studies.train import train
 
 ROOT = Path(__file__).parents[2]
 STEPS = 63  # a multiple of 7: the last checkpoint of a stage is its end

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from campaigns import STILL, brief, channels, compose
 
-from gsparc.training import train
+from gsparc.studies.train import train
 
 
 @pytest.mark.parametrize("kind", ["csi", "rssi", "spectrum"])

@@ -12,7 +12,7 @@ import torch
 from campaigns import brief, compose, spectra
 
 from gsparc.ops import composite, make_plan
-from gsparc.training import train
+from gsparc.studies.train import train
 
 
 @pytest.fixture(autouse=True)

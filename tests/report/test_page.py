@@ -11,10 +11,10 @@ from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
 
 from gsparc.report import plots
-from gsparc.report.__main__ import arguments, task
 from gsparc.report.page import html, studies, warnings
 from gsparc.report.readme import BEGIN, END, refresh
 from gsparc.report.runs import find_runs
+from gsparc.studies.report import arguments, task
 
 FETCHED = re.compile(
     r"""(?:src|href)\s*=\s*["'](?!data:|#)|@import|url\((?!#|["']?data:)|<link|<script[^>]+src"""

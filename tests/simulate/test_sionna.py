@@ -189,7 +189,7 @@ def test_killed_by_the_system_and_resumed(tmp_path):
     """SIGKILL between shards: nothing finished is lost or made twice."""
     out = tmp_path / "room.h5"
     command = [
-        sys.executable, "-m", "gsparc.simulate", "scene=conference_room", "scene.num_receivers=60",
+        sys.executable, "-m", "gsparc", "simulate", "scene=conference_room", "scene.num_receivers=60",
         "sampling.samples=5000", "shard=10", "check=0", "spectrum.height=18", "spectrum.width=36",
         f"out={out}", f"hydra.run.dir={tmp_path / 'run'}",
     ]  # fmt: skip

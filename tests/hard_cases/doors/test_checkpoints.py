@@ -28,9 +28,9 @@ import gsparc
 from gsparc import checkpoint
 from gsparc.checkpoint import CheckpointError
 from gsparc.data.load import load, split_for
-from gsparc.evaluate import main as evaluate
 from gsparc.registry import build
-from gsparc.training import main as train
+from gsparc.studies.evaluate import main as evaluate
+from gsparc.studies.train import main as train
 
 MARK = "owned"
 
@@ -83,7 +83,7 @@ def altered(sound: Path, to: Path, **changes: object) -> Path:
 
 
 def refused_everywhere(path: Path, file: Path, run: Path, says: str) -> None:
-    """`gsparc.load`, `python -m gsparc.evaluate` and `train.py ckpt_path=`."""
+    """`gsparc.load`, `gsparc evaluate` and `train.py ckpt_path=`."""
     with pytest.raises(CheckpointError, match=says) as refused:
         gsparc.load(path)
     assert "\n" not in str(refused.value) and path.name in str(refused.value)

@@ -1,6 +1,6 @@
 """Configurations with a slip of the finger at any depth: the nearest right name, before anything is computed.
 
-Remedy: gsparc/limits.py (what each setting may be) and gsparc/cli.py (one line, the nearest name).
+Remedy: gsparc/studies/limits.py (what each setting may be) and gsparc/studies/cli.py (one line, the nearest name).
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import pytest
 from campaigns import spectra
 from doors import assert_refused, knock
 
-from gsparc.evaluate import main as evaluate
-from gsparc.training import main as train
+from gsparc.studies.evaluate import main as evaluate
+from gsparc.studies.train import main as train
 
 SLIPS = {
     "modle=gsparc": "did you mean 'model'",

@@ -1,4 +1,4 @@
-"""Folders in the RFID release's layout, spoilt: `python -m gsparc.check` and `train.py dataset=rfid`.
+"""Folders in the RFID release's layout, spoilt: `gsparc check` and `train.py dataset=rfid`.
 
 Remedy: gsparc/data/rfid.py. The cases of tests/data/test_bad_input.py come again, at the commands' own doors.
 """
@@ -15,8 +15,8 @@ from doors import assert_found_bad, assert_refused, knock
 from PIL import Image
 from releases import GREY, SPOILT, write_release
 
-from gsparc.check import main as check
-from gsparc.training import main as train
+from gsparc.studies.check import main as check
+from gsparc.studies.train import main as train
 
 
 @pytest.fixture(scope="module")

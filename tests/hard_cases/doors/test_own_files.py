@@ -1,4 +1,4 @@
-"""Files of one's own, npz and HDF5, every array spoilt in every way: `python -m gsparc.check` and `load_own`.
+"""Files of one's own, npz and HDF5, every array spoilt in every way: `gsparc check` and `load_own`.
 
 Remedy: gsparc/data/own_checks.py; damage and Python objects: gsparc/data/raw.py.
 """
@@ -14,10 +14,10 @@ import pytest
 from doors import assert_found_bad, assert_refused, knock
 from ledger import LEDGER
 
-from gsparc.check import main as check
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
-from gsparc.training import main as train
+from gsparc.studies.check import main as check
+from gsparc.studies.train import main as train
 
 Arrays = dict[str, np.ndarray]
 

@@ -1,0 +1,1 @@
+"""One small file or folder per command."""

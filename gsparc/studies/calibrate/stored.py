@@ -1,0 +1,120 @@
+"""Which confidence to trust, kept with a model: `gsparc.load` answers with it, and with the threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc import checkpoint
+from gsparc.method import Prediction
+from gsparc.peers.gp import Kernel
+from gsparc.studies.calibrate.evidence import KINDS, expected_score, process_variance
+from gsparc.studies.calibrate.threshold import Promise, Threshold
+
+KEY = "confidence"
+
+
+@dataclass(frozen=True)
+class Trusted:
+    """The confidence that was best on positions set aside, and a threshold that promises something.
+
+    Attributes:
+        kind: one of `KINDS`; None: whatever the method says itself.
+        threshold: accept confidences of at least this; infinite where nothing can be promised.
+        promise: what the threshold promises; None where none was asked for.
+        known: (n, 3) local positions of the moving end that the method learned from [m].
+        kernel: of the process whose variance is a rival; None where no rival was stored.
+    """
+
+    kind: str | None
+    threshold: float
+    promise: Promise | None
+    known: np.ndarray
+    kernel: Kernel | None
+
+    def confidence(self, said: Prediction, places: np.ndarray | None, kind: str | None = None) -> np.ndarray:
+        """Confidence (B,) float32 in [0, 1] of predictions at local `places` (B, 3) [m] (None: unknown).
+
+        Raises:
+            ValueError: the method, or the checkpoint, does not have what `kind` needs.
+        """
+        kind = kind or self.kind or "learned"
+        return as_confidence(kind, self._score(kind, said, places)).astype(np.float32)
+
+    def check(self, kind: str) -> None:
+        """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""
+        if kind not in KINDS:
+            raise ValueError(f"confidence={kind}: expected one of {', '.join(KINDS)}")
+        if kind in ("distance", "gp_variance") and self.kernel is None:
+            raise ValueError(
+                f"confidence={kind}: the checkpoint does not say where was measured; "
+                "gsparc calibrate ckpt=FILE stores it"
+            )
+
+    def _score(self, kind: str, said: Prediction, places: np.ndarray | None) -> np.ndarray:
+        if kind == "learned":
+            if said.confidence is None:
+                raise ValueError("confidence=learned: this model has no confidence of its own")
+            return said.confidence.double().numpy()
+        if kind == "expected":
+            if said.variance is None:
+                raise ValueError("confidence=expected: this model states no error variance")
+            return expected_score(said).double().numpy()
+        self.check(kind)
+        assert self.kernel is not None
+        if places is None:
+            raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
+        if kind == "distance":
+            return -cKDTree(self.known).query(places)[0]
+        return -process_variance(self.kernel, self.known, places)
+
+
+def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
+    """Scores (n,) of `Evidence` as confidences (n,) in [0, 1] in the same order."""
+    if kind == "learned":
+        return score
+    if kind == "gp_variance":
+        return np.clip(1 + score, 0, 1)
+    return 1 / (1 - score)  # an expected error, or a distance in metres, of 1 is a confidence of a half
+
+
+def keep(path: str | Path, trusted: Trusted) -> None:
+    """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
+    checkpoint.amend(
+        path,
+        {
+            KEY: {
+                "kind": trusted.kind,
+                "threshold": trusted.threshold,
+                "promise": None if trusted.promise is None else asdict(trusted.promise),
+                "known": trusted.known,
+                "kernel": None if trusted.kernel is None else asdict(trusted.kernel),
+            }
+        },
+    )
+
+
+def kept(extra: Mapping[str, Any]) -> Trusted:
+    """What a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
+    found = extra.get(KEY)
+    if found is None:
+        return Trusted(None, float("inf"), None, np.zeros((0, 3)), None)
+    promise, kernel = found["promise"], found["kernel"]
+    return Trusted(
+        found["kind"],
+        float(found["threshold"]),
+        None if promise is None else Promise(**promise),
+        np.asarray(found["known"], np.float64),
+        None if kernel is None else Kernel(**kernel),
+    )
+
+
+def threshold_of(kind: str, found: Threshold) -> float:
+    """A threshold of scores as one of confidences."""
+    value = np.array(found.value)
+    return float(as_confidence(kind, value)) if np.isfinite(value) else float("inf")

@@ -1,0 +1,50 @@
+"""`gsparc check FILE_OR_FOLDER`: what was understood, or everything that is wrong."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from gsparc.data.describe import describe, read_any
+from gsparc.data.errors import DataError
+
+
+def check(path: str, console: Console) -> bool:
+    """Write what was understood of `path`, or all its problems one per line; returns whether it is good."""
+    try:
+        reading = read_any(path)
+    except DataError as error:
+        for problem in error.problems:
+            _line(console, problem)
+        count = len(error.problems)
+        _line(console, f"{path}: refused, {count} problem{'s' if count > 1 else ''}")
+        return False
+    for topic, sentence in describe(reading.data):
+        _line(console, f"{topic:<12}{sentence}")
+    for note in reading.notes:
+        _line(console, f"{'note':<12}{note}")
+    _line(console, f"{path}: good")
+    return True
+
+
+def _line(console: Console, text: str) -> None:
+    # As it is: paths may hold brackets, and one problem stays one line.
+    # A path that is not UTF-8 must not stop the message about it.
+    text = text.encode("utf-8", "replace").decode()
+    console.print(text, markup=False, highlight=False, soft_wrap=True, emoji=False)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; exit status 0 when everything given is good, else 1."""
+    parser = argparse.ArgumentParser(prog="gsparc check", description=__doc__)
+    parser.add_argument("path", nargs="+", help="npz or HDF5 file, or a folder like the RFID release")
+    console = Console()
+    good = [check(path, console) for path in parser.parse_args(arguments).path]
+    return 0 if all(good) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

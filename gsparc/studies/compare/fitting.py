@@ -1,0 +1,242 @@
+"""A cell filled: composed, trained on every fold, scored, and kept."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import hydra
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc import checkpoint
+from gsparc.clock import machine_facts
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split
+from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.registry import build
+from gsparc.scoring import score
+from gsparc.studies.compare.cells import Cell, Contender, key
+from gsparc.summary import provenance, write_summary
+from gsparc.trainer import Training
+
+log = logging.getLogger(__name__)
+
+RESULT = "cell.json"
+EARLIER = "measured at commit"  # among the facts of a result of earlier program text
+
+
+@dataclass(frozen=True)
+class Room:
+    """One dataset under one split.
+
+    Attributes:
+        dataset, split: names.
+        data: measurements.
+        folds: which rows learn and which test.
+    """
+
+    dataset: str
+    split: str
+    data: Measurements
+    folds: Split
+
+    @property
+    def kind(self) -> str:
+        """Of the measurements."""
+        return self.data.site.kind
+
+    @property
+    def hashes(self) -> tuple[str, str]:
+        """Of measurements and folds."""
+        return self.data.site.sha256, self.folds.sha256
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A room whose measurements are not here: what its kept results say of it.
+
+    Attributes:
+        dataset, split: names.
+        kind: of the measurements.
+        hashes: of measurements and folds.
+    """
+
+    dataset: str
+    split: str
+    kind: str
+    hashes: tuple[str, str]
+
+
+def remember(kept: Path, dataset: str, splits: Sequence[str]) -> list[Remembered]:
+    """The rooms of a dataset that most kept results speak of, one per split."""
+    found = []
+    for split in splits:
+        files = sorted(kept.glob(f"{dataset}-{split}-*/{RESULT}"))
+        facts = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+        known = Counter((f["dataset/kind"], f["dataset/sha256"], f["split/sha256"]) for f in facts)
+        if known:
+            kind, *hashes = known.most_common(1)[0][0]
+            found.append(Remembered(dataset, split, kind, (hashes[0], hashes[1])))
+    return found
+
+
+def open_rooms(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Room]:
+    """Load what `conf/dataset` names, with the given paths, once for all splits of `conf/split`."""
+    configs = [compose(dataset, settings, split, []) for split in splits]
+    data = load(_plain(configs[0].dataset))
+    return [
+        Room(dataset, split, data, split_for(_plain(config.split), data))
+        for split, config in zip(splits, configs, strict=True)
+    ]
+
+
+def compose(dataset: str, settings: dict[str, Any], split: str, overrides: list[str]) -> DictConfig:
+    """The configuration `train.py` would see."""
+    chosen = [f"dataset={dataset}", f"split={split}", "logger=none", "~callbacks.pictures", *overrides]
+    config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
+    OmegaConf.update(config, "dataset", settings, merge=True)
+    return config
+
+
+@dataclass(frozen=True)
+class Filled:
+    """A cell with its result.
+
+    Attributes:
+        cell: which.
+        folder: where its checkpoints are.
+        facts: flat, as in `summary.json`: `test/*`, `time/*`, `model/*`, `dataset/*`, `machine/*`.
+    """
+
+    cell: Cell
+    folder: Path
+    facts: dict[str, Any]
+
+    @property
+    def earlier(self) -> str | None:
+        """Commit of an earlier program text that it was measured with; None for this one's."""
+        return self.facts.get(EARLIER)
+
+    def scored(self) -> bool:
+        """Whether it was tested, not only timed."""
+        return any(name.startswith("test/") for name in self.facts)
+
+    @property
+    def checkpoint(self) -> Path:
+        """Of the first fold."""
+        return self.folder / "fold0.ckpt"
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A cell, composed but not yet trained."""
+
+    cell: Cell
+    config: DictConfig
+    folder: Path
+    scored: bool = True
+
+    def found(self) -> Filled | None:
+        """The kept result, if there is a whole one."""
+        try:
+            facts = json.loads((self.folder / RESULT).read_text(encoding="utf-8"))
+        except (OSError, json.JSONDecodeError):
+            return None
+        return Filled(self.cell, self.folder, facts)
+
+    def found_earlier(self, room: Room | Remembered) -> Filled | None:
+        """The latest result of other program text or settings for this cell, the same data and split.
+
+        Published results outlive the code they were measured with; a table must say so, not lose them.
+        """
+        stem = self.folder.name.rpartition("-")[0]
+        same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
+        same |= dict(zip(("dataset/sha256", "split/sha256"), room.hashes, strict=True))
+        found = []
+        for file in self.folder.parent.glob(f"{stem}-*/{RESULT}"):
+            facts = json.loads(file.read_text(encoding="utf-8"))
+            if all(facts.get(name) == value for name, value in same.items()):
+                found.append((facts.get("made") or "", file.parent, facts))
+        if not found:
+            return None
+        _, folder, facts = max(found, key=lambda entry: entry[0])
+        return Filled(self.cell, folder, {**facts, EARLIER: str(facts.get("git"))[:8]})
+
+
+def prepare(
+    cell: Cell, contender: Contender, settings: dict[str, Any], room: Room | Remembered, kept: Path
+) -> Prepared:
+    """Compose a cell's configuration and name the folder of its result."""
+    config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
+    model = _plain(config.model)
+    by_trainer = hasattr(build(config.model), "training")
+    trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks")} if by_trainer else {}
+    name = key(model, trainer, *room.hashes)
+    folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
+    return Prepared(cell, config, folder, not contender.timed_only)
+
+
+def fill(prepared: Prepared, room: Room) -> Filled:
+    """Train on every fold, score on the test rows, write checkpoints and then the result.
+
+    Raises:
+        ValueError: the method does not serve these data.
+        RuntimeError: training diverged.
+    """
+    config, folder = prepared.config, prepared.folder
+    methods, seconds, processor, notes = [], [], [], []
+    for number, fold in enumerate(room.folds.folds[: None if prepared.scored else 1]):
+        method = build(config.model)
+        if hasattr(method, "training"):
+            method.training = Training(
+                settings=instantiate(config.trainer),
+                seed=int(config.seed),
+                callbacks=lambda: [instantiate(node) for node in config.callbacks.values() if node],
+                config_yaml=OmegaConf.to_yaml(config, resolve=True),
+            )
+        before = time.process_time()
+        report = method.fit(room.data, fold, folder / f"fold{number}")
+        processor.append(time.process_time() - before)
+        seconds.append(report.seconds)
+        notes += [note for note in report.notes if number == 0]
+        extra = {"train_s": report.seconds, "fold": number, "split_sha256": room.folds.sha256}
+        yaml = OmegaConf.to_yaml(config, resolve=True)
+        checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
+        methods.append(method)
+    started = time.perf_counter()
+    figures = score(methods, room.data, room.folds).figures() if prepared.scored else {}
+    facts: dict[str, Any] = {f"test/{name}": value for name, value in figures.items()}
+    facts |= {
+        "time/train_s": sum(seconds) / len(seconds),
+        "time/train_cpu_s": sum(processor) / len(processor),
+        "time/score_s": time.perf_counter() - started,
+        "model/name": prepared.cell.method,
+        "model/num_gaussians": methods[0].size(),
+        "model/effects": getattr(methods[0], "effects", None),
+        "model/notes": "; ".join(notes),
+        "seed": prepared.cell.seed,
+        "budget_s": prepared.cell.budget_s,
+        "made": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    facts |= dataset_facts(room.data) | split_facts(room.folds) | machine_facts() | provenance()
+    write_summary(folder / RESULT, facts)  # last: a cell without it does not count
+    return Filled(prepared.cell, folder, facts)
+
+
+def kept_in(folder: str | None, cache: Path) -> Path:
+    """Where cells live: the folder asked for, else the platform's cache."""
+    return Path(os.path.expanduser(folder)) if folder else cache / "comparison"
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]

@@ -1,0 +1,85 @@
+"""Single-query latency of all methods of a room, in turns, on one processor, after all training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from gsparc import checkpoint
+from gsparc.clock import COPY, ClockSettings, interleaved, reference_copy
+from gsparc.method import Method
+from gsparc.studies.compare.fitting import Filled, Room
+
+QUERIES = 64  # different positions asked for
+SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
+ENDLESS_MS = 10_000.0  # from here on it is timed once
+FAST = ClockSettings(rounds=60, budget_s=30.0)
+SLOW = ClockSettings(rounds=5, least=1, warmup=0, budget_s=20.0)
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Of one method, one query end to end.
+
+    Attributes:
+        p50_ms, p95_ms: [ms].
+        to_copy: p50 in units of a 16 MiB copy timed in the same rounds.
+        rounds: how often it was timed.
+    """
+
+    p50_ms: float
+    p95_ms: float
+    to_copy: float
+    rounds: int
+
+
+def latencies(filled: Sequence[Filled], room: Room) -> dict[str, Latency]:
+    """One row per method, from the first of its checkpoints."""
+    methods: dict[str, Method] = {}
+    for one in filled:
+        if one.cell.method not in methods:
+            methods[one.cell.method] = _loaded(one.checkpoint)
+    calls = _calls(methods, room)
+    once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
+    endless = {name for name in calls if once[name][0] > ENDLESS_MS}
+    cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
+    warm = interleaved(cold, replace(SLOW, rounds=1))  # a first call may make what later ones keep
+    slow = {name for name in cold if warm[name][0] > SLOW_MS}
+    found = {name: latency for name, latency in _summaries(once).items() if name in endless}
+    for group, clock in ((set(calls) - slow - endless, FAST), (slow, SLOW)):
+        if group:
+            timed = interleaved({**{n: calls[n] for n in calls if n in group}, COPY: reference_copy()}, clock)
+            found |= _summaries(timed)
+    return {name: found[name] for name in methods}
+
+
+def _loaded(path: Path) -> Method:
+    return checkpoint.load(path)[0]
+
+
+def _calls(methods: Mapping[str, Method], room: Room) -> dict[str, Callable[[int], object]]:
+    """One query end to end each, another test position every time."""
+    rows = room.folds.folds[0].test[:QUERIES]
+    queries = [room.data.batch(rows[i : i + 1]) for i in range(len(rows))]
+
+    def call(method: Method) -> Callable[[int], object]:
+        return lambda turn: method.answer(queries[turn % len(queries)])
+
+    return {name: call(method) for name, method in methods.items()}
+
+
+def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
+    copy = float(np.median(times[COPY]))
+    return {
+        name: Latency(
+            p50_ms=float(np.median(values)),
+            p95_ms=float(np.quantile(values, 0.95)),
+            to_copy=float(np.median(values)) / copy,
+            rounds=len(values),
+        )
+        for name, values in times.items()
+        if name != COPY
+    }

@@ -1,0 +1,123 @@
+"""True and predicted channels of test positions, on any frequencies of the band."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.coherent.offsets import estimate
+from gsparc.data.argos import FACTS
+from gsparc.data.schema import Measurements
+from gsparc.method import Method, Prediction
+from gsparc.studies.link.grid import interpolated
+from gsparc.uplink.method import UplinkField
+
+if TYPE_CHECKING:
+    from gsparc.simulate.argos_sim import World
+
+CHUNK = 32
+
+
+@dataclass(frozen=True)
+class Channels:
+    """One band at n positions.
+
+    Attributes:
+        true: (n, A, K) complex64; of simulated streets exact, else interpolated from measured tones.
+        predicted: (n, A, K) complex64.
+        variance: (n,) expected squared error per entry of this very band; NaN where the method gives none.
+        confidence: (n,) the method's own; NaN where it has none.
+        source: where the truth comes from, for the summary.
+    """
+
+    true: Tensor
+    predicted: Tensor
+    variance: Tensor
+    confidence: Tensor
+    source: str
+
+    def of(self, index: np.ndarray) -> Channels:
+        """Some of the positions."""
+        at = torch.from_numpy(index)
+        return Channels(
+            self.true[at], self.predicted[at], self.variance[at], self.confidence[at], self.source
+        )
+
+
+def channels(
+    method: Method,
+    data: Measurements,
+    rows: np.ndarray,
+    frequency_hz: np.ndarray,
+    antennas: slice = slice(None),
+) -> Channels:
+    """True and predicted channels of rows (n,) at absolute frequencies (K,) [Hz], of some of the antennas.
+
+    Raises:
+        ValueError: a frequency outside the measured band.
+    """
+    assert data.site.subcarriers_hz is not None
+    predicted, variance, confidence = [], [], []
+    for start in range(0, len(rows), CHUNK):
+        batch = data.batch(rows[start : start + CHUNK])
+        if isinstance(method, UplinkField) and batch.uplink is not None:
+            wanted = torch.from_numpy(frequency_hz)
+            found = method.listen_at(batch.uplink, wanted, batch.noise_variance, antennas)
+        else:
+            found = method.answer(batch)
+            mean = interpolated(found.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
+            found = Prediction(mean, found.confidence, found.variance)
+        none = torch.full((len(batch),), torch.nan)
+        predicted.append(found.mean)
+        variance.append(none if found.variance is None else found.variance)
+        confidence.append(none if found.confidence is None else found.confidence)
+    true, source = truth(data, rows, frequency_hz)
+    return Channels(
+        true[:, antennas], torch.cat(predicted), torch.cat(variance), torch.cat(confidence), source
+    )
+
+
+def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
+    """True channels (n, A, K) in the data's units and frame, and how they were come by."""
+    assert data.site.subcarriers_hz is not None
+    if data.site.name == "argos-sim" and data.uplink is not None:
+        return _of_streets(data, rows, frequency_hz), "rays"
+    measured = data.targets(rows)
+    return interpolated(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
+
+
+@lru_cache(maxsize=1)
+def _streets(*facts: int) -> World:
+    from gsparc.simulate.argos_sim import world
+
+    return world(*facts)
+
+
+def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:
+    """Rays at these frequencies, turned as each snapshot was (phase and timing, found on its uplink)."""
+    site, uplink = data.site, data.uplink
+    assert uplink is not None and site.uplink_hz is not None and site.antennas is not None
+    assert site.carrier_hz is not None
+    there = _streets(*(int(data.provenance[name]) for name in FACTS if name in data.provenance))
+    heard = uplink[rows].astype(np.complex128) * site.target_scale
+    clean = there.response(site.uplink_hz, rows)
+    coarse = estimate(heard, clean, site.uplink_hz, site.carrier_hz, timing=True)
+    # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
+    rest = (coarse.removed(heard, site.uplink_hz, site.carrier_hz) * clean.conj()).sum(1)
+    away = site.uplink_hz - site.uplink_hz.mean()
+    weight = np.abs(rest)
+    middle = np.angle(rest.sum(1, keepdims=True))
+    angle = np.angle(rest * np.exp(-1j * middle))
+    mean = (weight * away).sum(1, keepdims=True) / weight.sum(1, keepdims=True)
+    slope = (weight * (away - mean) * angle).sum(1) / (weight * (away - mean) ** 2).sum(1)
+    level = ((weight * angle).sum(1) / weight.sum(1) - slope * mean[:, 0]) + middle[:, 0]
+    wanted = there.response(frequency_hz, rows)[:, site.antennas]
+    turn = coarse.phase[:, None] - 2 * np.pi * (frequency_hz - site.carrier_hz) * coarse.delay[:, None]
+    turn = turn + level[:, None] + slope[:, None] * (frequency_hz - site.uplink_hz.mean())
+    turned = wanted * np.exp(1j * turn)[:, None] / site.target_scale
+    return torch.from_numpy(turned.astype(np.complex64))

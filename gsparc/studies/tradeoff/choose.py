@@ -1,0 +1,70 @@
+"""`gsparc.load(FILE, budget_ms=...)`: time the stored operating points here and take the best that fits."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from gsparc.checkpoint import Stored
+from gsparc.data.schema import Site
+from gsparc.method import Method
+from gsparc.predictor import Predictor
+from gsparc.studies.tradeoff.spare import reduced
+from gsparc.studies.tradeoff.stored import Operating, kept
+from gsparc.studies.tradeoff.timing import Pace, in_turns
+
+log = logging.getLogger(__name__)
+
+PACE = Pace(rounds=12, least=5, calls=4, budget_s=3.0)
+QUANTILE = 0.75  # a point fits when three of four of its queries did: its median then does so again
+QUERIES = 16
+
+
+def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Operating]:
+    """The most accurate stored operating point whose queries take at most `budget_ms` on this machine.
+
+    Sets torch's number of threads to the point's.
+
+    Args:
+        method: as stored.
+        stored: its checkpoint.
+        budget_ms: for one query end to end [ms].
+
+    Raises:
+        ValueError: the budget is no positive number, or nothing fits; the fastest point is named.
+    """
+    if not (isinstance(budget_ms, (int, float)) and math.isfinite(budget_ms) and budget_ms > 0):
+        raise ValueError(f"budget_ms={budget_ms!r}: a positive number of milliseconds is needed")
+    points, measured = kept(stored.extra)
+    advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
+    if not points:
+        points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
+    points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
+    ways = [reduced(method, point.settings, measured) for point in points]
+    calls = {i: _ask(way, stored.site) for i, way in enumerate(ways)}
+    times = in_turns(calls, {i: point.threads for i, point in enumerate(points)}, PACE)
+    here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
+    fitting = [i for i in here if here[i] <= budget_ms]
+    if not fitting:
+        fastest = min(here, key=lambda i: here[i])
+        raise ValueError(
+            f"budget_ms={budget_ms:g}: no operating point of {stored.path} is that fast on this machine; the "
+            f"fastest ({points[fastest].label}) takes {here[fastest]:.3g} ms{advice}"
+        )
+    best = max(fitting, key=lambda i: (points[i].score, -here[i]))
+    torch.set_num_threads(points[best].threads)
+    log.info("%s: %s, %.3g ms here", stored.path, points[best].label, np.median(times[best]))
+    return ways[best], points[best]
+
+
+def _ask(method: Method, site: Site) -> Callable[[int], object]:
+    """Queries at places drawn in the scene's box."""
+    draw = np.random.default_rng(0)
+    places = draw.uniform(site.box[0], site.box[1], (QUERIES, 3)) + site.origin
+    ask = getattr(Predictor(method, site), site.kind)
+    return lambda number: ask(**{site.moving_end: places[number % QUERIES]})

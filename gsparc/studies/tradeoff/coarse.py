@@ -1,0 +1,61 @@
+"""Fewer pixels: render every n-th row and column, fill in the rest by linear interpolation."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsparc.method import Method, Prediction
+from gsparc.ops import Pose, SphereGrid
+from gsparc.studies.tradeoff.view import View
+
+
+def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
+    """Every `stride`-th pixel of the grid, the first row and column among them.
+
+    Raises:
+        ValueError: the columns cannot be divided so.
+    """
+    if grid.width % stride:
+        raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
+    return SphereGrid(
+        (grid.height - 1) // stride + 1,
+        grid.width // stride,
+        grid.first_elevation,
+        grid.first_azimuth,
+        grid.elevation_step * stride,
+        grid.azimuth_step * stride,
+    )
+
+
+class Filled(View):
+    """A method that answers on a coarser grid, its images interpolated to the full one.
+
+    Args:
+        inner: answers on `coarser(grid, stride)`.
+        grid: the full one.
+        stride: pixels per rendered pixel, along both axes.
+    """
+
+    def __init__(self, inner: Method, grid: SphereGrid, stride: int) -> None:
+        super().__init__(inner)
+        height, width = (grid.height - 1) // stride + 1, grid.width // stride
+        place = torch.arange(grid.height) / stride
+        low = place.floor().long()
+        share, eye = (place - low)[:, None], torch.eye(height)
+        # Rows past the last rendered one repeat it.
+        self._rows = (1 - share) * eye[low] + share * eye[(low + 1).clamp_max(height - 1)]
+        self._next = torch.arange(1, width + 1)
+        self._next[-1] = 0 if grid.periodic else width - 1
+        self._between = torch.arange(stride) / stride
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; images (B, H, W) of the full grid."""
+        found = self.inner.predict(tx, rx)
+        return Prediction(self.fill(found.mean), found.confidence, found.variance)
+
+    def fill(self, image: Tensor) -> Tensor:
+        """(B, h, w) -> (B, H, W)."""
+        wide = torch.lerp(image[..., None], image.index_select(2, self._next)[..., None], self._between)
+        return torch.matmul(self._rows, wide.flatten(2))

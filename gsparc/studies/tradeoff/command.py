@@ -1,0 +1,206 @@
+"""`gsparc tradeoff ckpt=FILE`: accuracy against latency; the front is kept with the model."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+
+from gsparc import checkpoint
+from gsparc.baselines import baseline, platform_cache
+from gsparc.clock import COPY, machine_facts, peak_memory, reference_copy
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.method import Method
+from gsparc.metrics import DECIDING, score_of
+from gsparc.scoring import rows_of, score
+from gsparc.studies import cli
+from gsparc.studies.evaluate import Opened, open_files
+from gsparc.studies.tradeoff import stored
+from gsparc.studies.tradeoff.picture import Rival, beaten_by, draw
+from gsparc.studies.tradeoff.points import Point, cost_of_halving, front
+from gsparc.studies.tradeoff.spare import combinations, measure, reduced
+from gsparc.studies.tradeoff.sweep import asker, candidate, sweep
+from gsparc.studies.tradeoff.timing import Pace
+from gsparc.summary import provenance, write_samples, write_summary
+
+log = logging.getLogger(__name__)
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run = open_files([config.ckpt], _plain(config.dataset), _plain(config.split))
+    fold, data, method = run.split.folds[0], run.data, run.methods[0]
+    rows = rows_of(fold, config.eval_on)
+    learned = np.sort(np.concatenate([fold.train, fold.val]))
+    measured = measure(method, data, learned)
+    settings = list(combinations(method, _plain(config.grid), _plain(config.singles)))
+    threads = _threads(config.threads)
+    log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
+    candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
+    rivals = _rivals(config, run)
+    clocks = {name: asker(rival, data, rows) for name, (rival, _) in rivals.items()}
+    points, other_ms = sweep(
+        candidates, data, fold, eval_on=config.eval_on,
+        pace=Pace(rounds=config.rounds, budget_s=config.budget_s), others={COPY: reference_copy(), **clocks},
+    )  # fmt: skip
+    figure = DECIDING[data.site.kind]
+    shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
+    chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
+    if config.store:
+        stored.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
+    beside = {
+        name: Rival(value, float(np.median(other_ms[name])), float(np.quantile(other_ms[name], 0.95)))
+        for name, (_, value) in rivals.items()
+        if value is not None
+    }
+    copy_ms = float(np.median(other_ms[COPY]))
+    write_samples(run_dir / "tradeoff.csv", _columns(points, shown, chosen, copy_ms))
+    best = [points[i] for i in shown]
+    title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
+    draw(points, shown, beside, figure, title, run_dir / "tradeoff.png")
+    facts = {
+        **_facts(points, best, figure, beside, copy_ms),
+        **machine_facts(), **peak_memory(), **provenance(), **dataset_facts(data), **split_facts(run.split),
+        "model/name": method.name,
+        "ckpt": str(config.ckpt),
+        "seed": run.stored[0].configuration.get("seed"),
+        "time/includes": "one query end to end: world position in, physical units out; warm",
+        "tradeoff/stored": len(chosen) if config.store else 0,
+    }  # fmt: skip
+    write_summary(run_dir / "summary.json", facts)
+    _show(best, figure, facts, title, run_dir)
+    for p in best:
+        rival = beaten_by(p, beside, figure)
+        if rival is not None:
+            log.warning("%s: %s is as fast and better", p.label, rival)
+    return facts
+
+
+def _threads(given: Sequence[int] | None) -> list[int]:
+    found = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
+    cores = os.cpu_count() or 1
+    if not found or found[0] < 1 or found[-1] > cores:
+        raise ValueError(
+            f"threads={found}: numbers between 1 and the {cores} cores of this machine are needed"
+        )
+    return found
+
+
+def _rivals(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | None]]:
+    """Baselines and the methods in other checkpoints, with the deciding figure of each."""
+    figure, fold, data = DECIDING[run.data.site.kind], run.split.folds[0], run.data
+    cache = platform_cache() if config.cache is None else Path(config.cache)
+    found: dict[str, tuple[Method, float | None]] = {}
+    for name in config.baselines:
+        fitted = baseline(name, data, run.split, config.eval_on, cache)
+        found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
+    for path in config.peers:
+        method, other = checkpoint.load(path)
+        if other.extra.get("split_sha256") not in (None, run.split.sha256):
+            raise ValueError(f"peers: {path} was trained on another split than {config.ckpt}")
+        name = next(
+            n for n in (method.name, f"{method.name} ({Path(path).parent.name})", path) if n not in found
+        )
+        found[name] = (method, _scored(method, data, fold, config.eval_on)[figure])
+    return found
+
+
+def _scored(method: Method, data: Measurements, fold: Fold, eval_on: str) -> dict[str, float | None]:
+    return score([method], data, Split("tradeoff", (fold,), ""), eval_on).figures()
+
+
+def _columns(
+    points: list[Point], shown: list[int], chosen: list[int], copy_ms: float
+) -> dict[str, list[Any]]:
+    """Columns of `tradeoff.csv`, fastest point first."""
+    order = sorted(range(len(points)), key=lambda i: points[i].p50)
+    rows = [points[i] for i in order]
+    spared = list(dict.fromkeys(knob for p in points for knob in p.settings))
+    return {
+        "label": [p.label for p in rows],
+        "render_ms_p50": [p.p50 for p in rows],
+        "render_ms_p95": [p.p95 for p in rows],
+        "ratio_to_copy": [p.p50 / copy_ms for p in rows],
+        **{figure: [p.figures[figure] for p in rows] for figure in points[0].figures},
+        "difference_to_full": [p.difference[0] for p in rows],
+        "difference_se": [p.difference[1] for p in rows],
+        "closeness_db": [p.closeness_db for p in rows],
+        "front": [int(i in shown) for i in order],
+        "kept_with_model": [int(i in chosen) for i in order],
+        "threads": [p.threads for p in rows],
+        "num_gaussians": [p.size for p in rows],
+        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in spared},
+    }
+
+
+def _cell(value: Any) -> Any:
+    return "+".join(map(str, value)) if isinstance(value, (list, tuple)) else value
+
+
+def _facts(
+    points: list[Point], best: list[Point], figure: str, rivals: dict[str, Rival], copy_ms: float
+) -> dict[str, Any]:
+    full = min((p for p in points if not p.settings), key=lambda p: p.p50)
+    useful = [p for p in best if beaten_by(p, rivals, figure) is None]  # a slope of points nobody should take
+    halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
+    facts: dict[str, Any] = {
+        "tradeoff/points": len(points),
+        "tradeoff/front": len(best),
+        "tradeoff/span": best[-1].p50 / best[0].p50,
+        "tradeoff/per_halving": halving,
+        "tradeoff/figure": figure,
+        "tradeoff/front_beaten_by_others": sum(beaten_by(p, rivals, figure) is not None for p in best),
+        "time/copy_ms": copy_ms,
+        "time/render_ms_p50": full.p50,
+        "time/render_ms_p95": full.p95,
+        f"test/{figure}": full.value(figure),
+    }
+    for number, p in enumerate(best, 1):
+        stem = f"front/{number}"
+        facts |= {f"{stem}/render_ms_p50": p.p50, f"{stem}/render_ms_p95": p.p95, f"{stem}/label": p.label}
+        facts |= {f"{stem}/{name}": value for name, value in p.figures.items()}
+    for name, rival in rivals.items():
+        facts |= {f"baseline/{name}/{figure}": rival.value, f"baseline/{name}/render_ms_p50": rival.p50}
+    return facts
+
+
+def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run_dir: Path) -> None:
+    table = Table(title=title)
+    table.add_column("not beaten")
+    for name in ("ms p50", "ms p95", figure, "difference to full"):
+        table.add_column(name, justify="right")
+    for p in best:
+        gap, error = p.difference
+        apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
+        table.add_row(p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart)
+    console = cli.console()
+    console.print(table)
+    slope = facts["tradeoff/per_halving"]
+    if slope is not None:
+        beaten = facts["tradeoff/front_beaten_by_others"]
+        rest = f" ({len(best) - beaten} that no baseline beats)" if beaten else ""
+        console.print(
+            f"{len(best)} points span {facts['tradeoff/span']:.1f} times in latency; each halving costs "
+            f"{slope:.2g} dB on average along the front{rest}",
+            highlight=False,
+        )
+    console.print(f"written to {run_dir}", highlight=False)
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
+
+
+if __name__ == "__main__":
+    cli.run(task, "tradeoff")

@@ -1,0 +1,84 @@
+"""What a Gaussian process on whole targets can spare: principal components, pixels, its variance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.method import Method, Prediction
+from gsparc.ops import Pose
+from gsparc.peers.encoding import from_real
+from gsparc.peers.gp import GaussianProcess
+from gsparc.studies.tradeoff.coarse import Filled
+from gsparc.studies.tradeoff.points import Settings
+from gsparc.studies.tradeoff.view import View
+
+
+def knobs(method: GaussianProcess) -> tuple[str, ...]:
+    """What can be turned."""
+    assert method.site is not None
+    return ("keep", "confidence", *(("stride",) if method.site.kind == "spectrum" else ()))
+
+
+def measure(method: GaussianProcess, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+    """Nothing: what a component contributes stands in the process."""
+    return {}
+
+
+def reduced(method: GaussianProcess, settings: Settings, measured: dict[str, Tensor]) -> Method:
+    """The mean of the process with the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
+    assert method.site is not None
+    if set(settings) <= {"confidence"} and settings.get("confidence", True):
+        return method
+    stride, grid = int(settings.get("stride", 1)), method.site.grid
+    count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(method.axes)))
+    kept = method.weights.square().sum(0).topk(min(count, len(method.axes))).indices
+    mean, axes, shape = method.mean, method.axes[kept], method.shape
+    if stride > 1:
+        assert grid is not None
+        mean, axes = (
+            part.unflatten(-1, shape)[..., ::stride, ::stride].flatten(-2).contiguous()
+            for part in (mean, axes)
+        )
+        shape = ((grid.height - 1) // stride + 1, grid.width // stride)
+    lean = Mean(method, mean, axes, method.weights[:, kept], shape)
+    return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
+
+
+class Mean(View):
+    """The mean of a Gaussian process, without its variance.
+
+    Args:
+        inner: fitted.
+        mean, axes: (P,) and (C, P), the basis of targets.
+        weights: (n, C), so that scores are `kernel(query, places) @ weights`.
+        shape: of a target.
+    """
+
+    def __init__(
+        self, inner: GaussianProcess, mean: Tensor, axes: Tensor, weights: Tensor, shape: tuple[int, ...]
+    ) -> None:
+        super().__init__(inner)
+        assert inner.site is not None
+        self._kind, self._end, self._shape = inner.site.kind, inner.site.moving_end, shape
+        self._mean, self._axes, self._weights = mean, axes, weights.float().contiguous()
+        self._middle = torch.from_numpy(inner.positions.mean(0)).float()
+        self._scale = math.sqrt(3) / inner.kernel.length
+        self._places = (torch.from_numpy(inner.positions).float() - self._middle) * self._scale
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; Matern-3/2 as in `gsparc.peers.gp.Kernel`, in float32."""
+        where = tx if self._end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        query = (where - self._middle) * self._scale
+        far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower
+        scores = ((1 + far) * torch.exp(-far)) @ self._weights
+        return Prediction(from_real(torch.addmm(self._mean, scores, self._axes), self._kind, self._shape))
+
+    def size(self) -> int:
+        """Components kept."""
+        return len(self._axes)

@@ -1,0 +1,80 @@
+"""What a field of wave packets can spare: packets and pixels."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.array.field import ArrayField
+from gsparc.array.packets import WavePackets
+from gsparc.array.render import SpectrumRenderer
+from gsparc.data.schema import Measurements
+from gsparc.method import Method
+from gsparc.studies.tradeoff.coarse import Filled, coarser
+from gsparc.studies.tradeoff.points import Settings
+from gsparc.studies.tradeoff.view import MeanOnly
+
+RIDGE = 1e-6  # relative to a feature's mean square, as when the packets were taught
+
+
+def knobs(method: ArrayField) -> tuple[str, ...]:
+    """What can be turned."""
+    return ("keep", "stride", "confidence")
+
+
+@torch.no_grad()
+def measure(method: ArrayField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+    """`contribution` (N,): the mean power each packet adds at training rows (n,).
+
+    `places` (n, 3) [m]: those rows' positions, where fewer packets learn what all of them said.
+    """
+    assert method.field is not None
+    places = torch.from_numpy(data.moving[rows].astype(np.float32))
+    features = method.field.features(places)
+    power = (features.square().mean(0) * method.field.gains.square().sum(1)).view(2, -1).sum(0)
+    return {"contribution": power, "places": places}
+
+
+@torch.no_grad()
+def reduced(method: ArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
+    """The array field with fewer packets (`keep`, a share) on fewer pixels (`stride`)."""
+    assert method.field is not None and method.site is not None and method.background is not None
+    twin = copy.copy(method)
+    if "keep" in settings:
+        twin.field = _fewer(method.field, float(settings["keep"]), measured)
+    site, stride = method.site, int(settings.get("stride", 1))
+    found: Method = twin
+    if stride > 1:
+        assert site.grid is not None
+        coarse = replace(site, grid=coarser(site.grid, stride))
+        twin.renderer = SpectrumRenderer(coarse, method.background[::stride, ::stride])
+        found = Filled(twin, site.grid, stride)
+    return found if settings.get("confidence", True) else MeanOnly(found)
+
+
+def _fewer(field: WavePackets, share: float, measured: dict[str, Tensor]) -> WavePackets:
+    """The packets that contribute most, taught again what all of them together said around the samples."""
+    total = len(measured["contribution"])
+    count = max(1, math.ceil(share * total))
+    kept = measured["contribution"].topk(count).indices.sort().values
+    blank = (torch.zeros(count, 3), torch.ones(count), torch.zeros(count, 3), field.origin)
+    few = WavePackets(*blank, elements=field.elements).requires_grad_(False)
+    both = torch.cat([kept, kept + total])
+    few.form.copy_(field.form[:, both])
+    places = measured["places"]
+    widths = field.form[3, :total].neg().mul(2).rsqrt()  # of the window exp(-x^2 / 2 s^2)
+    draws = torch.Generator().manual_seed(0)
+    spread = widths.median() * torch.randn(8, *places.shape, generator=draws)
+    asked = torch.cat([places, (places + spread / 2).flatten(0, 1)])
+    features = few.features(asked).double()
+    wanted = (field.features(asked) @ field.gains).double()
+    gram = features.mT @ features
+    gram.diagonal().add_(RIDGE * gram.diagonal().mean())
+    few.gains.copy_(torch.linalg.solve(gram, features.mT @ wanted).float())
+    few.bias.copy_(field.bias)
+    return few

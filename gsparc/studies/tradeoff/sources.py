@@ -1,0 +1,70 @@
+"""What a virtual-source process can spare: searches, sources, its variance."""
+
+from __future__ import annotations
+
+import copy
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
+from gsparc.coherent.query import Query
+from gsparc.coherent.vsgp import VirtualSourceGP
+from gsparc.data.schema import Measurements
+from gsparc.method import Method
+from gsparc.studies.tradeoff.points import Settings
+from gsparc.studies.tradeoff.view import MeanOnly
+
+
+def knobs(method: VirtualSourceGP) -> tuple[str, ...]:
+    """What can be turned."""
+    return ("searches", "keep", "confidence")
+
+
+def measure(method: VirtualSourceGP, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+    """`contribution0`, `contribution1`, ... (K,): mean power of each search's sources at its rows."""
+    return {
+        f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
+        for i, member in enumerate(method.members)
+    }
+
+
+@torch.no_grad()
+def reduced(method: VirtualSourceGP, settings: Settings, measured: dict[str, Tensor]) -> Method:
+    """The process with fewer `searches` (the heaviest), fewer sources (`keep`, a share), no variance.
+
+    Fewer sources explain the measured rows anew, which costs a factorisation here and nothing later.
+    """
+    twin = copy.copy(method)
+    count = min(int(settings.get("searches", len(method.members))), len(method.members))
+    chosen = method.weights.topk(count).indices.sort().values
+    twin.members = [method.members[i] for i in chosen]
+    twin.weights = method.weights[chosen] / method.weights[chosen].sum()
+    if "keep" in settings:
+        share = float(settings["keep"])
+        twin.members = [
+            _fewer(m, share, measured[f"contribution{i}"]) for m, i in zip(twin.members, chosen, strict=True)
+        ]
+    if settings.get("confidence", True):
+        twin.query = Query(twin.members)
+        return twin
+    twin.query = MeanQuery(twin.members, variance_rows=1)
+    return MeanOnly(twin)
+
+
+def _fewer(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
+    count = max(1, math.ceil(share * len(contribution)))
+    loudest = set(contribution.topk(count).indices.tolist())
+    kept = sorted(loudest | {0})  # the transmitter itself names the words of all others
+    phased = member.phased
+    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.turning)
+    return PhasedPosterior(member.rows, scene, member.noise_floor)
+
+
+class MeanQuery(Query):
+    """Means alone: the variance is most of a query's work."""
+
+    def _variance(self, part: Tensor, *unused: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros(len(part)), torch.ones(len(part))

@@ -1,0 +1,188 @@
+"""What a splatted field can spare: Gaussians, pixels, faint edges, the frozen plan, the confidence."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc import surgery
+from gsparc.data.schema import Measurements
+from gsparc.learned import LearnedField
+from gsparc.method import Method, Prediction
+from gsparc.model import FULL_SPHERE_ROWS, GaussianModel
+from gsparc.ops import Pose, SphereGrid, mean_weights
+from gsparc.studies.tradeoff.coarse import Filled, coarser
+from gsparc.studies.tradeoff.points import Settings
+from gsparc.studies.tradeoff.view import View
+
+RIDGE = 1e-5  # relative to the mean footprint energy; footprints overlap
+MOST_WEIGHTS = 25_000_000  # pixels times Gaussians held at once
+MOST_ROWS = 64  # positions over which a contribution is averaged
+
+
+def knobs(method: LearnedField) -> tuple[str, ...]:
+    """What can be turned."""
+    model = method.fitted()
+    static = model.site.kind == "spectrum" and model.site.static_end == "rx"
+    known = ("keep", "cutoff", "projection", "confidence")
+    return (*known, *(() if through_array(model) else ("stride",)), *(("frozen",) if static else ()))
+
+
+def through_array(model: GaussianModel) -> bool:
+    """Whether images are formed by an array from the splatted ones: on pixels of its own."""
+    return model.settings.response.array
+
+
+@torch.no_grad()
+def measure(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+    """`contribution` (N,): what each Gaussian adds to the predictions at training rows (n,), on average.
+
+    Its weight summed over the directions of the receiver times the size of its emission. `receiver` (4, 3) is
+    the pose of a static one, its position [m] above its rotation.
+    """
+    model = method.fitted()
+    chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_ROWS)).astype(int)]
+    total = torch.zeros(len(model.gaussians))
+    for row in chosen:
+        batch = data.batch(np.array([row]))
+        emitted = model.features(batch.tx, batch.rx).abs().sum(-1).mean(0)
+        total += emitted * _weights(model, batch.rx)
+    found = {"contribution": total / len(chosen)}
+    if model.site.static_end == "rx":
+        rx = data.batch(chosen[:1]).rx
+        found["receiver"] = torch.cat([rx.position.reshape(1, 3), rx.rotation.reshape(3, 3)])
+    return found
+
+
+def _weights(model: GaussianModel, rx: Pose) -> Tensor:
+    g = model.gaussians
+    return mean_weights(model.plan(rx), g.means, g.quats, g.scales, g.opacities).mean.reshape(-1, len(g))[0]
+
+
+def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:
+    """The field with what `settings` spare left out; the trained one stays as it is.
+
+    Args:
+        method: fitted.
+        settings: `keep` share of Gaussians in (0, 1]; `stride` in pixels; `cutoff` factor on the smallest
+            alpha that counts; `projection`; `frozen` plan or not; `confidence` or not.
+        measured: from `measure`.
+    """
+    twin = copy.copy(method)
+    twin.model = model = copy.deepcopy(method.fitted())
+    site, stride = model.site, int(settings.get("stride", 1))
+    raster = model.settings.raster
+    factor = float(settings.get("cutoff", 1))
+    raster = replace(
+        raster,
+        projection=settings.get("projection", raster.projection),
+        low_pass=raster.low_pass / stride**2,  # as wide as before on the sky
+        alpha_cutoff=raster.alpha_cutoff * factor,
+        relative_cutoff=raster.relative_cutoff * factor,
+    )
+    model.settings = replace(model.settings, raster=raster)
+    if "keep" in settings:
+        share, total = float(settings["keep"]), len(model.gaussians)
+        if _linear(model):
+            _keep(model, spread(model, measured)[: math.ceil(share * total)])
+            with torch.no_grad():
+                model.gaussians.log_scales.sub_(0.5 * math.log(share))  # together they cover as much sky
+            teach(model, method.fitted(), measured["receiver"])
+        else:
+            _keep(model, measured["contribution"].topk(math.ceil(share * total)).indices)
+    if not settings.get("confidence", True):
+        model.confidence = None
+    model.gaussians.version += 1  # a plan frozen before is stale
+    found: Method = twin if settings.get("frozen", True) else Live(twin)
+    if stride == 1:
+        return found
+    if site.kind != "spectrum":  # visibility is measured on fewer directions, nothing to fill in
+        rows = FULL_SPHERE_ROWS // stride
+        model.site = replace(site, grid=SphereGrid.full_sphere(rows, 2 * rows))
+        return found
+    assert site.grid is not None
+    model.site = replace(site, grid=coarser(site.grid, stride))
+    return Filled(found, site.grid, stride)
+
+
+class Live(View):
+    """A static receiver's plan made anew for every query, as a moving one's must be."""
+
+    def __init__(self, inner: LearnedField) -> None:
+        super().__init__(inner)
+        self._model = inner.fitted()
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`; the mean alone."""
+        mean = self._model(tx, rx).mean
+        return Prediction(mean.clamp(0, 1) if self._model.site.kind == "spectrum" else mean)
+
+
+def _keep(model: GaussianModel, rows: Tensor) -> None:
+    keep = torch.zeros(len(model.gaussians), dtype=torch.bool)
+    keep[rows] = True
+    surgery.apply(surgery.Edit(keep, torch.zeros(0, dtype=torch.long)), model, model.gaussians)
+
+
+def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:
+    """Rows (N,) in an order whose every beginning is spread over the sky, the strongest first.
+
+    Each is the one farthest from all before it. What is kept is taught anew, so places count, not strengths:
+    an eighth of 2,000 Gaussians chosen by contribution leaves holes.
+    """
+    seen = torch.nn.functional.normalize(model.gaussians.means.detach() - measured["receiver"][0], dim=1)
+    order = [int(measured["contribution"].argmax())]
+    apart = 1 - seen @ seen[order[0]]
+    while len(order) < len(seen):
+        apart[order[-1]] = -1.0
+        order.append(int(apart.argmax()))
+        apart = torch.minimum(apart, 1 - seen @ seen[order[-1]])
+    return torch.tensor(order)
+
+
+def _linear(model: GaussianModel) -> bool:
+    """Whether images are linear in what the emission has learned: then fewer can be taught in closed form."""
+    emission = model.settings.emission
+    static = model.site.kind == "spectrum" and model.site.static_end == "rx"
+    plain = not model.settings.attenuation.inverse_distance and not through_array(model)
+    return static and plain and not emission.hidden and emission.activation == "linear"
+
+
+@torch.no_grad()
+def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
+    """The emissions with which `few` come nearest to the images of the whole field, at all positions at once.
+
+    Images are W E f(x) with weights W (pixels x Gaussians), read-outs E and features f: least squares over
+    the pixels gives E of the few from W E of all.
+    """
+    rx, grid = Pose(receiver[0], receiver[1:]), whole.site.grid
+    assert grid is not None
+    entries = grid.height * grid.width * len(whole.gaussians)
+    fitting = [s for s in (1, 2, 3, 4, 5) if grid.width % s == 0 and entries <= MOST_WEIGHTS * s**2]
+    grid = coarser(grid, fitting[0]) if fitting else grid
+    wanted = _weights_of(whole, rx, grid) @ _readout(whole)
+    own = _weights_of(few, rx, grid)
+    gram = own.mT @ own
+    gram.diagonal().add_(RIDGE * gram.diagonal().mean() + 1e-12)
+    found = torch.linalg.solve(gram, own.mT @ wanted)
+    few.emission.weight2.copy_(found[:, :-1, None])
+    few.emission.bias2.copy_(found[:, -1:])
+
+
+def _readout(model: GaussianModel) -> Tensor:
+    """(N, width + 1)."""
+    return torch.cat([model.emission.weight2.squeeze(-1), model.emission.bias2], 1)
+
+
+def _weights_of(model: GaussianModel, rx: Pose, grid: SphereGrid) -> Tensor:
+    """(pixels, N)."""
+    view = copy.copy(model)
+    view.site = replace(model.site, grid=grid)
+    frozen = view.freeze(rx)
+    return frozen.render(torch.eye(len(model.gaussians)), frozen.version).flatten(1).mT

@@ -1,0 +1,152 @@
+"""Every combination of knobs scored on the test rows and timed in turns with all others."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation import paired_differences
+from gsparc.method import Method, Prediction
+from gsparc.metrics import DECIDING
+from gsparc.predictor import Predictor
+from gsparc.scoring import Scores, rows_of, score
+from gsparc.studies.tradeoff.points import Point, Settings, worded
+from gsparc.studies.tradeoff.timing import Pace, in_turns
+from gsparc.studies.tradeoff.view import View
+
+log = logging.getLogger(__name__)
+
+CLOSEST_DB = 100.0  # float32 tells no more
+PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One way of answering, before it is measured.
+
+    Attributes:
+        label: in words.
+        settings: what is spared.
+        method: answers so.
+        threads: CPU threads to be timed with.
+    """
+
+    label: str
+    settings: Settings
+    method: Method
+    threads: tuple[int, ...]
+
+
+def asker(method: Method, data: Measurements, rows: np.ndarray) -> Callable[[int], object]:
+    """A query end to end: a world position as a user holds it in, an array in physical units out.
+
+    Args:
+        method: fitted.
+        data: where the positions come from.
+        rows: (n,), asked one after the other.
+    """
+    ask = getattr(Predictor(method, data.site), data.site.kind)
+    moving = data.site.moving_end
+    places = data.moving[rows] + data.site.origin
+    return lambda number: ask(**{moving: places[number % len(places)]})
+
+
+def sweep(
+    candidates: Sequence[Candidate],
+    data: Measurements,
+    fold: Fold,
+    *,
+    eval_on: str,
+    pace: Pace,
+    others: Mapping[str, Callable[[int], object]],
+) -> tuple[list[Point], dict[str, np.ndarray]]:
+    """Measure the candidates; the first is the full model, which the others are compared with.
+
+    Args:
+        candidates: to be measured.
+        data, fold: as the model was trained with.
+        eval_on: rows whose figures are shown.
+        pace: of the clock.
+        others: further contenders for the clock alone (a copy of memory), by name.
+
+    Returns:
+        A point per candidate and number of threads, and the times [ms] of `others`.
+    """
+    figure = DECIDING[data.site.kind]
+    split = Split("tradeoff", (fold,), "")
+    scored: list[tuple[Scores, float]] = []
+    rows, whole = rows_of(fold, eval_on), None
+    for number, candidate in enumerate(candidates):
+        heard = Heard(candidate.method)
+        there = score([heard], data, split, eval_on)
+        said = torch.cat(heard.means)
+        whole = said if whole is None else whole
+        scored.append((there, closeness(said, whole)))
+        if number % 10 == 9:
+            log.info("%d of %d combinations scored", number + 1, len(candidates))
+    calls: dict[tuple[int, int] | str, Callable[[int], object]] = {
+        name: call for name, call in others.items()
+    }
+    threads: dict[tuple[int, int] | str, int] = dict.fromkeys(others, 1)
+    for index, candidate in enumerate(candidates):
+        ask = asker(candidate.method, data, rows)
+        for count in candidate.threads:
+            calls[index, count], threads[index, count] = ask, count
+    times = in_turns(calls, threads, pace)
+    points = []
+    for key, ms in times.items():
+        if isinstance(key, str):
+            continue
+        index, count = key
+        candidate, (scores, close) = candidates[index], scored[index]
+        label = f"{candidate.label}, {count} thread{'s' if count > 1 else ''}"
+        points.append(
+            Point(
+                label, candidate.settings, count, scores.figures(), close, ms,
+                candidate.method.size(), _difference(scores, scored[0][0], figure),
+            )
+        )  # fmt: skip
+    return points, {name: times[name] for name in others}
+
+
+class Heard(View):
+    """A method whose answers are kept while it is scored.
+
+    Attributes:
+        means: of every batch that was asked.
+    """
+
+    def __init__(self, inner: Method) -> None:
+        super().__init__(inner)
+        self.means: list[Tensor] = []
+
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`."""
+        found = self.inner.answer(batch)
+        self.means.append(found.mean)
+        return found
+
+
+def closeness(answers: Tensor, whole: Tensor) -> float:
+    """How near answers (n, ...) are to those of the full model [dB]: decides without a single measurement."""
+    apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
+    return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
+
+
+def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None, float | None]:
+    found = paired_differences(scores, full, "full")
+    stem = f"paired/full/{PAIRED.get(figure, figure)}"
+    return found.get(stem), found.get(f"{stem}_se")
+
+
+def candidate(method: Method, settings: Settings, threads: Sequence[int], label: str = "") -> Candidate:
+    """A candidate called after its settings."""
+    return Candidate(label or worded(settings), settings, method, tuple(threads))

@@ -1,0 +1,216 @@
+"""Compose, fit, test, write: what `train.py` and `gsparc train` do."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc import checkpoint
+from gsparc.baselines import platform_cache
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split, write_split
+from gsparc.evaluation import Evaluation, evaluate
+from gsparc.method import Method
+from gsparc.pictures import draw_predictions
+from gsparc.registry import build
+from gsparc.studies import cli, limits
+from gsparc.summary import provenance, remarks, results_table, write_samples, write_summary
+from gsparc.trainer import Training
+
+log = logging.getLogger(__name__)
+
+LEAST_ROWS = 4  # fewer training rows than this teach nothing
+
+
+@dataclass(frozen=True)
+class Objects:
+    """What a run made, for callers from Python.
+
+    Attributes:
+        methods: one fitted method per fold.
+        checkpoints: their files.
+        data, split: what they learned from.
+        evaluation: figures and per-sample columns.
+    """
+
+    methods: tuple[Method, ...]
+    checkpoints: tuple[Path, ...]
+    data: Measurements
+    split: Split
+    evaluation: Evaluation
+
+
+def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
+    """Fit a method on every fold of a split, test it beside the baselines, and write it all down.
+
+    Args:
+        config: as composed from conf/train.yaml.
+        run_dir: where checkpoints, curves, pictures and `summary.json` go.
+
+    Returns:
+        The facts of `summary.json`, and the objects they were computed from.
+
+    Raises:
+        ValueError: bad data, settings or checkpoint; one line each.
+    """
+    limits.check(_plain(config))
+    _refuse_absent(config.ckpt_path)
+    if config.threads is not None:
+        torch.set_num_threads(int(config.threads))
+    _anchor(config)
+    data = load(_plain(config.dataset))
+    split = split_for(_plain(config.split), data)
+    _refuse_empty(split)
+    write_split(run_dir / "split.json", split, len(data), data.site.sha256)
+    config_yaml = OmegaConf.to_yaml(config, resolve=True)
+    methods, files, seconds = [], [], []
+    with _loggers(config) as loggers:
+        for number, fold in enumerate(split.folds):
+            folder = run_dir if len(split.folds) == 1 else run_dir / f"fold{number}"
+            method = build(config.model)
+            for guess in getattr(method, "guesses", ()) if number == 0 else ():
+                log.info("guess: %s", guess)
+            _equip(method, config, config_yaml, loggers, number, len(split.folds))
+            report = method.fit(data, fold, folder)
+            for note in report.notes:
+                log.info("%s", note)
+            file = folder / "model.ckpt"
+            extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
+            checkpoint.save(file, method, config_yaml, extra)
+            methods.append(method)
+            files.append(file)
+            seconds.append(report.seconds)
+        found = evaluate(
+            methods, seconds, data, split,
+            eval_on=config.eval_on, baselines=list(config.baselines), cache=platform_cache(),
+        )  # fmt: skip
+        facts = {**found.facts, **provenance(), "seed": int(config.seed)}
+        for logger in loggers:
+            logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
+    draw_predictions(
+        methods[0],
+        data,
+        split.folds[0],
+        f"{data.site.name}: test rows of {methods[0].name}",
+        run_dir / "test.png",
+    )
+    write_samples(run_dir / "per_sample.csv", found.columns)
+    write_summary(run_dir / "summary.json", facts)
+    return facts, Objects(tuple(methods), tuple(files), data, split, found)
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
+
+
+def _anchor(config: DictConfig) -> None:
+    """Data paths become absolute, so that a checkpoint finds its data from any folder."""
+    for key in ("root", "file"):
+        if not OmegaConf.is_missing(config.dataset, key) and config.dataset.get(key):
+            config.dataset[key] = str(Path(config.dataset[key]).resolve())
+
+
+def _refuse_empty(split: Split) -> None:
+    for number, fold in enumerate(split.folds):
+        if len(fold.train) < LEAST_ROWS or not len(fold.test):
+            raise ValueError(
+                f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
+                f"rows; at least {LEAST_ROWS} and 1 are needed"
+            )
+
+
+def _equip(
+    method: Method, config: DictConfig, config_yaml: str, loggers: Sequence[Logger], number: int, folds: int
+) -> None:
+    """Hand the method of fold `number` what the run brings along, and what it goes on from.
+
+    Raises:
+        ValueError: it is to go on, but trains in one piece.
+    """
+    if hasattr(method, "training"):
+        method.training = Training(
+            settings=instantiate(config.trainer),
+            seed=int(config.seed),
+            callbacks=lambda: _callbacks(config),
+            loggers=loggers,
+            resume=_resume(config, number, folds),
+            config_yaml=config_yaml,
+        )
+    elif config.ckpt_path is not None:
+        if not hasattr(method, "resume"):
+            raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
+        method.resume = _resume(config, number, folds)
+
+
+def _callbacks(config: DictConfig) -> list[Any]:
+    return [instantiate(node) for node in (config.callbacks or {}).values() if node is not None]
+
+
+def _refuse_absent(path: str | None) -> None:
+    """Before anything is read or simulated: there is nothing to go on with."""
+    if path is not None and not Path(path).exists():
+        raise ValueError(f"ckpt_path={path}: no such file")
+
+
+def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
+    """The checkpoint to go on from; a run with several folds resumes each from its own folder."""
+    if config.ckpt_path is None:
+        return None
+    path = Path(config.ckpt_path)
+    if folds == 1:
+        return path
+    own = path / f"fold{number}" / "last.ckpt"
+    if path.is_file():
+        raise ValueError(
+            f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
+        )
+    return own if own.exists() else None
+
+
+@contextmanager
+def _loggers(config: DictConfig) -> Iterator[Sequence[Logger]]:
+    """The run's loggers, closed whatever happens."""
+    made: list[Logger] = []
+    status = "failed"
+    try:
+        made.extend(instantiate(node) for node in (config.logger or {}).values())
+        yield made
+        status = "success"
+    finally:
+        for logger in made:
+            logger.finalize(status)
+            if hasattr(logger, "experiment") and hasattr(logger.experiment, "finish"):
+                logger.experiment.finish(exit_code=0 if status == "success" else 1)
+
+
+def task(config: DictConfig) -> float | None:
+    """Train as configured and show the table; the returned figure is what a sweep optimises."""
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    facts, objects = train(config, run_dir)
+    title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
+    console = cli.console()
+    console.print(results_table(facts, facts["model/name"], title, config.eval_on))
+    for remark in remarks(facts, config.eval_on):
+        console.print(remark, highlight=False)
+    console.print(f"written to {run_dir}", highlight=False)
+    return facts.get(f"{config.eval_on}/psnr_db", facts.get(f"{config.eval_on}/nmse"))
+
+
+def main() -> None:
+    """Entry point."""
+    cli.run(task, "train")
+
+
+if __name__ == "__main__":
+    main()

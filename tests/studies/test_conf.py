@@ -1,0 +1,156 @@
+"""The configuration: every choice composes and builds; sweeps have directories of their own."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import hydra
+import pytest
+from campaigns import brief, compose, spectra
+from hydra import initialize_config_module
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+import gsparc.conf
+from gsparc.method import Method
+from gsparc.registry import build
+from gsparc.studies import cli
+from gsparc.studies.cli import one_line
+from gsparc.studies.train import task
+
+CONF = Path(gsparc.conf.__path__[0])
+ROOT = Path(__file__).parents[2]
+GROUPS = (
+    "dataset",
+    "split",
+    "model",
+    "trainer",
+    "callbacks",
+    "logger",
+    "paper",
+    "experiment",
+)  # of train.yaml
+CHOICES = sorted(f"{group}={file.stem}" for group in GROUPS for file in (CONF / group).glob("*.yaml"))
+NEEDED = {
+    "dataset=own": ["dataset.file=x.npz"],
+    "dataset=newrf": ["dataset.file=x.npz"],
+    "split=file": ["split.path=split.json"],
+}
+
+
+@pytest.mark.parametrize("choice", CHOICES)
+def test_every_choice_composes_and_builds(choice):
+    config = compose(choice, *NEEDED.get(choice, []))
+    assert isinstance(build(config.model), Method)
+    for node in (config.callbacks or {}).values():
+        instantiate(node)
+    instantiate(config.trainer)
+
+
+@pytest.mark.parametrize(
+    ("override", "hint"),
+    [
+        ("model=gsprac", "'gsparc'"),
+        ("dataset=rfd", "'rfid'"),
+        ("split=gruped", "'grouped'"),
+        ("callbacks=densfy", "'densify'"),
+        ("model.emission.hiden=8", "'model.emission.hidden'"),
+        ("trainer.max_step=8", "'trainer.max_steps'"),
+        ("sed=1", "'seed'"),
+        ("model.field.cuont=8", "'model.field.count'"),
+    ],
+)
+def test_a_typo_gets_the_nearest_right_name(override, hint):
+    with pytest.raises(HydraException) as raised:
+        compose(override)
+    line = one_line(raised.value)
+    assert f"did you mean {hint}" in line and "\n" not in line
+
+
+def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
+    """A new `auto` must be settled (gsparc/resolve.py, gsparc/effects.py) and be named here."""
+
+    def still_open(node: dict, prefix: str = ""):
+        for key, value in node.items():
+            if isinstance(value, dict):
+                yield from still_open(value, f"{prefix}{key}.")
+            elif value == "auto":
+                yield f"{prefix}{key}"
+
+    model = OmegaConf.to_container(compose().model, resolve=False)
+    assert set(still_open(model)) == {
+        "warm_start", "field.init", "emission.encoding.kind", "emission.activation", "emission.init_bias",
+        "effects.phase", "effects.array", "effects.directions", "effects.hybrid",
+    }  # fmt: skip
+
+
+def test_the_paper_leaves_nothing_to_auto():
+    config = compose("paper=gsparc")
+    settings = build(config.model).settings
+    values = [settings.field.init, settings.emission.activation, settings.emission.encoding.kind]
+    assert "auto" not in [*values, settings.emission.init_bias, config.model.warm_start]
+    assert len(config.model.guesses) > 5
+
+
+def run_directory(monkeypatch, *overrides: str) -> str:
+    """Where `train.py` would write."""
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        config = hydra.compose("train", overrides=list(overrides), return_hydra_config=True)
+    monkeypatch.setattr(HydraConfig.instance(), "cfg", config)  # what ${hydra:...} asks
+    return config.hydra.run.dir
+
+
+@pytest.mark.parametrize("model", sorted(file.stem for file in (CONF / "model").glob("*.yaml")))
+def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
+    """Models whose config holds no name ended in `Interpolation key 'model.name' not found`."""
+    named = run_directory(monkeypatch, f"model={model}", "dataset=own")
+    assert re.fullmatch(rf"outputs/own/{model}/[\d_-]+-\d{{6}}", named)  # microseconds: no two share one
+
+
+def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
+    assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
+
+
+@pytest.mark.parametrize("command", ["train", "calibration", "link", "tradeoff"])
+def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monkeypatch, capsys):
+    """`--help` listed names and values without a word about them."""
+    monkeypatch.setattr(sys, "argv", [command, "--help"])
+    with pytest.raises(SystemExit) as ended:
+        cli.run(task, command)
+    said = capsys.readouterr().out
+    assert not ended.value.code and said.startswith("Compose, fit, test, write")
+    assert (CONF / f"{command}.yaml").read_text().splitlines()[0] in said and "  # " in said
+
+
+def test_a_folder_that_cannot_be_written_is_named_without_a_number():
+    """`[Errno 2] No such file or directory: '/proc/x'`."""
+    assert one_line(FileNotFoundError(2, "No such file or directory", "/proc/x")) == (
+        "/proc/x: No such file or directory"
+    )
+
+
+@pytest.mark.slow
+def test_a_sweep_over_hidden_units_has_a_directory_per_job(tmp_path):
+    """`-m model.emission.hidden=0,8`: 0 starts in closed form, 8 cannot; both are said and both train."""
+    file = spectra(tmp_path / "own.npz")
+    command = [
+        sys.executable,
+        "train.py",
+        "-m",
+        "model.emission.hidden=0,8",
+        *brief(file, "trainer.max_steps=4"),
+    ]
+    done = subprocess.run(
+        [*command, f"hydra.sweep.dir={tmp_path / 'sweep'}"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    folders = sorted(p.parent.name for p in (tmp_path / "sweep").glob("*/summary.json"))
+    assert len(folders) == 2 and "hidden-0" in folders[0] and "hidden-8" in folders[1]
+    logs = [(tmp_path / "sweep" / folder / "training.log") for folder in folders]
+    said = [next(path.parent.glob("*.log")).read_text() for path in logs]
+    assert "warm_start=auto -> true" in said[0] and "warm_start=auto -> false" in said[1]
