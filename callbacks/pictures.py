@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from gsparc.callbacks.ledger import CostLedger
-from gsparc.pictures import draw_spectra
+from gsparc.evaluation.pictures import draw_spectra
 
 
 class Pictures(L.Callback):

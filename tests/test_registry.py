@@ -44,8 +44,8 @@ def test_a_config_becomes_a_method():
     "target",
     [
         "os.system",
-        "gsparc.summary.os.system",
-        "gsparc.summary.write_summary",
+        "gsparc.evaluation.summary.os.system",
+        "gsparc.evaluation.summary.write_summary",
         "gsparc.nowhere.X",
         3,
         "builtins.eval",

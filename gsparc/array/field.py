@@ -17,9 +17,9 @@ from gsparc.array.render import SpectrumRenderer
 from gsparc.array.response import site_problem, steering
 from gsparc.array.store import recovered, report
 from gsparc.array.tuning import LEAST_LEFT, LeftOut, tune
-from gsparc.baselines import platform_cache
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.encoding import to_real, training_targets

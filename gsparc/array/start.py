@@ -17,9 +17,9 @@ from gsparc.array.process import learn_process, mirror_elements
 from gsparc.array.response import steering
 from gsparc.array.store import recovered, report
 from gsparc.array.tuning import tune
-from gsparc.baselines import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.encoding import Prior
+from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.model import GaussianModel
 from gsparc.ops import Pose
 from gsparc.peers.encoding import to_real, training_targets

@@ -14,15 +14,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc import checkpoint
-from gsparc.baselines import platform_cache
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, write_split
-from gsparc.evaluation import Evaluation, evaluate
+from gsparc.evaluation.baseline_cache import platform_cache
+from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
 from gsparc.method import Method
 from gsparc.predictor import SAME_PLACE_M
 from gsparc.studies import cli, limits
-from gsparc.summary import provenance, results_table, write_samples, write_summary
 
 log = logging.getLogger(__name__)
 

@@ -13,12 +13,12 @@ import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gsparc.report.page import studies, write
-from gsparc.report.readme import refresh
-from gsparc.report.runs import columns, find_runs
-from gsparc.report.timing import retime
+from gsparc.evaluation.report.page import studies, write
+from gsparc.evaluation.report.readme import refresh
+from gsparc.evaluation.report.runs import columns, find_runs
+from gsparc.evaluation.report.timing import retime
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.studies import cli
-from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 

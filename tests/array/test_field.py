@@ -20,9 +20,9 @@ from gsparc.array.tuning import tune
 from gsparc.data.load import load, split_for
 from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold, Split, indices_hash
+from gsparc.evaluation.scores import score
 from gsparc.ops import SphereGrid
 from gsparc.registry import method_class
-from gsparc.scoring import score
 
 SMALL = PacketSettings(count=300, samples=1500)
 

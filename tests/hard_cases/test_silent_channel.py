@@ -2,7 +2,7 @@
 
 Remedy: scales of silence are defined, figures without a value are null and counted. Shown: a campaign with
 silent rows, and one that is silent altogether, train and are tested with finite figures, or are refused in
-one line. Exact. (Metrics alone: tests/test_metrics.py.)
+one line. Exact. (Metrics alone: tests/evaluation/test_metrics.py.)
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gsparc.clock import ClockSettings, machine_facts, peak_memory
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.ops.native import instruction_set
 from gsparc.studies import cli
 from gsparc.studies.bench import kernels, layers, steps
@@ -20,7 +21,6 @@ from gsparc.studies.bench.claims import claims
 from gsparc.studies.bench.measure import Machine, Row, facts, measure
 from gsparc.studies.bench.report import claims_table, markdown, rows_table
 from gsparc.studies.bench.scene import DEFAULT, scene
-from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 

@@ -17,9 +17,10 @@ from gsparc.clock import machine_facts
 from gsparc.data.argos import peers_figures, peers_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.scores import rows_of
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.method import Method
-from gsparc.scoring import rows_of
 from gsparc.studies import cli
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.studies.calibrate.evidence import (
@@ -35,7 +36,6 @@ from gsparc.studies.calibrate.stored import Trusted, keep, threshold_of
 from gsparc.studies.calibrate.threshold import Promise
 from gsparc.studies.calibrate.trial import How, Trial, accept, divisible, trials
 from gsparc.studies.evaluate import open_files
-from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 

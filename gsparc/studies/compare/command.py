@@ -16,7 +16,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.markdown import Markdown
 
-from gsparc.baselines import platform_cache
+from gsparc.evaluation.baseline_cache import platform_cache
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.studies import cli
 from gsparc.studies.compare import figure, table
 from gsparc.studies.compare.cells import Budget, Cell, contenders, plan
@@ -32,7 +33,6 @@ from gsparc.studies.compare.fitting import (
     remember,
 )
 from gsparc.studies.compare.latency import Latency, latencies
-from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 

@@ -22,11 +22,11 @@ from gsparc.clock import machine_facts
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.scores import score
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.registry import build
-from gsparc.scoring import score
 from gsparc.studies.compare.cells import Cell, Contender, key
-from gsparc.summary import provenance, write_summary
 from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.schema import Kind
-from gsparc.metrics import DECIDING, score_of
+from gsparc.evaluation.metrics import DECIDING, score_of
+from gsparc.evaluation.summary import BUSY
 from gsparc.studies.compare.fitting import Filled
 from gsparc.studies.compare.latency import Latency
-from gsparc.summary import BUSY
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}

@@ -15,7 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc.clock import machine_facts
-from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.studies import cli
 from gsparc.studies.calibrate.threshold import Promise
 from gsparc.studies.calibrate.trial import accept
@@ -37,7 +38,6 @@ from gsparc.studies.link.study import (
     transmit,
 )
 from gsparc.studies.link.tables import tables
-from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 

@@ -15,14 +15,15 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
 from gsparc import checkpoint
-from gsparc.baselines import baseline, platform_cache
 from gsparc.clock import COPY, machine_facts, peak_memory, reference_copy
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation import dataset_facts, split_facts
+from gsparc.evaluation.baseline_cache import baseline, platform_cache
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.metrics import DECIDING, score_of
+from gsparc.evaluation.scores import rows_of, score
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
 from gsparc.method import Method
-from gsparc.metrics import DECIDING, score_of
-from gsparc.scoring import rows_of, score
 from gsparc.studies import cli
 from gsparc.studies.evaluate import Opened, open_files
 from gsparc.studies.tradeoff import stored
@@ -31,7 +32,6 @@ from gsparc.studies.tradeoff.points import Point, cost_of_halving, front
 from gsparc.studies.tradeoff.spare import combinations, measure, reduced
 from gsparc.studies.tradeoff.sweep import asker, candidate, sweep
 from gsparc.studies.tradeoff.timing import Pace
-from gsparc.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from gsparc.metrics import lower_is_better, score_of
+from gsparc.evaluation.metrics import lower_is_better, score_of
 from gsparc.studies.tradeoff.points import Point
 
 NAMES = {

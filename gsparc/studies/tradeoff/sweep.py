@@ -13,11 +13,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation import paired_differences
+from gsparc.evaluation.evaluate import paired_differences
+from gsparc.evaluation.metrics import DECIDING
+from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.method import Method, Prediction
-from gsparc.metrics import DECIDING
 from gsparc.predictor import Predictor
-from gsparc.scoring import Scores, rows_of, score
 from gsparc.studies.tradeoff.points import Point, Settings, worded
 from gsparc.studies.tradeoff.timing import Pace, in_turns
 from gsparc.studies.tradeoff.view import View

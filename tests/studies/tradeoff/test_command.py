@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 import gsparc
 from gsparc import checkpoint
 from gsparc.clock import COPY
-from gsparc.scoring import score
+from gsparc.evaluation.scores import score
 from gsparc.studies.tradeoff import choose, stored
 from gsparc.studies.tradeoff.command import task
 from gsparc.studies.tradeoff.points import Point

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.report.runs import Run
+from gsparc.evaluation.report.runs import Run
 
 DRAWS = 1000
 LEVEL = 0.95

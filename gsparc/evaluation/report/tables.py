@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsparc.report.intervals import Interval, interval, over_seeds
-from gsparc.report.runs import PER_SAMPLE, SIDE, Run, number
-from gsparc.report.table import Column, Table
+from gsparc.evaluation.report.intervals import Interval, interval, over_seeds
+from gsparc.evaluation.report.runs import PER_SAMPLE, SIDE, Run, number
+from gsparc.evaluation.report.table import Column, Table
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 WORST = 3

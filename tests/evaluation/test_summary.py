@@ -13,8 +13,8 @@ import pytest
 import torch
 from rich.console import Console
 
-import gsparc.summary
-from gsparc.summary import provenance, remarks, results_table, write_samples, write_summary
+import gsparc.evaluation.summary
+from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 
 
 def test_numbers_strings_and_null(tmp_path):
@@ -72,7 +72,7 @@ def test_commit_is_known_inside_the_tree_only(tmp_path):
     facts = provenance()
     assert "torch" in facts["versions"] and "python 3" in facts["versions"]
     outside = tmp_path / "summary.py"
-    shutil.copy(gsparc.summary.__file__, outside)
+    shutil.copy(gsparc.evaluation.summary.__file__, outside)
     # Inside another project's repository an untracked copy must not claim that project's commit.
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     code = f"import runpy; print(runpy.run_path({str(outside)!r})['provenance']()['git'])"

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsparc.report.runs import Run
+from gsparc.evaluation.report.runs import Run
+from gsparc.evaluation.summary import write_samples
 from gsparc.studies.evaluate import open_files
 from gsparc.studies.tradeoff.sweep import asker
 from gsparc.studies.tradeoff.timing import Pace, in_turns
-from gsparc.summary import write_samples
 
 log = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity
 
-from gsparc.metrics import (
+from gsparc.evaluation.metrics import (
     DECIDING,
     ChannelMetrics,
     PowerMetrics,

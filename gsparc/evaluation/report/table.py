@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from gsparc.report.intervals import Interval
+from gsparc.evaluation.report.intervals import Interval
 
 
 @dataclass(frozen=True)

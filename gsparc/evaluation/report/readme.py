@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.atomic import whole_file
-from gsparc.report.runs import Run, by_study
-from gsparc.report.table import Table
-from gsparc.report.tables import results, seeds
+from gsparc.evaluation.report.runs import Run, by_study
+from gsparc.evaluation.report.table import Table
+from gsparc.evaluation.report.tables import results, seeds
 
 BEGIN = "<!-- results: written by `make results` -->"
 END = "<!-- end of results -->"

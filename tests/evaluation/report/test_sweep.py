@@ -14,9 +14,9 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from gsparc.report.sweep import FAILURE, SweepReport
+from gsparc.evaluation.report.sweep import FAILURE, SweepReport
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 
 
 def of_job(folder: Path, mode: RunMode = RunMode.MULTIRUN):

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsparc.metrics import score_of
-from gsparc.report.runs import Run, number
-from gsparc.report.table import Column, Table
-from gsparc.report.tables import FORMS, HEADS
+from gsparc.evaluation.metrics import score_of
+from gsparc.evaluation.report.runs import Run, number
+from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.report.tables import FORMS, HEADS
 
 MINUTES = (1, 2, 5, 10)
 

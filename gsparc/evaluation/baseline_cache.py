@@ -16,9 +16,9 @@ from gsparc import checkpoint
 from gsparc.atomic import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
+from gsparc.evaluation.scores import Scores, score
 from gsparc.method import Method
 from gsparc.registry import method_class
-from gsparc.scoring import Scores, score
 
 log = logging.getLogger(__name__)
 

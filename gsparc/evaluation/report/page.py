@@ -14,10 +14,10 @@ import numpy as np
 from jinja2 import Environment
 from PIL import Image
 
-from gsparc.report import effects, learning, plots, tables
-from gsparc.report.runs import Run, by_study, told_apart
-from gsparc.report.table import Table
-from gsparc.summary import BUSY, circumstances, simpler_wins
+from gsparc.evaluation.evaluate.report import effects, learning, plots, tables
+from gsparc.evaluation.report.runs import Run, by_study, told_apart
+from gsparc.evaluation.report.table import Table
+from gsparc.evaluation.summary import BUSY, circumstances, simpler_wins
 
 PICTURE_PX = 1000  # width at which pictures are kept
 MOST_PICTURES = 6
@@ -123,7 +123,7 @@ def html(title: str, made: str, shown: Sequence[Study]) -> str:
         made: where it comes from.
         shown: what is on it.
     """
-    text = (files("gsparc.report") / "page.html.j2").read_text(encoding="utf-8")
+    text = (files("gsparc.evaluation.report") / "page.html.j2").read_text(encoding="utf-8")
     return Environment(autoescape=True).from_string(text).render(title=title, made=made, studies=shown)
 
 

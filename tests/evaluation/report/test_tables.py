@@ -9,11 +9,11 @@ import json
 import numpy as np
 import pytest
 
-from gsparc.report import effects, learning, tables
-from gsparc.report.intervals import Interval, bootstrap, interval
-from gsparc.report.plots import _short
-from gsparc.report.runs import Run, columns, find_runs, told_apart
-from gsparc.report.table import Column, Table
+from gsparc.evaluation.evaluate.report import effects, learning, tables
+from gsparc.evaluation.report.intervals import Interval, bootstrap, interval
+from gsparc.evaluation.report.plots import _short
+from gsparc.evaluation.report.runs import Run, columns, find_runs, told_apart
+from gsparc.evaluation.report.table import Column, Table
 
 
 def cells(table, row: int) -> dict:

@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from gsparc.data.schema import Kind
-from gsparc.metrics import DECIDING
+from gsparc.evaluation.metrics import DECIDING
 
 SIDE: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "ssim", "mse"), "csi": ("snr_db",), "rssi": ("mae_db", "nmse")

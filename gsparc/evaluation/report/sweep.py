@@ -14,10 +14,10 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table as Shown
 
-from gsparc.report.intervals import Interval
-from gsparc.report.table import Column, Table
+from gsparc.evaluation.report.intervals import Interval
+from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.studies import cli
-from gsparc.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 
@@ -67,11 +67,11 @@ class SweepReport(Callback):
 
 def report(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
-    from gsparc.report import plots
-    from gsparc.report.page import studies, write
-    from gsparc.report.runs import by_study, find_runs, told_apart
-    from gsparc.report.tables import seeds
-    from gsparc.report.timing import retime
+    from gsparc.evaluation.evaluate.report import plots
+    from gsparc.evaluation.report.page import studies, write
+    from gsparc.evaluation.report.runs import by_study, find_runs, told_apart
+    from gsparc.evaluation.report.tables import seeds
+    from gsparc.evaluation.report.timing import retime
 
     runs = find_runs([folder])
     if settings.retime:

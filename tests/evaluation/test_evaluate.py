@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.baselines import BASELINES, baseline
 from gsparc.clock import ClockSettings
-from gsparc.evaluation import evaluate, paired_differences
+from gsparc.evaluation.baseline_cache import BASELINES, baseline
+from gsparc.evaluation.evaluate import evaluate, paired_differences
+from gsparc.evaluation.scores import score
+from gsparc.evaluation.summary import write_samples, write_summary
 from gsparc.method import Method, Prediction
 from gsparc.peers.idw import InverseDistance
 from gsparc.peers.mean import Mean
-from gsparc.scoring import score
-from gsparc.summary import write_samples, write_summary
 
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)
 
@@ -133,7 +133,7 @@ def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
 
 def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatch):
     data, split = campaign("csi", 40), folds(40, 2)
-    monkeypatch.setattr("gsparc.baselines.STORE_ABOVE_S", 0.0)
+    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
     first = baseline("gp", data, split, cache=tmp_path)
 
     def refuse(*arguments):
@@ -141,7 +141,7 @@ def test_cached_baselines_are_not_refitted(campaign, folds, tmp_path, monkeypatc
 
     with monkeypatch.context() as patch:
         patch.setattr("gsparc.peers.gp.GaussianProcess.fit", refuse)
-        patch.setattr("gsparc.baselines.score", refuse)
+        patch.setattr("gsparc.evaluation.baseline_cache.score", refuse)
         second = baseline("gp", data, split, cache=tmp_path)
     assert second.train_s == first.train_s
     for name, values in first.scores.samples.items():
@@ -163,7 +163,7 @@ def test_a_cheap_fit_is_timed_anew(campaign, folds, tmp_path, monkeypatch):
 
 def test_the_cache_knows_the_local_frame(campaign, folds, tmp_path, monkeypatch):
     data, split = campaign("csi", 40), folds(40)
-    monkeypatch.setattr("gsparc.baselines.STORE_ABOVE_S", 0.0)
+    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
     here = baseline("gp", data, split, cache=tmp_path).scores.figures()
     shift = np.array([5.0, 0.0, 0.0])
     site = dataclasses.replace(data.site, origin=data.site.origin - shift)
@@ -176,7 +176,7 @@ def test_the_cache_knows_the_local_frame(campaign, folds, tmp_path, monkeypatch)
 
 def test_a_damaged_cache_is_made_anew(campaign, folds, tmp_path, monkeypatch, caplog):
     data, split = campaign("csi", 40), folds(40)
-    monkeypatch.setattr("gsparc.baselines.STORE_ABOVE_S", 0.0)
+    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
     first = baseline("gp", data, split, cache=tmp_path)
     for path in tmp_path.rglob("*.*"):
         path.write_bytes(b"rubbish")
@@ -219,7 +219,7 @@ def test_only_the_chosen_rows_are_asked_about(campaign, folds):
 
 def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, monkeypatch):
     """Ray marching took ten minutes to be timed in batches of 64."""
-    monkeypatch.setattr("gsparc.evaluation.SLOWEST_BATCH_MS", 0.0)
+    monkeypatch.setattr("gsparc.evaluation.evaluate.SLOWEST_BATCH_MS", 0.0)
     data, split = campaign("spectrum", 40), folds(40)
     method = Remembering((12, 24))
     facts = evaluate(method, None, data, split, eval_on="val", baselines=(), clock=QUICK).facts

@@ -10,10 +10,10 @@ import pytest
 from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
 
-from gsparc.report import plots
-from gsparc.report.page import html, studies, warnings
-from gsparc.report.readme import BEGIN, END, refresh
-from gsparc.report.runs import find_runs
+from gsparc.evaluation.evaluate.report import plots
+from gsparc.evaluation.report.page import html, studies, warnings
+from gsparc.evaluation.report.readme import BEGIN, END, refresh
+from gsparc.evaluation.report.runs import find_runs
 from gsparc.studies.report import arguments, task
 
 FETCHED = re.compile(

@@ -16,11 +16,11 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
-from gsparc.metrics import lower_is_better, score_of
-from gsparc.report.intervals import interval, over_seeds
-from gsparc.report.learning import curve, validation_figure
-from gsparc.report.runs import PER_SAMPLE, Run
-from gsparc.report.tables import BASELINES, HEADS, grouped
+from gsparc.evaluation.metrics import lower_is_better, score_of
+from gsparc.evaluation.report.intervals import interval, over_seeds
+from gsparc.evaluation.report.learning import curve, validation_figure
+from gsparc.evaluation.report.runs import PER_SAMPLE, Run
+from gsparc.evaluation.report.tables import BASELINES, HEADS, grouped
 from gsparc.studies.tradeoff.points import front
 
 WIDE, TALL = 7.0, 3.8

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.baselines import BASELINES, Fitted, baseline, mean_seconds
 from gsparc.clock import COPY, ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
+from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline, mean_seconds
+from gsparc.evaluation.metrics import paired_values
+from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.method import Method
-from gsparc.metrics import paired_values
-from gsparc.scoring import Scores, rows_of, score
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsparc.report.intervals import Interval
-from gsparc.report.runs import PER_SAMPLE, Run
-from gsparc.report.table import Column, Table
-from gsparc.report.tables import HEADS
+from gsparc.evaluation.report.intervals import Interval
+from gsparc.evaluation.report.runs import PER_SAMPLE, Run
+from gsparc.evaluation.report.table import Column, Table
+from gsparc.evaluation.report.tables import HEADS
 
 
 def effects(runs: Sequence[Run]) -> Table | None:
