@@ -26,8 +26,8 @@ from hydra import compose, initialize_config_module
 from gsparc import trainer
 from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold
+from gsparc.methods.registry import build
 from gsparc.module import GaussianModule
-from gsparc.registry import build
 from gsparc.trainer import Training
 
 STEPS, TURNS = 40, 4

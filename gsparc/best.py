@@ -38,9 +38,9 @@ from gsparc.hybrid import (
     weight_of,
 )
 from gsparc.learned import LearnedField
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
-from gsparc.peers.gp import GaussianProcess
 from gsparc.response import ResponseSettings
 from gsparc.trainer import Training
 

@@ -17,8 +17,8 @@ from gsparc.bearings.field import POOR, beyond, site_problem
 from gsparc.bearings.lags import Lags
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import Method
-from gsparc.peers.encoding import to_real
+from gsparc.methods.method import Method
+from gsparc.methods.target_rows import to_real
 
 Switch = bool | Literal["auto", "splat"]
 SPLAT = "splat"

@@ -31,9 +31,9 @@ from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.effects import Decision, Switch, fifths, nmse_of
-from gsparc.method import Method
+from gsparc.methods.gp import GaussianProcess, choose_kernel
+from gsparc.methods.method import Method
 from gsparc.ops import Pose
-from gsparc.peers.gp import GaussianProcess, choose_kernel
 
 LEVEL_DB = 0.25  # a process of images this far behind an array, left out, is level with it
 WEIGHTS = np.linspace(0, 1, 21)

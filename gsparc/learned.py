@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc import checkpoint, surgery
+from gsparc import surgery
 from gsparc.budget import Pace
 from gsparc.confidence import Confidence, ConfidenceSettings
 from gsparc.data.schema import Measurements, Site
@@ -21,7 +21,8 @@ from gsparc.data.splits import Fold
 from gsparc.emission import EmissionSettings
 from gsparc.encoding import Prior
 from gsparc.field import FieldSettings
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods import checkpoint
+from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import Pose

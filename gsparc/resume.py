@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from lightning.pytorch.plugins.io import CheckpointIO
 
-from gsparc import checkpoint
+from gsparc.methods import checkpoint
 
 if TYPE_CHECKING:
-    from gsparc.method import Method
+    from gsparc.methods.method import Method
 
 
 def interrupted(path: Path) -> checkpoint.Stored:

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.encoding import Prior
+from gsparc.methods.gp import choose_kernel, principal_components
+from gsparc.methods.target_rows import training_targets
 from gsparc.model import GaussianModel
 from gsparc.ops import Pose
-from gsparc.peers.encoding import training_targets
-from gsparc.peers.gp import choose_kernel, principal_components
 
 IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
 CHUNK = 256  # images held as floats at a time

@@ -23,8 +23,8 @@ from gsparc.effects import (
     probe_array,
     spacing_in_wavelengths,
 )
+from gsparc.methods.gp import GaussianProcess
 from gsparc.ops import SphereGrid
-from gsparc.peers.gp import GaussianProcess
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
 
 

@@ -18,8 +18,8 @@ from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.hybrid import Beside, Rest, Told, compared, learn_rest, searched_beyond, weight_of
-from gsparc.peers.mean import Mean
-from gsparc.registry import build
+from gsparc.methods.mean import Mean
+from gsparc.methods.registry import build
 
 NONE = Fold(*[np.zeros(0, np.int64)] * 3)
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "furniture": False, "edges": False}

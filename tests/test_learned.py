@@ -8,12 +8,13 @@ import torch
 from campaigns import brief, channels, compose, powers, spectra
 from omegaconf import OmegaConf
 
-from gsparc import checkpoint, load
+from gsparc import load
 from gsparc.data.load import load as load_data
 from gsparc.data.load import split_for
 from gsparc.learned import QUERY_CHUNK, LearnedField
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import build
 from gsparc.ops import Pose
-from gsparc.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
 

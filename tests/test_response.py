@@ -21,8 +21,8 @@ from gsparc.callbacks import ContributionPruning
 from gsparc.data.load import load as load_data
 from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
+from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
-from gsparc.registry import build
 from gsparc.response import ArrayResponse, ChannelResponse, PathResponse
 from gsparc.simulate.shoebox import LIGHT
 from gsparc.trainer import TrainerSettings, Training

@@ -7,9 +7,9 @@ import pytest
 import torch
 from campaigns import brief, compose, spectra
 
-from gsparc import checkpoint
 from gsparc.data.load import load, split_for
-from gsparc.registry import build
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
 

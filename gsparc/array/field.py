@@ -20,9 +20,9 @@ from gsparc.array.tuning import LEAST_LEFT, LeftOut, tune
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.evaluation.baseline_cache import platform_cache
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
-from gsparc.peers.encoding import to_real, training_targets
 
 log = logging.getLogger(__name__)
 

@@ -20,9 +20,9 @@ from gsparc.array.tuning import tune
 from gsparc.data.schema import Measurements
 from gsparc.encoding import Prior
 from gsparc.evaluation.baseline_cache import platform_cache
+from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.model import GaussianModel
 from gsparc.ops import Pose
-from gsparc.peers.encoding import to_real, training_targets
 from gsparc.view import seen_by_array
 
 RIDGE = 1e-3  # of the strongest direction of G: how short emissions are

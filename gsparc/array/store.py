@@ -14,7 +14,7 @@ import numpy as np
 from gsparc.array.recovery import Recovered, recover
 from gsparc.atomic import whole_file
 from gsparc.data.schema import Measurements, Site
-from gsparc.peers.encoding import training_targets
+from gsparc.methods.target_rows import training_targets
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from scipy.linalg import eigh
 
-from gsparc.peers.gp import Components
+from gsparc.methods.gp import Components
 
 ROWS, COLUMNS = 2, 4  # a beam is many pixels wide: thinned images have the same inner products
 

@@ -24,10 +24,10 @@ from gsparc.bearings.sources import SearchSettings, bearings, find_sources, mixe
 from gsparc.bearings.trend import Trend, TrendSettings, learn_trend
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Prediction
-from gsparc.peers.encoding import to_real
-from gsparc.peers.gp import Kernel, choose_kernel
-from gsparc.peers.interpolation import Interpolator
+from gsparc.methods.gp import Kernel, choose_kernel
+from gsparc.methods.interpolation import Interpolator
+from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.target_rows import to_real
 from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)

@@ -11,7 +11,7 @@ import torch
 from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
-from gsparc.peers.gp import Kernel
+from gsparc.methods.gp import Kernel
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from gsparc.coherent.phase import LIGHT
 from gsparc.coherent.visibility import matern32
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, tried for the envelope

@@ -33,7 +33,7 @@ from gsparc.coherent.sightings import Sightings
 from gsparc.coherent.visibility import matern32
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 
 # Receivers whose rays meet in a source; of more sources the most seen are kept.

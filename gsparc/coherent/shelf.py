@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from gsparc.atomic import whole_file
-from gsparc.checkpoint import SEARCHES
+from gsparc.methods.checkpoint import SEARCHES
 
 if TYPE_CHECKING:
     from gsparc.coherent.ensemble import Member

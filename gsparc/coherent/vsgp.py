@@ -30,7 +30,7 @@ from gsparc.coherent.sources import SourceKind, box_of, kinds
 from gsparc.coherent.visibility import KernelVisibility
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)

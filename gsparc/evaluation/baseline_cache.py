@@ -12,13 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc import checkpoint
 from gsparc.atomic import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
-from gsparc.method import Method
-from gsparc.registry import method_class
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.registry import method_class
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +54,7 @@ def baseline(
     """Fit (or find) the baseline `name` with its default settings on each fold, and score it.
 
     Args:
-        name: as in `gsparc.registry.METHODS`.
+        name: as in `gsparc.methods.registry.METHODS`.
         data: the dataset.
         split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
         eval_on: `train`, `val` or `test`.

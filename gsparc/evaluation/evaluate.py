@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.clock import COPY, ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline, mean_seconds
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score
-from gsparc.method import Method
+from gsparc.methods.method import Method
+from gsparc.methods.timing import COPY, ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
@@ -55,7 +55,7 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.registry.METHODS`.
+        baselines: names in `gsparc.methods.registry.METHODS`.
         cache: folder where baselines are kept between runs; None keeps nothing.
         clock: how long to measure latencies.
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.method import Method
+from gsparc.methods.method import Method
 
 
 def draw_predictions(

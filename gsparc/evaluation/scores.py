@@ -10,7 +10,7 @@ import numpy as np
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.metrics import metrics_for
-from gsparc.method import Method
+from gsparc.methods.method import Method
 
 SUBSETS = ("train", "val", "test")
 CHUNK = 64  # rows predicted at a time

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Prediction
-from gsparc.uplink.face import UplinkMethod
+from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.uplink_method import UplinkMethod
 
 
 class Network(nn.Module):

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from gsparc.data.module import order
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.network import Network, Scene
 

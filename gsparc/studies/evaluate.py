@@ -13,15 +13,15 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc import checkpoint
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
-from gsparc.method import Method
-from gsparc.predictor import SAME_PLACE_M
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.predictor import SAME_PLACE_M
 from gsparc.studies import cli, limits
 
 log = logging.getLogger(__name__)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsparc.registry import METHODS, suggest
+from gsparc.methods.registry import METHODS, suggest
 
 
 @dataclass(frozen=True)

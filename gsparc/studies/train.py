@@ -15,7 +15,6 @@ from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc import checkpoint
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
@@ -23,8 +22,9 @@ from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
-from gsparc.method import Method
-from gsparc.registry import build
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.registry import build
 from gsparc.studies import cli, limits
 from gsparc.trainer import Training
 

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Prediction
+from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.uplink_method import UplinkMethod
 from gsparc.uplink.atoms import Aperture, flat_places, mean_delay, phasor
-from gsparc.uplink.face import UplinkMethod
 from gsparc.uplink.posterior import Sources
 from gsparc.uplink.search import SearchSettings, SourceSearch
 from gsparc.uplink.trust import Heard, Trust, learn, signs, unheard_noise

@@ -10,7 +10,6 @@ import pytest
 import torch
 from known_arrays import array_site, measure, walk
 
-from gsparc import checkpoint
 from gsparc.array.field import ArrayField
 from gsparc.array.packets import PacketSettings, WavePackets, distil
 from gsparc.array.process import Kernel, learn_process, mirror_elements, settle, twin
@@ -21,8 +20,9 @@ from gsparc.data.load import load, split_for
 from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.scores import score
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import method_class
 from gsparc.ops import SphereGrid
-from gsparc.registry import method_class
 
 SMALL = PacketSettings(count=300, samples=1500)
 

@@ -7,7 +7,7 @@ import pytest
 from campaigns import compose
 
 from gsparc.data.splits import Fold
-from gsparc.registry import build
+from gsparc.methods.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
 

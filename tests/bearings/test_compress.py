@@ -1,7 +1,7 @@
 import numpy as np
 
 from gsparc.bearings.compress import components
-from gsparc.peers.gp import principal_components
+from gsparc.methods.gp import principal_components
 
 
 def smooth_images(count=30, seed=0):

@@ -13,8 +13,8 @@ from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
+from gsparc.methods.gp import GaussianProcess
 from gsparc.ops import SphereGrid
-from gsparc.peers.gp import GaussianProcess
 from gsparc.simulate.shoebox import images
 from gsparc.trainer import TrainerSettings, Training
 

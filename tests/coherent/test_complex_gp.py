@@ -3,7 +3,7 @@ import torch
 from rooms import nmse, shoebox
 
 from gsparc.coherent.complex_gp import ComplexGP
-from gsparc.registry import method_class
+from gsparc.methods.registry import method_class
 
 
 def _dense():

@@ -8,14 +8,15 @@ import torch
 from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
 
-from gsparc import checkpoint, load
+from gsparc import load
 from gsparc.coherent.pictures import plot_visibility
 from gsparc.coherent.rows import gather
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.effects import probe_phase
-from gsparc.registry import method_class
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import method_class
 
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0}
 

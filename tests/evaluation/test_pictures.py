@@ -8,7 +8,7 @@ from PIL import Image
 
 from gsparc.data.splits import Fold
 from gsparc.evaluation.pictures import draw_points, draw_predictions
-from gsparc.peers.mean import Mean
+from gsparc.methods.mean import Mean
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])

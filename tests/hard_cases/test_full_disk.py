@@ -1,7 +1,7 @@
 """Full disk: a checkpoint or a dataset that no longer fits.
 
 Remedy: written beside and renamed, so that the good one survives; the error is one line that says which file
-(gsparc/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which fails like a full
+(gsparc/methods/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which fails like a full
 disk does: in the middle of writing. Naive: writing in place loses the good one first.
 """
 
@@ -15,13 +15,13 @@ import torch
 from campaigns import brief, spectra
 from crashes import Limited, run, simulation, training
 
-from gsparc import checkpoint
-from gsparc.checkpoint import CheckpointError
+from gsparc.methods import checkpoint
+from gsparc.methods.checkpoint import CheckpointError
 
 
 @pytest.fixture
 def fitted(campaign, folds, tmp_path):
-    from gsparc.peers.gp import GaussianProcess
+    from gsparc.methods.gp import GaussianProcess
 
     method = GaussianProcess()
     method.fit(campaign("spectrum", 30), folds(30).folds[0], tmp_path)

@@ -15,7 +15,7 @@ from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.data.load import load, split_for
 from gsparc.losses import spectrum_loss
-from gsparc.registry import build
+from gsparc.methods.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
 

@@ -1,6 +1,6 @@
 """Kills: SIGKILL at random moments of training and of simulation.
 
-Remedy: every file appears by renaming (gsparc/checkpoint.py, gsparc/simulate/shards.py); all that a run needs
+Remedy: every file appears by renaming (gsparc/methods/checkpoint.py, gsparc/simulate/shards.py); all that a run needs
 to go on is in its last checkpoint, or in its finished shards. Shown: after any kill what is there is whole;
 going on always works; the end is bit-identical to an uninterrupted run's. Tolerance: none. Naive: a file that
 is written in place is cut short by the kill.
@@ -20,7 +20,7 @@ import torch
 from campaigns import brief, spectra
 from crashes import killed, moments, run, simulation, training
 
-from gsparc import checkpoint
+from gsparc.methods import checkpoint
 
 STEPS = 42  # a multiple of 7: the last checkpoint of a stage is its end
 SETTINGS = (

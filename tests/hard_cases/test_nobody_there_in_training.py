@@ -14,7 +14,7 @@ import torch
 from campaigns import brief, channels, compose, powers, spectra
 
 from gsparc.data.load import load, split_for
-from gsparc.registry import build
+from gsparc.methods.registry import build
 from gsparc.studies.train import train
 from gsparc.trainer import TrainerSettings, Training
 

@@ -16,11 +16,11 @@ import torch
 from campaigns import brief, compose, spectra
 from rasters import GRIDS, origin, random_scene, render
 
-from gsparc import checkpoint
 from gsparc.learned import LearnedField
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import build
 from gsparc.module import NonFiniteLoss
 from gsparc.ops.settings import FARTHEST, WIDEST
-from gsparc.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
 

@@ -20,7 +20,7 @@ import pytest
 import torch
 from campaigns import brief, compose, spectra
 
-from gsparc import checkpoint
+from gsparc.methods import checkpoint
 from gsparc.studies.train import train
 
 ROOT = Path(__file__).parents[2]

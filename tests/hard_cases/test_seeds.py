@@ -18,7 +18,7 @@ from releases import REAL
 
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.load import load, split_for
-from gsparc.registry import build
+from gsparc.methods.registry import build
 from gsparc.trainer import TrainerSettings, Training
 
 

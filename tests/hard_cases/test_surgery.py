@@ -24,10 +24,10 @@ from gsparc.data.schema import Site
 from gsparc.emission import EmissionSettings
 from gsparc.encoding import EncodingSettings
 from gsparc.field import FieldSettings
+from gsparc.methods.registry import build
 from gsparc.model import GaussianModel, ModelSettings
 from gsparc.module import NonFiniteLoss
 from gsparc.ops import Pose, SphereGrid
-from gsparc.registry import build
 from gsparc.schedule import OptimizerSettings, optimizer_for
 from gsparc.surgery import row_parameters
 from gsparc.trainer import TrainerSettings, Training

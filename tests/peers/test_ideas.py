@@ -10,11 +10,11 @@ from scenes import error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
 from gsparc.data.rfid import planar_array
+from gsparc.methods.kriging import fit_variogram
+from gsparc.methods.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.peers.directions import virtual_transmitters
-from gsparc.peers.kriging import fit_variogram
 from gsparc.peers.radiance import fourier_legendre, terms
-from gsparc.registry import method_class
 
 
 def fitted(name, data, fold, tmp_path, **settings):

@@ -11,9 +11,9 @@ import torch
 import yaml
 from scenes import lobes, room
 
-from gsparc import checkpoint
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import method_class
 from gsparc.peers.trained import rate_factor
-from gsparc.registry import method_class
 
 SPECTRA = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 CHANNELS = ("gsrf", "ngrf", "newrf")

@@ -7,7 +7,7 @@ import sys
 import pytest
 import torch
 
-from gsparc.clock import ClockSettings
+from gsparc.methods.timing import ClockSettings
 from gsparc.ops import composite, make_plan, marks
 from gsparc.studies.bench import kernels, steps
 from gsparc.studies.bench.case import Case, Work

@@ -107,8 +107,8 @@ def test_thinned_rows_keep_their_distance() -> None:
 
 
 def test_evidence_of_a_method(campaign, folds) -> None:
-    from gsparc.peers.gp import GaussianProcess
-    from gsparc.peers.mean import Mean
+    from gsparc.methods.gp import GaussianProcess
+    from gsparc.methods.mean import Mean
 
     data, split = campaign("csi", rows=60, static_end="tx"), folds(60)
     fold = split.folds[0]

@@ -17,8 +17,8 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import gsparc.conf
-from gsparc.method import Method
-from gsparc.registry import build
+from gsparc.methods.method import Method
+from gsparc.methods.registry import build
 from gsparc.studies import cli
 from gsparc.studies.cli import one_line
 from gsparc.studies.train import task

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from gsparc import checkpoint
 from gsparc.data.load import load, split_for
-from gsparc.peers.nearest import Nearest
+from gsparc.methods import checkpoint
+from gsparc.methods.nearest import Nearest
 from gsparc.studies.cli import one_line, run
 from gsparc.studies.evaluate import aligned, evaluate_files, main
 
@@ -40,7 +40,7 @@ def trained(room, tmp_path):
     config = {
         "dataset": {"name": "newrf", "file": str(room)},
         "split": {"name": "random"},
-        "model": {"_target_": "gsparc.peers.nearest.Nearest"},
+        "model": {"_target_": "gsparc.methods.nearest.Nearest"},
         "seed": 3,
     }
     data = load(config["dataset"])

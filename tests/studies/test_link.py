@@ -10,7 +10,8 @@ import torch
 from campaigns import compose
 from cities import city, fold
 
-from gsparc import checkpoint, load
+from gsparc import load
+from gsparc.methods import checkpoint
 from gsparc.studies.calibrate.threshold import binomial_interval
 from gsparc.studies.link.adaptation import Rates
 from gsparc.studies.link.beams import gain, loss_db

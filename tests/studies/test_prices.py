@@ -7,13 +7,13 @@ import pytest
 from clocks import WoundClock
 from invented import invent
 
-from gsparc import clock
-from gsparc.clock import ClockSettings
 from gsparc.data.splits import Fold
 from gsparc.effects import decide_array
-from gsparc.method import FitReport
-from gsparc.peers.mean import Mean
-from gsparc.peers.nearest import Nearest
+from gsparc.methods import timing
+from gsparc.methods.mean import Mean
+from gsparc.methods.method import FitReport
+from gsparc.methods.nearest import Nearest
+from gsparc.methods.timing import ClockSettings
 from gsparc.studies.study.prices import measure
 
 FOLD = Fold(np.arange(30), np.arange(30, 32), np.arange(32, 48))
@@ -59,7 +59,7 @@ def priced(makers, data, folder):
 
 
 def test_prices_are_ratios_to_the_plain_variant(tmp_path, monkeypatch):
-    monkeypatch.setattr(clock.time, "perf_counter", WATCH)
+    monkeypatch.setattr(timing.time, "perf_counter", WATCH)
     found = priced({"plain": Quick, "slow": Slow, "impossible": Impossible}, invent("csi"), tmp_path)
     assert set(found) == {"plain", "slow"}
     assert found["plain"].query_ratio == found["plain"].train_ratio == 1

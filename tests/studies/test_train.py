@@ -16,8 +16,8 @@ from campaigns import brief, channels, compose, powers, spectra
 from omegaconf import open_dict
 
 import gsparc
-from gsparc import checkpoint
 from gsparc.learned import LearnedField
+from gsparc.methods import checkpoint
 from gsparc.studies import evaluate
 from gsparc.studies.train import Objects, train
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 from cities import city, deaf, fold, folder
 
-from gsparc import checkpoint
 from gsparc.data.argos import load_argos
+from gsparc.methods import checkpoint
+from gsparc.methods.ridge import Ridge
 from gsparc.peers.fire import Fire
-from gsparc.peers.ridge import Ridge
 from gsparc.uplink.atoms import Aperture, Columns, delays, steering
 from gsparc.uplink.method import UplinkField
 from gsparc.uplink.posterior import Sources

@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from gsparc.clock import ClockSettings, interleaved
+from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.ops.settings import Projection
 from gsparc.studies.bench import kernels, layers, steps
 from gsparc.studies.bench.case import Call

@@ -11,8 +11,8 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from gsparc.clock import ClockSettings, machine_facts, peak_memory
 from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.methods.timing import ClockSettings, machine_facts, peak_memory
 from gsparc.ops.native import instruction_set
 from gsparc.studies import cli
 from gsparc.studies.bench import kernels, layers, steps

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsparc.clock import ClockSettings, interleaved
+from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.ops import marks
 from gsparc.studies.bench.case import Case
 

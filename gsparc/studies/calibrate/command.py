@@ -13,14 +13,14 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc.clock import machine_facts
 from gsparc.data.argos import peers_figures, peers_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.method import Method
+from gsparc.methods.method import Method
+from gsparc.methods.timing import machine_facts
 from gsparc.studies import cli
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.studies.calibrate.evidence import (

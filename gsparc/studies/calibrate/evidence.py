@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.method import Method, Prediction
-from gsparc.peers.encoding import training_targets
-from gsparc.peers.gp import Kernel, choose_kernel, principal_components
+from gsparc.methods.gp import Kernel, choose_kernel, principal_components
+from gsparc.methods.method import Method, Prediction
+from gsparc.methods.target_rows import training_targets
 
 KINDS = ("learned", "expected", "distance", "gp_variance")
 CHUNK = 64

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc import checkpoint
-from gsparc.method import Prediction
-from gsparc.peers.gp import Kernel
+from gsparc.methods import checkpoint
+from gsparc.methods.gp import Kernel
+from gsparc.methods.method import Prediction
 from gsparc.studies.calibrate.evidence import KINDS, expected_score, process_variance
 from gsparc.studies.calibrate.threshold import Promise, Threshold
 

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gsparc.registry import targets
+from gsparc.methods.registry import targets
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -175,7 +175,7 @@ def code_version(model: Mapping[str, Any]) -> str:
     ]
     open_ends = {
         base.__module__ for cls in classes for base in cls.__mro__ if base.__module__.startswith("gsparc.")
-    } - {"gsparc.method"}
+    } - {"gsparc.methods.method"}
     sources: dict[str, str] = {}
     while open_ends:
         name = open_ends.pop()

@@ -17,15 +17,15 @@ import hydra
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc import checkpoint
-from gsparc.clock import machine_facts
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.registry import build
+from gsparc.methods import checkpoint
+from gsparc.methods.registry import build
+from gsparc.methods.timing import machine_facts
 from gsparc.studies.compare.cells import Cell, Contender, key
 from gsparc.trainer import Training
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc import checkpoint
-from gsparc.clock import COPY, ClockSettings, interleaved, reference_copy
-from gsparc.method import Method
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.timing import COPY, ClockSettings, interleaved, reference_copy
 from gsparc.studies.compare.fitting import Filled, Room
 
 QUERIES = 64  # different positions asked for

@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.coherent.offsets import estimate
 from gsparc.data.argos import FACTS
 from gsparc.data.schema import Measurements
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
 from gsparc.studies.link.grid import interpolated
 from gsparc.uplink.method import UplinkField
 

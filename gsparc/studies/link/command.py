@@ -14,9 +14,9 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
-from gsparc.clock import machine_facts
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.methods.timing import machine_facts
 from gsparc.studies import cli
 from gsparc.studies.calibrate.threshold import Promise
 from gsparc.studies.calibrate.trial import accept

@@ -13,7 +13,7 @@ from gsparc.best import Gsparc
 from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Site
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.studies.link.grid import interpolated, resource_grid
 from gsparc.uplink.method import UplinkField

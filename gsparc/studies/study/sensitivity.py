@@ -15,14 +15,14 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 from rich.table import Table
 
-from gsparc.clock import machine_facts
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import dataset_facts
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.method import Method
+from gsparc.methods.method import Method
+from gsparc.methods.timing import machine_facts
 from gsparc.studies import cli
 from gsparc.studies.study.variants import setting
 

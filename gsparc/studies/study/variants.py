@@ -15,8 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.method import Method
-from gsparc.registry import build, method_class
+from gsparc.methods.method import Method
+from gsparc.methods.registry import build, method_class
 from gsparc.studies import limits
 from gsparc.trainer import Training
 

@@ -10,10 +10,10 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gsparc.checkpoint import Stored
 from gsparc.data.schema import Site
-from gsparc.method import Method
-from gsparc.predictor import Predictor
+from gsparc.methods.checkpoint import Stored
+from gsparc.methods.method import Method
+from gsparc.methods.predictor import Predictor
 from gsparc.studies.tradeoff.spare import reduced
 from gsparc.studies.tradeoff.stored import Operating, kept
 from gsparc.studies.tradeoff.timing import Pace, in_turns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose, SphereGrid
 from gsparc.studies.tradeoff.view import View
 

@@ -14,8 +14,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc import checkpoint
-from gsparc.clock import COPY, machine_facts, peak_memory, reference_copy
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baseline_cache import baseline, platform_cache
@@ -23,7 +21,9 @@ from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.metrics import DECIDING, score_of
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
-from gsparc.method import Method
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.timing import COPY, machine_facts, peak_memory, reference_copy
 from gsparc.studies import cli
 from gsparc.studies.evaluate import Opened, open_files
 from gsparc.studies.tradeoff import stored

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.method import Method, Prediction
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.method import Method, Prediction
+from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
-from gsparc.peers.encoding import from_real
-from gsparc.peers.gp import GaussianProcess
 from gsparc.studies.tradeoff.coarse import Filled
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import View
@@ -72,7 +72,7 @@ class Mean(View):
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; Matern-3/2 as in `gsparc.peers.gp.Kernel`, in float32."""
+        """See `Method.predict`; Matern-3/2 as in `gsparc.methods.gp.Kernel`, in float32."""
         where = tx if self._end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
         query = (where - self._middle) * self._scale
         far = torch.linalg.vector_norm(query[:, None] - self._places, dim=-1)  # cdist: three times slower

@@ -17,9 +17,9 @@ from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import bearings, mixed
 from gsparc.bearings.trend import Trend
 from gsparc.data.schema import Measurements
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
+from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
-from gsparc.peers.encoding import from_real
 from gsparc.studies.tradeoff.coarse import Filled, coarser
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import View
@@ -97,7 +97,7 @@ class Mean(View):
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; Matern-3/2 as in `gsparc.peers.gp.Kernel`."""
+        """See `Method.predict`; Matern-3/2 as in `gsparc.methods.gp.Kernel`."""
         where = rx.position.reshape(-1, 3).expand(len(tx), 3)
         far = torch.linalg.vector_norm((where - self._middle)[:, None] - self._places, dim=-1)
         images = [

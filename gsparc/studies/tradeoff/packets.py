@@ -14,7 +14,7 @@ from gsparc.array.field import ArrayField
 from gsparc.array.packets import WavePackets
 from gsparc.array.render import SpectrumRenderer
 from gsparc.data.schema import Measurements
-from gsparc.method import Method
+from gsparc.methods.method import Method
 from gsparc.studies.tradeoff.coarse import Filled, coarser
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import MeanOnly

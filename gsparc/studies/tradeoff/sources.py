@@ -13,7 +13,7 @@ from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.query import Query
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements
-from gsparc.method import Method
+from gsparc.methods.method import Method
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import MeanOnly
 

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsparc.best import Gsparc
 from gsparc.data.schema import Measurements
 from gsparc.hybrid import Companion
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import View
@@ -28,7 +28,7 @@ FAMILIES = {  # the most special class first
     "gsparc.array.field.ArrayField": "gsparc.studies.tradeoff.packets",
     "gsparc.bearings.field.BearingField": "gsparc.studies.tradeoff.crossings",
     "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.studies.tradeoff.sources",
-    "gsparc.peers.gp.GaussianProcess": "gsparc.studies.tradeoff.components",
+    "gsparc.methods.gp.GaussianProcess": "gsparc.studies.tradeoff.components",
     "gsparc.learned.LearnedField": "gsparc.studies.tradeoff.splatted",
 }
 AS_TRAINED = {

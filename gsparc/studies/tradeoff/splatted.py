@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc import surgery
 from gsparc.data.schema import Measurements
 from gsparc.learned import LearnedField
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
 from gsparc.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.ops import Pose, SphereGrid, mean_weights
 from gsparc.studies.tradeoff.coarse import Filled, coarser

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsparc import checkpoint
+from gsparc.methods import checkpoint
 from gsparc.studies.tradeoff.points import Point, Settings
 from gsparc.studies.tradeoff.spare import Measured
 

@@ -16,8 +16,8 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import Scores, rows_of, score
-from gsparc.method import Method, Prediction
-from gsparc.predictor import Predictor
+from gsparc.methods.method import Method, Prediction
+from gsparc.methods.predictor import Predictor
 from gsparc.studies.tradeoff.points import Point, Settings, worded
 from gsparc.studies.tradeoff.timing import Pace, in_turns
 from gsparc.studies.tradeoff.view import View

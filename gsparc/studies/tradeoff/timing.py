@@ -10,7 +10,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from gsparc.clock import synchronise
+from gsparc.methods.timing import synchronise
 
 Key = TypeVar("Key")
 

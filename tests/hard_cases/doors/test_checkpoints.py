@@ -1,6 +1,6 @@
 """Hostile and damaged checkpoints at the doors that read them: nothing executes, one line says why.
 
-Remedy: gsparc/checkpoint.py (weights-only unpickling, only classes of gsparc are built). Each hostile file
+Remedy: gsparc/methods/checkpoint.py (weights-only unpickling, only classes of gsparc are built). Each hostile file
 would leave a mark; no mark may appear. Naive: `pickle.load` and `torch.load(weights_only=False)` leave it.
 """
 # ruff: noqa: E501 (a case is a row of a table)
@@ -25,10 +25,10 @@ from doors import assert_refused, knock
 from ledger import LEDGER
 
 import gsparc
-from gsparc import checkpoint
-from gsparc.checkpoint import CheckpointError
 from gsparc.data.load import load, split_for
-from gsparc.registry import build
+from gsparc.methods import checkpoint
+from gsparc.methods.checkpoint import CheckpointError
+from gsparc.methods.registry import build
 from gsparc.studies.evaluate import main as evaluate
 from gsparc.studies.train import main as train
 
@@ -68,8 +68,8 @@ def sound(tmp_path_factory) -> tuple[Path, Path]:
     folder = tmp_path_factory.mktemp("sound")
     file = spectra(folder / "own.npz")
     data = load({"name": "own", "file": str(file)})
-    config = "model: {_target_: gsparc.peers.idw.InverseDistance}\n"
-    method = build({"_target_": "gsparc.peers.idw.InverseDistance"})
+    config = "model: {_target_: gsparc.methods.idw.InverseDistance}\n"
+    method = build({"_target_": "gsparc.methods.idw.InverseDistance"})
     method.fit(data, split_for({"name": "random"}, data).folds[0], folder)
     checkpoint.save(folder / "m.ckpt", method, config)
     return folder / "m.ckpt", file
@@ -123,16 +123,16 @@ def test_commands_refuse_them_in_one_line(sound, tmp_path, name):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.exec", "pathlib.Path.touch", "gsparc.checkpoint.os.system", "gsparc.data.load.log",
-     "torch.load", "gsparc.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
+    ["os.system", "builtins.exec", "pathlib.Path.touch", "gsparc.methods.checkpoint.os.system", "gsparc.data.load.log",
+     "torch.load", "gsparc.methods.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
 )  # fmt: skip
 def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
     mark = tmp_path / MARK
     config = f"model: {{_target_: '{target}', _args_: ['{mark}']}}\n"
     for name, changes in {
         "named": {"config": config, "target": target},
-        "nested": {"config": f"model: {{_target_: gsparc.peers.idw.InverseDistance, power: {config[7:-1]}}}\n",
-                   "target": "gsparc.peers.idw.InverseDistance"},
+        "nested": {"config": f"model: {{_target_: gsparc.methods.idw.InverseDistance, power: {config[7:-1]}}}\n",
+                   "target": "gsparc.methods.idw.InverseDistance"},
     }.items():  # fmt: skip
         path = altered(sound[0], tmp_path / f"{name}.ckpt", **changes)
         with pytest.raises(CheckpointError) as refused:
@@ -152,7 +152,7 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
         ({"site": None}, "incomplete"),
         ({"state": [1, 2]}, "incomplete"),
         ({"state": {}}, "cannot be restored"),
-        ({"target": "gsparc.peers.gp.GaussianProcess", "config": ""}, "cannot be restored"),
+        ({"target": "gsparc.methods.gp.GaussianProcess", "config": ""}, "cannot be restored"),
         ({"config": "model: ["}, "not YAML"),
         ({"config": "a: !!python/object/apply:os.system ['true']"}, "not YAML"),
     ],

@@ -65,7 +65,7 @@ def test_every_method_of_the_default_comparison_composes():
 
 
 MODULE = '''"""{doc}"""
-from gsparc.peers.mean import Mean
+from gsparc.methods.mean import Mean
 
 
 class Toy(Mean):
@@ -83,12 +83,12 @@ def test_words_do_not_make_another_method_and_numbers_do(tmp_path, monkeypatch):
         versions.append(code_version({"_target_": "gsparc.peers.toy.Toy"}))
     assert versions[0] == versions[1] != versions[2]
     assert code_version({"_target_": "gsparc.peers.gsrf.GSRF"}) != code_version(
-        {"_target_": "gsparc.peers.mean.Mean"}
+        {"_target_": "gsparc.methods.mean.Mean"}
     )
 
 
 def test_a_key_names_data_split_and_settings():
-    model = {"_target_": "gsparc.peers.mean.Mean"}
+    model = {"_target_": "gsparc.methods.mean.Mean"}
     base = key(model, {}, "data", "split")
     assert base == key(dict(model), {}, "data", "split")
     others = [

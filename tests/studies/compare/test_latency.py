@@ -8,8 +8,8 @@ import pytest
 import torch
 from clocks import WoundClock
 
-from gsparc import clock
-from gsparc.method import Prediction
+from gsparc.methods import timing
+from gsparc.methods.method import Prediction
 from gsparc.studies.compare import latency
 from gsparc.studies.compare.cells import Cell
 from gsparc.studies.compare.fitting import Filled, Room
@@ -32,7 +32,7 @@ class Waiting:
 def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path):
     made: dict[str, Waiting] = {}
     watch = WoundClock()
-    monkeypatch.setattr(clock.time, "perf_counter", watch)
+    monkeypatch.setattr(timing.time, "perf_counter", watch)
     monkeypatch.setattr(
         latency, "_loaded", lambda path: made.setdefault(path.parent.name, Waiting(path.parent.name, watch))
     )

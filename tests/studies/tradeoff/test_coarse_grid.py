@@ -44,6 +44,6 @@ def test_columns_that_cannot_be_divided_are_refused():
 
 @pytest.fixture
 def steady():
-    from gsparc.peers.mean import Mean
+    from gsparc.methods.mean import Mean
 
     return Mean()

@@ -14,9 +14,9 @@ from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
 
 import gsparc
-from gsparc import checkpoint
-from gsparc.clock import COPY
 from gsparc.evaluation.scores import score
+from gsparc.methods import checkpoint
+from gsparc.methods.timing import COPY
 from gsparc.studies.tradeoff import choose, stored
 from gsparc.studies.tradeoff.command import task
 from gsparc.studies.tradeoff.points import Point

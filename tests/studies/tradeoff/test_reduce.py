@@ -19,8 +19,8 @@ from gsparc.bearings.sources import SearchSettings
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
-from gsparc.peers.gp import GaussianProcess
-from gsparc.peers.mean import Mean
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.mean import Mean
 from gsparc.studies.tradeoff import spare, splatted
 from gsparc.studies.train import train
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.method import Prediction
-from gsparc.peers.interpolation import Interpolator
+from gsparc.methods.interpolation import Interpolator
+from gsparc.methods.method import Prediction
 
 
 class Zero(Interpolator):

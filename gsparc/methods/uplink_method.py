@@ -7,7 +7,7 @@ from abc import abstractmethod
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.method import Method, Prediction
+from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
 
 

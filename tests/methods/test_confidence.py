@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import gsparc
-from gsparc import checkpoint
-from gsparc.peers.gp import GaussianProcess
+from gsparc.methods import checkpoint
+from gsparc.methods.gp import GaussianProcess
 from gsparc.studies.calibrate.evidence import gather, known_positions, position_kernel
 from gsparc.studies.calibrate.stored import Trusted, as_confidence, keep
 from gsparc.studies.calibrate.threshold import Promise

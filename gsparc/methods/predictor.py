@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc import checkpoint
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import Kind, Site
-from gsparc.method import Method, Prediction
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.studies.calibrate.stored import Trusted, kept
 
@@ -250,7 +250,7 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
             the model's own where it was never calibrated.
 
     Raises:
-        gsparc.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
+        gsparc.methods.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
         ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence.
     """
     method, stored = checkpoint.load(path)

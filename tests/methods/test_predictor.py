@@ -11,10 +11,10 @@ import pytest
 import torch
 
 import gsparc
-from gsparc import checkpoint
-from gsparc.peers.gp import GaussianProcess
-from gsparc.peers.mean import Mean
-from gsparc.registry import method_class
+from gsparc.methods import checkpoint
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.mean import Mean
+from gsparc.methods.registry import method_class
 
 
 def loaded(data, fold, path, name="gp"):

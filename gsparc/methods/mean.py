@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.method import Prediction
-from gsparc.peers.encoding import to_real
-from gsparc.peers.interpolation import Interpolator
+from gsparc.methods.interpolation import Interpolator
+from gsparc.methods.method import Prediction
+from gsparc.methods.target_rows import to_real
 
 
 class Mean(Interpolator):

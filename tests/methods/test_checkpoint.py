@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc import checkpoint
-from gsparc.checkpoint import CheckpointError
-from gsparc.peers.gp import GaussianProcess
-from gsparc.peers.idw import InverseDistance
+from gsparc.methods import checkpoint
+from gsparc.methods.checkpoint import CheckpointError
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.idw import InverseDistance
 
 CONFIG = """
-model: {_target_: gsparc.peers.idw.InverseDistance, neighbours: 3, power: 1.0}
+model: {_target_: gsparc.methods.idw.InverseDistance, neighbours: 3, power: 1.0}
 seed: 4
 """
 

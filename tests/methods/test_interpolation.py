@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from gsparc.data.schema import Measurements
-from gsparc.peers.encoding import from_real, to_real
-from gsparc.peers.idw import InverseDistance
-from gsparc.registry import method_class
+from gsparc.methods.idw import InverseDistance
+from gsparc.methods.registry import method_class
+from gsparc.methods.target_rows import from_real, to_real
 
 NAMES = ("zero", "mean", "nearest", "idw", "gp")
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from clocks import WoundClock
 
-from gsparc import clock
-from gsparc.clock import ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
+from gsparc.methods import timing
+from gsparc.methods.timing import ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
 
 
 def test_contenders_take_turns_after_warming_up():
@@ -18,7 +18,7 @@ def test_contenders_take_turns_after_warming_up():
 
 def test_budget_stops_rounds_but_not_below_the_least(monkeypatch):
     watch = WoundClock()
-    monkeypatch.setattr(clock.time, "perf_counter", watch)
+    monkeypatch.setattr(timing.time, "perf_counter", watch)
     slow = {"slow": lambda turn: watch.wind(0.02)}
     times = interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, budget_s=0.01))
     assert len(times["slow"]) == 4 and (abs(times["slow"] - 20) < 1).all()

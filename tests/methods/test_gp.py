@@ -11,8 +11,8 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.scores import score
+from gsparc.methods.gp import GaussianProcess, Kernel, choose_kernel, leave_one_out, principal_components
 from gsparc.ops import Pose
-from gsparc.peers.gp import GaussianProcess, Kernel, choose_kernel, leave_one_out, principal_components
 
 
 def test_leave_one_out_equals_refitting_without_each_row():

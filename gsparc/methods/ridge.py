@@ -12,8 +12,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Prediction
-from gsparc.uplink.face import UplinkMethod
+from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.uplink_method import UplinkMethod
 
 PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 

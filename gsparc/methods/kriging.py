@@ -18,9 +18,9 @@ from scipy.linalg import lu_factor, lu_solve
 from scipy.optimize import curve_fit
 from scipy.spatial.distance import cdist, pdist
 
-from gsparc.method import Prediction
-from gsparc.peers.encoding import entry_variance, to_real
-from gsparc.peers.interpolation import Interpolator
+from gsparc.methods.interpolation import Interpolator
+from gsparc.methods.method import Prediction
+from gsparc.methods.target_rows import entry_variance, to_real
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
 SILENCE = 1e-36  # power of a channel where none was measured, in stored units: it has no decibels

@@ -14,9 +14,9 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.target_rows import from_real, training_targets
 from gsparc.ops import Pose
-from gsparc.peers.encoding import from_real, training_targets
 
 
 class Interpolator(Method):

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from gsparc.atomic import whole_file
 from gsparc.data.schema import Site
-from gsparc.method import Method
+from gsparc.methods.method import Method
+from gsparc.methods.registry import METHODS, build, method_class
 from gsparc.ops import SphereGrid
-from gsparc.registry import METHODS, build, method_class
 
 SCHEMA_VERSION = 1
 FORMAT = "gsparc-checkpoint"

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gsparc.method import Method
-from gsparc.peers.gp import GaussianProcess
-from gsparc.registry import METHODS, build, method_class
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.method import Method
+from gsparc.methods.registry import METHODS, build, method_class
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -19,7 +19,7 @@ def test_every_name_is_a_method(name):
 
 def test_every_model_of_the_configuration_has_a_name():
     """`model=directed` could be trained, but was no baseline and could not be read from a bare checkpoint."""
-    files = (Path(__file__).parents[1] / "conf" / "model").glob("*.yaml")
+    files = (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")
     targets = {file.stem: yaml.safe_load(file.read_text())["_target_"] for file in files}
     assert targets == METHODS
 
@@ -32,7 +32,7 @@ def test_a_typo_gets_the_nearest_name():
 
 
 def test_a_config_becomes_a_method():
-    method = build({"_target_": "gsparc.peers.gp.GaussianProcess", "components": 7})
+    method = build({"_target_": "gsparc.methods.gp.GaussianProcess", "components": 7})
     assert isinstance(method, GaussianProcess) and method.limit == 7
     with pytest.raises(ValueError, match=r"not a gsparc\.method\.Method"):
         build({"_target_": "pathlib.Path"})
@@ -53,10 +53,10 @@ def test_a_config_becomes_a_method():
 )
 def test_text_from_a_file_builds_our_classes_only(target, tmp_path):
     hostile = {
-        "_target_": "gsparc.peers.gp.GaussianProcess",
+        "_target_": "gsparc.methods.gp.GaussianProcess",
         "components": {"_target_": target, "_args_": ["x"]},
     }
     for config in (hostile, {"_target_": target}, {**hostile, "components": [hostile["components"]]}):
         with pytest.raises(ValueError, match="refused"):
             build(config, trusted=False)
-    assert build({"_target_": "gsparc.peers.gp.GaussianProcess"}, trusted=False).limit > 0
+    assert build({"_target_": "gsparc.methods.gp.GaussianProcess"}, trusted=False).limit > 0

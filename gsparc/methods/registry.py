@@ -10,22 +10,22 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.method import Method
+from gsparc.methods.method import Method
 
 METHODS = {
-    "zero": "gsparc.peers.zero.Zero",
-    "mean": "gsparc.peers.mean.Mean",
-    "nearest": "gsparc.peers.nearest.Nearest",
-    "idw": "gsparc.peers.idw.InverseDistance",
-    "gp": "gsparc.peers.gp.GaussianProcess",
-    "kriging": "gsparc.peers.kriging.Kriging",
+    "zero": "gsparc.methods.zero.Zero",
+    "mean": "gsparc.methods.mean.Mean",
+    "nearest": "gsparc.methods.nearest.Nearest",
+    "idw": "gsparc.methods.idw.InverseDistance",
+    "gp": "gsparc.methods.gp.GaussianProcess",
+    "kriging": "gsparc.methods.kriging.Kriging",
     "gsrf": "gsparc.peers.gsrf.GSRF",
     "wrfgs": "gsparc.peers.wrfgs.WRFGSPlus",
     "swiftwrf": "gsparc.peers.swiftwrf.SwiftWRF",
     "nerf2": "gsparc.peers.nerf2.NeRF2",
     "ngrf": "gsparc.peers.ngrf.NGRF",
     "newrf": "gsparc.peers.newrf.NeWRF",
-    "ridge": "gsparc.peers.ridge.Ridge",
+    "ridge": "gsparc.methods.ridge.Ridge",
     "fire": "gsparc.peers.fire.Fire",
     "uplink": "gsparc.uplink.method.UplinkField",
     "complex_gp": "gsparc.coherent.complex_gp.ComplexGP",
@@ -70,7 +70,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
             _refuse_foreign(path)
     method = instantiate(node)
     if not isinstance(method, Method):
-        raise ValueError(f"model: {target} is not a gsparc.method.Method")
+        raise ValueError(f"model: {target} is not a gsparc.methods.method.Method")
     return method
 
 

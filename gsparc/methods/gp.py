@@ -14,9 +14,9 @@ from sklearn.gaussian_process.kernels import Matern
 from torch import Tensor
 
 from gsparc.data.schema import Kind
-from gsparc.method import Prediction
-from gsparc.peers.encoding import entry_variance, to_real
-from gsparc.peers.interpolation import Interpolator
+from gsparc.methods.interpolation import Interpolator
+from gsparc.methods.method import Prediction
+from gsparc.methods.target_rows import entry_variance, to_real
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""What every method is (`Method`), by name, stored, loaded, timed; and the plain baselines."""
