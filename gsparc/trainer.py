@@ -18,7 +18,7 @@ from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.io import CheckpointIO
 
 from gsparc.budget import Budget, Stretched
-from gsparc.data.module import MeasurementsModule
+from gsparc.data.datamodule import MeasurementsModule
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.module import GaussianModule

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from gsparc.atomic import whole_file
+from gsparc.data.files import whole_file
 from gsparc.methods.checkpoint import SEARCHES
 
 if TYPE_CHECKING:

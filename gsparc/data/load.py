@@ -132,8 +132,8 @@ def _argos_sim(config: Mapping[str, Any]) -> Measurements:
 
 def _argos_folder(folder: Path, config: Mapping[str, Any]) -> Measurements:
     from gsparc.data.argos import load_argos
-    from gsparc.encoder.autoencoder import EncoderSettings
-    from gsparc.encoder.store import encoder_for
+    from gsparc.data.position_encoder.autoencoder import EncoderSettings
+    from gsparc.data.position_encoder.store import encoder_for
 
     given = dict(config.get("encoder") or {})
     file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))

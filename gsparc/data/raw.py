@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from gsparc.data.errors import DataError
-from gsparc.data.trial import fails
+from gsparc.data.hdf5_probe import fails
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.atomic import whole_file
 from gsparc.data.errors import DataError
+from gsparc.data.files import whole_file
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.atomic import whole_file
+from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score

@@ -14,7 +14,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from gsparc.atomic import whole_file
+from gsparc.data.files import whole_file
 from gsparc.data.schema import Site
 from gsparc.methods.method import Method
 from gsparc.methods.registry import METHODS, build, method_class

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.module import order
+from gsparc.data.datamodule import order
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitReport, Method, Prediction

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from gsparc.atomic import whole_folder
+from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.streets import Rays, Streets, trace
 

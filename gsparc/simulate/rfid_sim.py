@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from gsparc.atomic import whole_folder
+from gsparc.data.files import whole_folder
 from gsparc.data.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.atomic import whole_file
+from gsparc.data.files import whole_file
 
 
 class Shards:

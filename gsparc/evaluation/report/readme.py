@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.atomic import whole_file
+from gsparc.data.files import whole_file
 from gsparc.evaluation.report.runs import Run, by_study
 from gsparc.evaluation.report.table import Table
 from gsparc.evaluation.report.tables import results, seeds

@@ -130,7 +130,9 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
     ckpt = tmp_path / "model.ckpt"
     shutil.copy(field.checkpoints[0], ckpt)
     before = ckpt.read_bytes()
-    monkeypatch.setattr("gsparc.atomic.os.replace", lambda *paths: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr(
+        "gsparc.data.files.os.replace", lambda *paths: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
     point = Point("as trained", {}, 1, {"psnr_db": 1.0}, 1.0, np.ones(3))
     with pytest.raises(KeyboardInterrupt):
         stored.keep(ckpt, [point], "psnr_db", {})

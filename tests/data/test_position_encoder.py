@@ -8,10 +8,10 @@ import torch
 from cities import city, fold
 
 from gsparc.data.errors import DataError
-from gsparc.encoder.autoencoder import EncoderSettings, spread
-from gsparc.encoder.features import features
-from gsparc.encoder.judge import judge
-from gsparc.encoder.store import encoder_for, load, places
+from gsparc.data.position_encoder.accuracy import judge
+from gsparc.data.position_encoder.autoencoder import EncoderSettings, spread
+from gsparc.data.position_encoder.features import features
+from gsparc.data.position_encoder.store import encoder_for, load, places
 
 QUICK = EncoderSettings(hidden=32, steps=150, batch=64)
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsparc.atomic import whole_file
 from gsparc.data.assemble import content_hash
 from gsparc.data.errors import DataError
-from gsparc.encoder.autoencoder import Autoencoder, EncoderSettings, train
-from gsparc.encoder.features import features
+from gsparc.data.files import whole_file
+from gsparc.data.position_encoder.autoencoder import Autoencoder, EncoderSettings, train
+from gsparc.data.position_encoder.features import features
 
 log = logging.getLogger(__name__)
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 import torch
 
+from gsparc.data.datamodule import MeasurementsModule, StepLoader, order, steps_per_epoch
 from gsparc.data.load import LOADERS, load
-from gsparc.data.module import MeasurementsModule, StepLoader, order, steps_per_epoch
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 
