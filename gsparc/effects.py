@@ -14,11 +14,11 @@ from scipy.spatial import cKDTree
 
 from gsparc.array.recovery import recover
 from gsparc.bearings.field import POOR, beyond, site_problem
-from gsparc.bearings.lags import Lags
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import Method
 from gsparc.methods.target_rows import to_real
+from gsparc.physics.lags import Lags
 
 Switch = bool | Literal["auto", "splat"]
 SPLAT = "splat"

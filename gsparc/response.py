@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gsparc.array.render import SpectrumRenderer
-from gsparc.array.response import array_output, element_pattern, normalised, site_problem, steering
-from gsparc.coherent.phase import LIGHT, ranges, wave_over_band
 from gsparc.coherent.rows import tones_of
 from gsparc.data.schema import Site
 from gsparc.ops import Pose
 from gsparc.ops.channels import channels
+from gsparc.physics.array_response import array_output, element_pattern, normalised, site_problem, steering
+from gsparc.physics.bartlett import SpectrumRenderer
+from gsparc.physics.waves import LIGHT, ranges, wave_over_band
 
 UNEVEN = 1e-6  # tones this far off an even comb, in spacings, are evaluated one by one
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsparc.array.render import spectra
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.ops import SphereGrid
+from gsparc.physics.bartlett import spectra
 from gsparc.simulate.shoebox import Room, trace
 
 WAVELENGTH = 0.3259

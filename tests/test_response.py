@@ -15,14 +15,14 @@ from known_arrays import array_site
 from rooms import nmse, shoebox
 from torch import Tensor
 
-from gsparc.array.render import spectra
-from gsparc.array.response import normalised
 from gsparc.callbacks import ContributionPruning
 from gsparc.data.load import load as load_data
 from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
+from gsparc.physics.array_response import normalised
+from gsparc.physics.bartlett import spectra
 from gsparc.response import ArrayResponse, ChannelResponse, PathResponse
 from gsparc.simulate.shoebox import LIGHT
 from gsparc.trainer import TrainerSettings, Training

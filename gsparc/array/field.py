@@ -13,8 +13,6 @@ from torch import Tensor
 
 from gsparc.array.packets import PacketSettings, WavePackets, distil
 from gsparc.array.process import learn_process, mirror_elements
-from gsparc.array.render import SpectrumRenderer
-from gsparc.array.response import site_problem, steering
 from gsparc.array.store import recovered, report
 from gsparc.array.tuning import LEAST_LEFT, LeftOut, tune
 from gsparc.data.schema import Measurements, Site
@@ -23,6 +21,8 @@ from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
+from gsparc.physics.array_response import site_problem, steering
+from gsparc.physics.bartlett import SpectrumRenderer
 
 log = logging.getLogger(__name__)
 

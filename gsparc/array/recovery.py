@@ -15,8 +15,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.array.response import lags
 from gsparc.data.schema import Site
+from gsparc.physics.array_response import lags
 
 log = logging.getLogger(__name__)
 

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from gsparc.array.process import learn_process, mirror_elements
-from gsparc.array.response import steering
 from gsparc.array.store import recovered, report
 from gsparc.array.tuning import tune
 from gsparc.data.schema import Measurements
@@ -23,6 +22,7 @@ from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.model import GaussianModel
 from gsparc.ops import Pose
+from gsparc.physics.array_response import steering
 from gsparc.view import seen_by_array
 
 RIDGE = 1e-3  # of the strongest direction of G: how short emissions are

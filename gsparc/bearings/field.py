@@ -19,7 +19,6 @@ from torch import Tensor
 
 from gsparc.bearings.compress import components
 from gsparc.bearings.doubt import Doubt, Looks, learn_doubt
-from gsparc.bearings.lags import BLOCK, Lags
 from gsparc.bearings.sources import SearchSettings, bearings, find_sources, mixed, powers
 from gsparc.bearings.trend import Trend, TrendSettings, learn_trend
 from gsparc.data.schema import Measurements
@@ -28,6 +27,7 @@ from gsparc.methods.gp import Kernel, choose_kernel
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import FitReport, Prediction
 from gsparc.methods.target_rows import to_real
+from gsparc.physics.lags import BLOCK, Lags
 from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)

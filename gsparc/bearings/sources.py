@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.bearings.lags import Lags
 from gsparc.ops import SphereGrid
+from gsparc.physics.lags import Lags
 
 SWEEPS = 20  # over all sources: powers are then within a hundredth of the best
 

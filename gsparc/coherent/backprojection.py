@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.coherent.phase import LIGHT, NEAR_M
 from gsparc.coherent.process import Factor, steering
 from gsparc.coherent.rows import Rows
+from gsparc.physics.waves import LIGHT, NEAR_M
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
 

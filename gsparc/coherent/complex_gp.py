@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.coherent.phase import LIGHT
 from gsparc.coherent.visibility import matern32
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, tried for the envelope
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, tried

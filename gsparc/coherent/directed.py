@@ -24,7 +24,6 @@ from torch import Tensor
 from gsparc.coherent.bundles import Rays, meet
 from gsparc.coherent.frame import Frame, frame_of, refuse
 from gsparc.coherent.openness import Open, coherence
-from gsparc.coherent.phase import LIGHT, ranges, wave, wave_over_band
 from gsparc.coherent.pinning import Pinning
 from gsparc.coherent.process import JITTER, Factor, steering
 from gsparc.coherent.revote import Rates, flips
@@ -35,6 +34,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT, ranges, wave, wave_over_band
 
 # Receivers whose rays meet in a source; of more sources the most seen are kept.
 LEAST_SEEN, MOST_SOURCES = 2, 60

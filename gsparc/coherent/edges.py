@@ -14,11 +14,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsparc.coherent.phase import NEAR_M, reduced_phase
 from gsparc.coherent.process import JITTER, Factor, Posterior, Scene
 from gsparc.coherent.refine import refine
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.sources import about_edge
+from gsparc.physics.waves import NEAR_M, reduced_phase
 
 BLOCK = 512  # candidates at a time
 GIVING_WAY = 12  # steps of refinement after an edge

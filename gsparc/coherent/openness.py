@@ -15,7 +15,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from gsparc.coherent.phase import LIGHT
+from gsparc.physics.waves import LIGHT
 
 SHARP_RAD = 0.1  # standard deviation of relative phases below which a place counts as exact
 

@@ -11,10 +11,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from gsparc.coherent.planes import Word, all_words, bisector, images, reflect
 from gsparc.coherent.process import Posterior, Scene
 from gsparc.coherent.refine import refine
 from gsparc.coherent.rows import Rows
+from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
 
 LONGER = 0.02  # [m] per letter: of two words at the same place the shorter is meant
 WALL = 0.2  # [m], half the smallest separation that is read as a mirror image

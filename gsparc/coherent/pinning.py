@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from gsparc.coherent.openness import Open, coherence, slopes
-from gsparc.coherent.phase import LIGHT
 from gsparc.coherent.process import JITTER, Factor, steering
 from gsparc.coherent.rows import Rows
+from gsparc.physics.waves import LIGHT
 
 PER_CELL, LEAST_DRAWN, MOST_DRAWN = 6, 32, 768  # places per (quarter wavelength)^3 that is open
 POLISHED, STEPS = 6, 8  # the best of them, and steps for each

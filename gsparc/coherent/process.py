@@ -16,10 +16,10 @@ from torch import Tensor
 
 from gsparc.coherent.furniture.clutter import Clutter, shade
 from gsparc.coherent.furniture.paths import Unfolding
-from gsparc.coherent.phase import ranges, wave
-from gsparc.coherent.planes import Word, images
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, View, Visibility
+from gsparc.physics.mirror_planes import Word, images
+from gsparc.physics.waves import ranges, wave
 
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
 
@@ -30,7 +30,7 @@ class Scene:
 
     Attributes:
         transmitter: (3,) float64 [m], the word ().
-        planes: (P, 4) float64, see `gsparc.coherent.planes`.
+        planes: (P, 4) float64, see `gsparc.physics.mirror_planes`.
         words: K of them, the transmitter first.
         log_amplitude: (K,) float32, log s_k.
         log_noise: log of the noise variance, in units of the rows' power.

@@ -11,10 +11,10 @@ from torch import Tensor
 from gsparc.coherent.furniture.clutter import Screens
 from gsparc.coherent.furniture.paths import Unfolding
 from gsparc.coherent.inphase import PhasedPosterior, shares, stacked
-from gsparc.coherent.phase import ranges, wave_over_band
 from gsparc.coherent.process import Scene
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, matern32
+from gsparc.physics.waves import ranges, wave_over_band
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 

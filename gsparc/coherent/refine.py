@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gsparc.coherent.descent import descend
-from gsparc.coherent.planes import images
 from gsparc.coherent.process import JITTER, Factor, Posterior, Scene, add_covariance, correlations, steering
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, View
+from gsparc.physics.mirror_planes import images
 
 # Steps between two evaluations of the visibility: sources move millimetres, it varies in decimetres.
 REFRESH = 16

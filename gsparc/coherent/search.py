@@ -12,12 +12,12 @@ from torch import Tensor
 
 from gsparc.coherent.backprojection import Effort, pick_apart, score, search_box
 from gsparc.coherent.parsing import prune, respell, upright, vote, without_planes
-from gsparc.coherent.phase import LIGHT
-from gsparc.coherent.planes import Word, all_words, bisector, images, reflect
 from gsparc.coherent.process import Posterior, Scene, steering
 from gsparc.coherent.refine import learn_visibility, refine
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility
+from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
+from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
 

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from gsparc.coherent.descent import descend
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene, RealFactor, add_source, shares, stacked
-from gsparc.coherent.planes import images
 from gsparc.coherent.process import JITTER, correlations, steering
 from gsparc.coherent.refine import REFRESH, Pace, rates
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility, View
+from gsparc.physics.mirror_planes import images
 
 PHASE_PACE = 0.05  # [rad]
 

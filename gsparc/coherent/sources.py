@@ -17,8 +17,8 @@ from enum import StrEnum
 import torch
 from torch import Tensor
 
-from gsparc.coherent.phase import NEAR_M, ranges
 from gsparc.coherent.rows import Rows
+from gsparc.physics.waves import NEAR_M, ranges
 
 
 class SourceKind(StrEnum):

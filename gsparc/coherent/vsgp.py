@@ -20,7 +20,6 @@ from gsparc.coherent.frame import Frame, frame_of, refuse
 from gsparc.coherent.furniture.clutter import Clutter
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
 from gsparc.coherent.offsets import KINDS, Offsets, estimate
-from gsparc.coherent.phase import LIGHT, ranges, wave, wave_over_band
 from gsparc.coherent.process import Scene
 from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows, elements, gather, query_elements, tones_of
@@ -32,6 +31,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT, ranges, wave, wave_over_band
 
 log = logging.getLogger(__name__)
 

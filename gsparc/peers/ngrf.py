@@ -18,11 +18,11 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from gsparc.array.response import bartlett, normalised, steering
 from gsparc.data.schema import Kind
 from gsparc.ops import Pose
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.trained import TrainedPeer
+from gsparc.physics.array_response import bartlett, normalised, steering
 
 LIGHT = 299_792_458.0
 MARGIN = 3.0  # [m] around the moving end's box, where radiators start

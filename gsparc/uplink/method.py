@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitReport, Prediction
 from gsparc.methods.uplink_method import UplinkMethod
-from gsparc.uplink.atoms import Aperture, flat_places, mean_delay, phasor
+from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
 from gsparc.uplink.posterior import Sources
 from gsparc.uplink.search import SearchSettings, SourceSearch
 from gsparc.uplink.trust import Heard, Trust, learn, signs, unheard_noise

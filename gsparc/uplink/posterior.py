@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.uplink.atoms import Aperture, Columns, delays, steering
+from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.uplink.atoms import Aperture, Columns, delays, steering
+from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 from gsparc.uplink.posterior import Sources
 
 LEAST_SHARE = 1e-7  # of a snapshot's power that a source's prior keeps, so that nothing divides by zero

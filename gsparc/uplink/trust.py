@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.uplink.atoms import Aperture
+from gsparc.physics.plane_waves import Aperture
 from gsparc.uplink.posterior import Sources
 
 RIDGE = 1e-3

@@ -13,8 +13,6 @@ from known_arrays import array_site, measure, walk
 from gsparc.array.field import ArrayField
 from gsparc.array.packets import PacketSettings, WavePackets, distil
 from gsparc.array.process import Kernel, learn_process, mirror_elements, settle, twin
-from gsparc.array.render import SpectrumRenderer, spectra
-from gsparc.array.response import steering
 from gsparc.array.tuning import tune
 from gsparc.data.load import load, split_for
 from gsparc.data.rfid import planar_array
@@ -23,6 +21,8 @@ from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import method_class
 from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import steering
+from gsparc.physics.bartlett import SpectrumRenderer, spectra
 
 SMALL = PacketSettings(count=300, samples=1500)
 

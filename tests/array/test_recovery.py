@@ -12,10 +12,10 @@ from known_arrays import array_site, measure, room_vectors, walk
 from gsparc.array import store
 from gsparc.array.process import align, mirror_elements, twin
 from gsparc.array.recovery import recover
-from gsparc.array.render import spectra
 from gsparc.data.load import load
 from gsparc.data.rfid import planar_array
 from gsparc.ops import SphereGrid
+from gsparc.physics.bartlett import spectra
 
 
 def _agreement(found, truth, partner):

@@ -9,12 +9,12 @@ from boxes import ROOM, TRANSMITTER, room_of_spectra
 from scipy.optimize import nnls
 
 from gsparc.bearings.field import BearingField
-from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
 from gsparc.methods.gp import GaussianProcess
 from gsparc.ops import SphereGrid
+from gsparc.physics.lags import Lags
 from gsparc.simulate.shoebox import images
 from gsparc.trainer import TrainerSettings, Training
 

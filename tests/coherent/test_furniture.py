@@ -16,11 +16,11 @@ from gsparc.coherent.furniture.mirrors import find_mirrors, find_patch, walls
 from gsparc.coherent.furniture.paths import Unfolding
 from gsparc.coherent.furniture.residual import Residual
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
-from gsparc.coherent.planes import all_words
 from gsparc.coherent.process import Scene
 from gsparc.coherent.query import Query
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility
+from gsparc.physics.mirror_planes import all_words
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)

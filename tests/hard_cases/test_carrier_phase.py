@@ -1,6 +1,6 @@
 """Carrier phase: 2 pi f r / c in float32 is off by radians at hundreds of metres.
 
-Remedy: cycles are reduced in float64 before the cast (gsparc/coherent/phase.py; for the kernel of factored
+Remedy: cycles are reduced in float64 before the cast (gsparc/physics/waves.py; for the kernel of factored
 channels, csrc/channels.h, see tests/ops/test_channels.py). Shown: 10 km at 60 GHz within 1e-3 rad of rational
 arithmetic, forward, and the slope of the unreduced phase, backward.
 """
@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.coherent.phase import LIGHT, ranges, reduced_phase, wave, wave_over_band
+from gsparc.physics.waves import LIGHT, ranges, reduced_phase, wave, wave_over_band
 
 CARRIER = 60e9  # [Hz]
 FAR = [10_000.0, 9_999.123_456, 4_321.000_789, 777.7, 12.345]  # [m]

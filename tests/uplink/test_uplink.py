@@ -13,7 +13,7 @@ from gsparc.data.argos import load_argos
 from gsparc.methods import checkpoint
 from gsparc.methods.ridge import Ridge
 from gsparc.peers.fire import Fire
-from gsparc.uplink.atoms import Aperture, Columns, delays, steering
+from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 from gsparc.uplink.method import UplinkField
 from gsparc.uplink.posterior import Sources
 from gsparc.uplink.search import SearchSettings, SourceSearch

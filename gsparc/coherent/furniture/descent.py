@@ -16,8 +16,8 @@ from gsparc.coherent.furniture.clutter import SOFT, Clutter, shade
 from gsparc.coherent.furniture.paths import Paths
 from gsparc.coherent.furniture.residual import Residual
 from gsparc.coherent.inphase import PhasedScene
-from gsparc.coherent.planes import Word, images
 from gsparc.coherent.process import steering
+from gsparc.physics.mirror_planes import Word, images
 
 ALIKE = 0.7  # standard deviation of the sources' log amplitudes about their mean
 SLOWER = 0.97  # factor of all step sizes from step to step

@@ -18,11 +18,11 @@ from gsparc.coherent.furniture.descent import Accord, descend
 from gsparc.coherent.furniture.mirrors import SmallMirror, find_mirrors, find_patch, same_mirror, walls
 from gsparc.coherent.furniture.residual import Explained, Residual
 from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
-from gsparc.coherent.phase import LIGHT
-from gsparc.coherent.planes import Word, all_words, images
 from gsparc.coherent.process import JITTER, Scene, steering
 from gsparc.coherent.rows import Rows
 from gsparc.coherent.visibility import KernelVisibility
+from gsparc.physics.mirror_planes import Word, all_words, images
+from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
 

@@ -18,9 +18,9 @@ from gsparc.coherent.furniture.boxes import BLOCK, Evolution, evolve
 from gsparc.coherent.furniture.clutter import tangents, within
 from gsparc.coherent.furniture.paths import Paths
 from gsparc.coherent.furniture.residual import Explained
-from gsparc.coherent.phase import LIGHT, NEAR_M
-from gsparc.coherent.planes import Word, reflect
 from gsparc.coherent.rows import Rows
+from gsparc.physics.mirror_planes import Word, reflect
+from gsparc.physics.waves import LIGHT, NEAR_M
 
 log = logging.getLogger(__name__)
 

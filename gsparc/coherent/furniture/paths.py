@@ -13,7 +13,7 @@ from itertools import pairwise, permutations
 import torch
 from torch import Tensor
 
-from gsparc.coherent.planes import Word, images, reflect
+from gsparc.physics.mirror_planes import Word, images, reflect
 
 SAME_M = 0.05  # spellings whose images are closer are the same source
 EDGE = 1e-6  # a plane is met between both ends of a leg, give or take

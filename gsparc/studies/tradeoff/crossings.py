@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from gsparc.bearings.field import BearingField
-from gsparc.bearings.lags import Lags
 from gsparc.bearings.sources import bearings, mixed
 from gsparc.bearings.trend import Trend
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
+from gsparc.physics.lags import Lags
 from gsparc.studies.tradeoff.coarse import Filled, coarser
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import View

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsparc.array.field import ArrayField
 from gsparc.array.packets import WavePackets
-from gsparc.array.render import SpectrumRenderer
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method
+from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.studies.tradeoff.coarse import Filled, coarser
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import MeanOnly

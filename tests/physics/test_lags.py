@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.bearings.lags import Lags
 from gsparc.ops import SphereGrid
+from gsparc.physics.lags import Lags
 
 GRID, WAVELENGTH = SphereGrid.hemisphere(18, 72), 0.125
 ELEMENTS = np.stack(

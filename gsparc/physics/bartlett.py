@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.array.response import lags, steering
 from gsparc.data.schema import Site
+from gsparc.physics.array_response import lags, steering
 
 TINY = 1e-9  # of a squared spectrum: keeps the slope of the square root finite
 SILENT = 1e-9  # harmonics this much weaker than the strongest are none: float32 would not see them

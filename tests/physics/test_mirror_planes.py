@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from gsparc.coherent.parsing import respell, upright, vote
-from gsparc.coherent.planes import all_words, bisector, images, reflect
 from gsparc.coherent.process import Scene
+from gsparc.physics.mirror_planes import all_words, bisector, images, reflect
 
 WALLS = torch.tensor(
     [[1.0, 0, 0, 0], [2.0, 0, 0, 4.0], [0, 1, 0, 0], [0, 1, 0, 3.0]], dtype=torch.float64

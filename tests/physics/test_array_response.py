@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.array import response
 from gsparc.data.rfid import planar_array
 from gsparc.ops import SphereGrid
+from gsparc.physics import array_response
 from gsparc.simulate import rfid_sim
 
 WAVELENGTH = 0.3259
@@ -21,30 +21,30 @@ def _vectors(rows, elements, seed=0):
 
 def test_steering_is_the_simulators():
     grid, array = SphereGrid.hemisphere(6, 8), planar_array()
-    ours = response.steering(array, grid, WAVELENGTH)
+    ours = array_response.steering(array, grid, WAVELENGTH)
     np.testing.assert_allclose(ours.numpy(), rfid_sim.steering(array, grid, WAVELENGTH), atol=1e-6)
 
 
 @pytest.mark.parametrize("array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2])
 def test_squared_spectrum_is_linear_in_the_lags(array):
     grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
-    lags = response.lags(array, WAVELENGTH)
-    direct = response.bartlett(h, response.steering(array, grid, WAVELENGTH)) ** 2
+    lags = array_response.lags(array, WAVELENGTH)
+    direct = array_response.bartlett(h, array_response.steering(array, grid, WAVELENGTH)) ** 2
     torch.testing.assert_close(lags.of(h) @ lags.basis(grid, WAVELENGTH).T, direct)
     v = torch.cat([h.real, h.imag], 1)
     torch.testing.assert_close(torch.einsum("bi,kij,bj->bk", v, lags.forms(), v), lags.of(h))
 
 
 def test_a_square_array_has_49_lags():
-    assert response.lags(planar_array(), WAVELENGTH).count == 49
-    assert response.lags(planar_array(2, 3), WAVELENGTH).count == 15
+    assert array_response.lags(planar_array(), WAVELENGTH).count == 49
+    assert array_response.lags(planar_array(2, 3), WAVELENGTH).count == 15
 
 
 def test_array_output_is_the_weighted_sum_over_directions():
     grid, array = SphereGrid.hemisphere(4, 6), planar_array(2, 2)
     z = _vectors(1, 24).view(1, 4, 6)
-    pattern = response.element_pattern(grid, 1.5)
-    h = response.array_output(z, response.steering(array, grid, WAVELENGTH), grid, pattern)
+    pattern = array_response.element_pattern(grid, 1.5)
+    h = array_response.array_output(z, array_response.steering(array, grid, WAVELENGTH), grid, pattern)
     expected = torch.zeros(4, dtype=torch.complex128)
     for i in range(4):
         for j in range(6):
@@ -58,11 +58,11 @@ def test_array_output_is_the_weighted_sum_over_directions():
 @pytest.mark.parametrize("how", ["max", "minmax", "power", "none"])
 def test_slopes_through_the_array_and_the_normalisation(how):
     grid, array = SphereGrid.hemisphere(3, 4), planar_array(2, 2)
-    matrix = response.steering(array, grid, WAVELENGTH)
+    matrix = array_response.steering(array, grid, WAVELENGTH)
 
     def splat_then_array(real, imag):
-        h = response.array_output(torch.complex(real, imag), matrix, grid)
-        return response.normalised(response.bartlett(h, matrix), how)
+        h = array_response.array_output(torch.complex(real, imag), matrix, grid)
+        return array_response.normalised(array_response.bartlett(h, matrix), how)
 
     parts = [v.clone().requires_grad_() for v in torch.view_as_real(_vectors(2, 12).view(2, 3, 4)).unbind(-1)]
     assert torch.autograd.gradcheck(splat_then_array, parts)
@@ -71,18 +71,18 @@ def test_slopes_through_the_array_and_the_normalisation(how):
 def test_slope_where_the_spectrum_vanishes_is_zero_not_nan():
     matrix = torch.ones(2, 1, dtype=torch.complex128)
     h = torch.tensor([[1.0 + 0j, -1.0]], dtype=torch.complex128, requires_grad=True)
-    response.bartlett(h, matrix).sum().backward()
+    array_response.bartlett(h, matrix).sum().backward()
     assert torch.equal(h.grad, torch.zeros_like(h))
 
 
 def test_normalised_silence_is_finite():
     for how in ("max", "minmax", "power", "none"):
-        assert torch.isfinite(response.normalised(torch.zeros(1, 5), how)).all()
+        assert torch.isfinite(array_response.normalised(torch.zeros(1, 5), how)).all()
     with pytest.raises(ValueError, match="median"):
-        response.normalised(torch.zeros(1, 5), "median")
+        array_response.normalised(torch.zeros(1, 5), "median")
 
 
 def test_sites_without_an_array_are_named(campaign):
-    assert "no antenna array" in response.site_problem(campaign("spectrum", 4).site)
-    assert "csi" in response.site_problem(campaign("csi", 4).site)
-    assert "receiver moves" in response.site_problem(campaign("spectrum", 4, "tx").site)
+    assert "no antenna array" in array_response.site_problem(campaign("spectrum", 4).site)
+    assert "csi" in array_response.site_problem(campaign("csi", 4).site)
+    assert "receiver moves" in array_response.site_problem(campaign("spectrum", 4, "tx").site)
