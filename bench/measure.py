@@ -17,7 +17,7 @@ import torch
 from record import guarded, told
 from torch import Tensor
 
-from gsparc.losses import _Kernel, _Similarity, ssim
+from gsparc.field.losses import _Kernel, _Similarity, ssim
 from gsparc.ops import (
     Pose,
     SphereGrid,

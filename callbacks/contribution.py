@@ -8,8 +8,8 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc import surgery
-from gsparc.response import PathResponse
+from gsparc.field.gaussians import edit
+from gsparc.field.response import PathResponse
 
 log = logging.getLogger(__name__)
 
@@ -40,5 +40,5 @@ class ContributionPruning(L.Callback):
             if keep.all():
                 return
             none = torch.empty(0, dtype=torch.long)
-            surgery.apply(surgery.Edit(keep, none), model, model.gaussians, trainer.optimizers[0])
+            edit.apply(edit.Edit(keep, none), model, model.gaussians, trainer.optimizers[0])
         log.info("step %d: %d sources of %d stay", trainer.global_step, int(keep.sum()), len(keep))

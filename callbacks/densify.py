@@ -10,8 +10,8 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc import surgery
-from gsparc.model import GaussianModel
+from gsparc.field.gaussians import edit
+from gsparc.field.model import GaussianModel
 
 log = logging.getLogger(__name__)
 
@@ -87,11 +87,11 @@ class Densify(L.Callback):
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
             edit = self.plan(model, draws)
             before = len(model.gaussians)
-            surgery.apply(edit, model, model.gaussians, trainer.optimizers[0])
+            edit.apply(edit, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
         log.debug("step %d: %d -> %d Gaussians", step, before, len(model.gaussians))
 
-    def plan(self, model: GaussianModel, generator: torch.Generator) -> surgery.Edit:
+    def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
         field = model.gaussians
         mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
@@ -120,7 +120,7 @@ class Densify(L.Callback):
         )
         spread = _sample_inside(field.scales[splits], field.quats[splits], generator)
         means = torch.cat([field.means[clones], field.means[splits] + spread])
-        return surgery.Edit(
+        return edit.Edit(
             keep=~(prune | split),
             parents=parents,
             replace={"gaussians.means": means, "gaussians.log_scales": scales},

@@ -27,6 +27,7 @@ from gsparc.effects import (
     probe_array,
     probe_phase,
 )
+from gsparc.field.response import ResponseSettings
 from gsparc.hybrid import (
     Companion,
     Rest,
@@ -41,7 +42,6 @@ from gsparc.learned import LearnedField
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
-from gsparc.response import ResponseSettings
 from gsparc.trainer import Training
 
 log = logging.getLogger(__name__)

@@ -13,26 +13,25 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc import surgery
 from gsparc.budget import Pace
-from gsparc.confidence import Confidence, ConfidenceSettings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import Prior
-from gsparc.field import FieldSettings
+from gsparc.field.confidence import Confidence, ConfidenceSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import Prior
+from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
+from gsparc.field.gaussians import FieldSettings, edit
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.response import ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitReport, Method, Prediction
-from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import Pose
 from gsparc.resolve import Choices, resolve, settled
-from gsparc.response import ResponseSettings
 from gsparc.resume import GsparcCheckpointIO, interrupted
 from gsparc.schedule import OptimizerSettings
 from gsparc.start import prepare
 from gsparc.trainer import Training, run_stage
-from gsparc.view import FrozenArray, FrozenView, frozen_view
 
 log = logging.getLogger(__name__)
 
@@ -240,7 +239,7 @@ class LearnedField(Method):
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
         self.model = self._new_model(site, torch.zeros(1, 3))
-        surgery.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
+        edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
         self._frozen = None
 

@@ -10,12 +10,12 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc import surgery
 from gsparc.budget import Pace
-from gsparc.confidence import weighted
 from gsparc.data.schema import Batch
-from gsparc.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
-from gsparc.model import GaussianModel, Rendered
+from gsparc.field.confidence import weighted
+from gsparc.field.gaussians import edit
+from gsparc.field.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
+from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
 from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
 
@@ -138,7 +138,7 @@ class GaussianModule(L.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Make room for the checkpoint's number of Gaussians before its tensors arrive."""
         count = len(checkpoint["state_dict"]["model.gaussians.ids"])
-        surgery.resize(self.model, self.model.gaussians, count)
+        edit.resize(self.model, self.model.gaussians, count)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A poisoned state never replaces a good checkpoint."""
@@ -147,7 +147,7 @@ class GaussianModule(L.LightningModule):
 
     def _offender(self) -> str | None:
         """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
-        rows = surgery.row_parameters(self.model, len(self.model.gaussians))
+        rows = edit.row_parameters(self.model, len(self.model.gaussians))
         for name, parameter in self.model.named_parameters():
             bad = ~torch.isfinite(parameter)
             if not bad.any():

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gsparc.data.schema import Site
-from gsparc.model import ModelSettings
+from gsparc.field.model import ModelSettings
 
 AUTO = "auto"
 

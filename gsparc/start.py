@@ -17,9 +17,9 @@ from torch import Tensor
 from gsparc.array import start as through_array
 from gsparc.coherent import start as with_carrier
 from gsparc.data.schema import Measurements
-from gsparc.encoding import Prior
-from gsparc.losses import Snapshot
-from gsparc.model import GaussianModel, ModelSettings
+from gsparc.field.encoding import Prior
+from gsparc.field.losses import Snapshot
+from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
 from gsparc.resolve import Choices
 from gsparc.warmstart import learn_prior, warm_start

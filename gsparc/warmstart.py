@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.encoding import Prior
+from gsparc.field.encoding import Prior
+from gsparc.field.model import GaussianModel
 from gsparc.methods.gp import choose_kernel, principal_components
 from gsparc.methods.target_rows import training_targets
-from gsparc.model import GaussianModel
 from gsparc.ops import Pose
 
 IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular

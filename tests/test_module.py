@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.confidence import ConfidenceSettings, weighted
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
-from gsparc.model import GaussianModel, ModelSettings
+from gsparc.field.confidence import ConfidenceSettings, weighted
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import Pose
 from gsparc.schedule import OptimizerSettings

@@ -4,10 +4,10 @@ import dataclasses
 
 import pytest
 
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
-from gsparc.model import ModelSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import ModelSettings
 from gsparc.resolve import Choices, resolve, settled
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
-from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
 from gsparc.warmstart import learn_prior, warm_start
 

@@ -17,13 +17,13 @@ from gsparc.array.process import learn_process, mirror_elements
 from gsparc.array.store import recovered, report
 from gsparc.array.tuning import tune
 from gsparc.data.schema import Measurements
-from gsparc.encoding import Prior
 from gsparc.evaluation.baseline_cache import platform_cache
+from gsparc.field.encoding import Prior
+from gsparc.field.frozen import seen_by_array
+from gsparc.field.model import GaussianModel
 from gsparc.methods.target_rows import to_real, training_targets
-from gsparc.model import GaussianModel
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
-from gsparc.view import seen_by_array
 
 RIDGE = 1e-3  # of the strongest direction of G: how short emissions are
 LEAST_NOISE = 1e-3

@@ -21,9 +21,9 @@ from gsparc.coherent.visibility import matern32
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.encoding import Prior
-from gsparc.model import GaussianModel
-from gsparc.response import PathResponse
+from gsparc.field.encoding import Prior
+from gsparc.field.model import GaussianModel
+from gsparc.field.response import PathResponse
 
 ROWS = 1000  # receivers times tones the gains are solved on
 LENGTHS_M = (0.5, 1.0, 2.0, 4.0)  # over which gains may vary

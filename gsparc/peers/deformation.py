@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 
 def perceptron(inner: int, outer: int, width: int, depth: int, *, quiet: bool = False) -> nn.Sequential:

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.field import FieldSettings, GaussianField, initial_field
-from gsparc.model import FULL_SPHERE_ROWS
+from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
+from gsparc.field.model import FULL_SPHERE_ROWS
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
 from gsparc.peers.network import Scene
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops import Pose
 from gsparc.peers.deformation import perceptron
 from gsparc.peers.network import Network, Scene

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Site
-from gsparc.losses import channel_loss, spectrum_loss
+from gsparc.field.losses import channel_loss, spectrum_loss
 from gsparc.ops import Pose
 
 SSIM_WEIGHT = 0.2

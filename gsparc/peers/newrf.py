@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Kind, Measurements
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops import Pose
 from gsparc.peers.deformation import perceptron
 from gsparc.peers.directions import virtual_transmitters, votes

@@ -7,10 +7,10 @@ import torch
 
 from gsparc.callbacks import Densify
 from gsparc.callbacks.densify import _sample_inside
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
-from gsparc.model import GaussianModel, ModelSettings, Rendered
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import GaussianModel, ModelSettings, Rendered
 from gsparc.ops import Pose
 from gsparc.schedule import OptimizerSettings, optimizer_for
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gsparc.callbacks import OpacityReset
-from gsparc.field import GaussianField
+from gsparc.field.gaussians import GaussianField
 
 
 @pytest.fixture

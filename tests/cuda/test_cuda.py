@@ -9,7 +9,7 @@ import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
-from gsparc.losses import _Kernel, _Similarity
+from gsparc.field.losses import _Kernel, _Similarity
 from gsparc.ops import SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])

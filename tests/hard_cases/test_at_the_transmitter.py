@@ -9,10 +9,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
-from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
 
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))

@@ -10,8 +10,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.confidence import Confidence, ConfidenceSettings, weighted
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.confidence import Confidence, ConfidenceSettings, weighted
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 G = [-1e4, -100.0, -88.8, -10.0, -1.0, 0.0, 1.0, 10.0, 88.8, 100.0, 1e4]

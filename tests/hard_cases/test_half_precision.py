@@ -1,7 +1,7 @@
 """Half precision: 1 - 1e-6 rounds to 1; opacities, transmittances, logarithms and SSIM lose what they say.
 
 Remedy: features, confidence and the closed-form start compute in float32 whatever autocast says
-(gsparc/model.py, confidence.py, warmstart.py); float16 and bfloat16 tensors are refused at the rasterizer's
+(gsparc/field/model.py, confidence.py, warmstart.py); float16 and bfloat16 tensors are refused at the rasterizer's
 door. Shown: a run under bfloat16 autocast is finite and ends within 1 % of float32's error.
 """
 
@@ -14,7 +14,7 @@ from campaigns import brief, compose, spectra
 from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.data.load import load, split_for
-from gsparc.losses import spectrum_loss
+from gsparc.field.losses import spectrum_loss
 from gsparc.methods.registry import build
 from gsparc.trainer import TrainerSettings, Training
 

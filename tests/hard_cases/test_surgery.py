@@ -1,6 +1,6 @@
 """Surgery: clone, split, prune and reset desynchronise parameters, moments and counters.
 
-Remedy: one place edits them all (gsparc/surgery.py). Shown: after any sequence shapes agree, moments are
+Remedy: one place edits them all (gsparc/field/edit.py). Shown: after any sequence shapes agree, moments are
 finite, untouched rows are bit-identical in everything, ids are permanent and unique. Tolerance: none.
 """
 
@@ -21,15 +21,15 @@ from ledger import LEDGER
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Site
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
+from gsparc.field.edit import row_parameters
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.methods.registry import build
-from gsparc.model import GaussianModel, ModelSettings
 from gsparc.module import NonFiniteLoss
 from gsparc.ops import Pose, SphereGrid
 from gsparc.schedule import OptimizerSettings, optimizer_for
-from gsparc.surgery import row_parameters
 from gsparc.trainer import TrainerSettings, Training
 
 SITE = Site(

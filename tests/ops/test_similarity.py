@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.library import opcheck
 
-from gsparc.losses import _Kernel, _Similarity
+from gsparc.field.losses import _Kernel, _Similarity
 from gsparc.ops import _native, backends
 from gsparc.ops.similarity import similarity_op
 

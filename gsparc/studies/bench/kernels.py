@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsparc.field.frozen import frozen_view
 from gsparc.ops import composite, freeze, marks, mean_weights
 from gsparc.ops.geometry import Pose
 from gsparc.studies.bench.case import Call, Case, Work, size
 from gsparc.studies.bench.scene import COMPLEX, GRID, Scene, places, receiver, receivers
-from gsparc.view import frozen_view
 
 REFERENCE_BYTES = 3 * 2**30  # of one forward pass in dense tensors
 DENSE_TENSORS = 12  # (N, H W) tensors alive at once in the reference

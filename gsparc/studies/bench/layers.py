@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from gsparc.emission import Emission, EmissionSettings
-from gsparc.losses import spectrum_loss
+from gsparc.field.emission import Emission, EmissionSettings
+from gsparc.field.losses import spectrum_loss
 from gsparc.ops import mean_weights
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings, GaussianField
-from gsparc.model import GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings, GaussianField
+from gsparc.field.model import GaussianModel, ModelSettings, RasterSettings
 from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, make_plan
 from gsparc.ops.settings import IMAGE_CUTOFF, Projection
 

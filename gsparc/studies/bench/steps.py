@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.losses import spectrum_loss
-from gsparc.model import GaussianModel
+from gsparc.field.losses import spectrum_loss
+from gsparc.field.model import GaussianModel
 from gsparc.ops import Pose, composite
 from gsparc.ops.settings import Projection
 from gsparc.schedule import OptimizerSettings, optimizer_for

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc import surgery
 from gsparc.data.schema import Measurements
+from gsparc.field.gaussians import edit
+from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.learned import LearnedField
 from gsparc.methods.method import Method, Prediction
-from gsparc.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.ops import Pose, SphereGrid, mean_weights
 from gsparc.studies.tradeoff.coarse import Filled, coarser
 from gsparc.studies.tradeoff.points import Settings
@@ -127,7 +127,7 @@ class Live(View):
 def _keep(model: GaussianModel, rows: Tensor) -> None:
     keep = torch.zeros(len(model.gaussians), dtype=torch.bool)
     keep[rows] = True
-    surgery.apply(surgery.Edit(keep, torch.zeros(0, dtype=torch.long)), model, model.gaussians)
+    edit.apply(edit.Edit(keep, torch.zeros(0, dtype=torch.long)), model, model.gaussians)
 
 
 def spread(model: GaussianModel, measured: dict[str, Tensor]) -> Tensor:

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.emission import EmissionSettings
-from gsparc.encoding import EncodingSettings
-from gsparc.field import FieldSettings
-from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.frozen import frozen_view
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.ops import Pose, StalePlan
-from gsparc.view import frozen_view
 
 RAW = EncodingSettings("raw")
 LINEAR = EmissionSettings(RAW, hidden=3, activation="linear", log_distance=False)

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsparc.encoding import EncodingSettings, PositionEncoding, Prior
+from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 2.0, 1.0]])
 

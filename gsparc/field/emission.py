@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops.networks import networks
 
 EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import torch
 
-from gsparc.confidence import Confidence, ConfidenceSettings, weighted
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.confidence import Confidence, ConfidenceSettings, weighted
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 

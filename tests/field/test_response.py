@@ -19,14 +19,14 @@ from gsparc.callbacks import ContributionPruning
 from gsparc.data.load import load as load_data
 from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
+from gsparc.field.frozen import frozen_view
+from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
 from gsparc.physics.bartlett import spectra
-from gsparc.response import ArrayResponse, ChannelResponse, PathResponse
 from gsparc.simulate.shoebox import LIGHT
 from gsparc.trainer import TrainerSettings, Training
-from gsparc.view import frozen_view
 
 GRID = SphereGrid.hemisphere(8, 16)
 
@@ -221,11 +221,11 @@ def _pose() -> Pose:
 
 
 def _splatted(hidden: int = 0):
-    from gsparc.emission import EmissionSettings
-    from gsparc.encoding import EncodingSettings
-    from gsparc.field import FieldSettings
-    from gsparc.model import AttenuationSettings, GaussianModel, ModelSettings
-    from gsparc.response import ResponseSettings
+    from gsparc.field.emission import EmissionSettings
+    from gsparc.field.encoding import EncodingSettings
+    from gsparc.field.gaussians import FieldSettings
+    from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
+    from gsparc.field.response import ResponseSettings
 
     torch.manual_seed(0)
     settings = ModelSettings(

@@ -2,9 +2,8 @@ from __future__ import annotations
 
 import torch
 
-from gsparc import surgery
-from gsparc.field import GaussianField
-from gsparc.surgery import Edit, resize, row_parameters
+from gsparc.field.edit import Edit, resize, row_parameters
+from gsparc.field.gaussians import GaussianField, edit
 
 
 class Root(torch.nn.Module):
@@ -43,9 +42,7 @@ def test_one_edit_moves_everything_together():
     keep = torch.tensor([True, False, True, True, False, True])
     replace = {"gaussians.means": torch.full((2, 3), 9.0)}
     counted = {"seen": torch.arange(6.0)}
-    edited = surgery.apply(
-        Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer, counted
-    )
+    edited = edit.apply(Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer, counted)
     for name, parameter in row_parameters(root, 6).items():
         assert torch.equal(parameter[:4], rows[name][keep])
         wanted = replace.get(name, rows[name][[1, 3]])
@@ -63,9 +60,7 @@ def test_one_edit_moves_everything_together():
 def test_the_optimizer_goes_on_after_an_edit():
     root = Root()
     optimizer = stepped(root)
-    surgery.apply(
-        Edit(torch.tensor([True] * 5 + [False]), torch.tensor([0])), root, root.gaussians, optimizer
-    )
+    edit.apply(Edit(torch.tensor([True] * 5 + [False]), torch.tensor([0])), root, root.gaussians, optimizer)
     before = root.gaussians.means.detach().clone()
     optimizer.zero_grad()
     sum(p.square().sum() for p in root.parameters()).backward()
@@ -76,7 +71,7 @@ def test_the_optimizer_goes_on_after_an_edit():
 def test_an_edit_before_the_first_step_has_no_moments_to_move():
     root = Root()
     optimizer = torch.optim.Adam([{"params": [p]} for p in root.parameters()])
-    surgery.apply(Edit(torch.zeros(6, dtype=torch.bool), torch.tensor([0])), root, root.gaussians, optimizer)
+    edit.apply(Edit(torch.zeros(6, dtype=torch.bool), torch.tensor([0])), root, root.gaussians, optimizer)
     assert len(root.gaussians) == 1 and root.gaussians.ids.tolist() == [6]
     held = {id(group["params"][0]) for group in optimizer.param_groups}
     assert held == {id(p) for p in root.parameters()}

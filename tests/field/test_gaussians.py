@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.field import FieldSettings, GaussianField, initial_field
+from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 
 BOX = torch.tensor([[-1.0, -2.0, 0.0], [1.0, 2.0, 1.0]])
 RECEIVER = torch.tensor([3.0, 0.0, 1.0])

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc import surgery
-from gsparc.model import GaussianModel
+from gsparc.field.gaussians import edit
+from gsparc.field.model import GaussianModel
+from gsparc.field.response import ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan
-from gsparc.response import ArrayResponse
 
 AT_ONCE = 128  # single Gaussians whose views are in memory on the way to a small matrix
 
@@ -92,7 +92,7 @@ def _only(rows: Tensor, model: GaussianModel) -> GaussianModel:
     """A copy with these Gaussians alone, in this order."""
     copy = deepcopy(model)
     nobody = torch.zeros(len(model.gaussians), dtype=torch.bool, device=rows.device)
-    surgery.apply(surgery.Edit(nobody, rows), copy, copy.gaussians)
+    edit.apply(edit.Edit(nobody, rows), copy, copy.gaussians)
     return copy
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from gsparc.field import GaussianField
+from gsparc.field.gaussians import GaussianField
 
 
 @dataclass(frozen=True)

@@ -5,8 +5,8 @@ import dataclasses
 import pytest
 import torch
 
-from gsparc.emission import Emission, EmissionSettings
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.emission import Emission, EmissionSettings
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 BOX = torch.tensor([[-1.0] * 3, [1.0] * 3])
 ENCODING = EncodingSettings("fourier", octaves=2)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from gsparc.encoding import EncodingSettings, PositionEncoding
+from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gsparc.confidence import Confidence, ConfidenceSettings
 from gsparc.data.schema import Site
-from gsparc.emission import Emission, EmissionSettings
-from gsparc.encoding import PositionEncoding, Prior
-from gsparc.field import FieldSettings, GaussianField, initial_field
+from gsparc.field.confidence import Confidence, ConfidenceSettings
+from gsparc.field.emission import Emission, EmissionSettings
+from gsparc.field.encoding import PositionEncoding, Prior
+from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
+from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
 from gsparc.ops import (
     Cutoff,
     FrozenPlan,
@@ -27,7 +28,6 @@ from gsparc.ops import (
     make_plan,
     mean_weights,
 )
-from gsparc.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 

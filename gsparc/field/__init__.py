@@ -1,0 +1,1 @@
+"""The Gaussian field: parameters, emission, encoding, coherent terms, losses, edits, frozen queries."""
