@@ -23,12 +23,12 @@ import lightning.pytorch as L
 import torch
 from hydra import compose, initialize_config_module
 
-from gsparc import trainer
 from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold
 from gsparc.methods.registry import build
-from gsparc.module import GaussianModule
-from gsparc.trainer import Training
+from gsparc.training import fit
+from gsparc.training.fit import Training
+from gsparc.training.lightning_module import GaussianModule
 
 STEPS, TURNS = 40, 4
 
@@ -66,8 +66,8 @@ class Steps:
     def under_lightning(self, log_every: int) -> tuple[float, GaussianModule]:
         """Milliseconds of a step, and the module."""
         method, watch = build(self.config.model), Watch()
-        settings = trainer.TrainerSettings(max_steps=STEPS, val_every=STEPS, checkpoint_every=10 * STEPS)
-        trainer.LOG_EVERY = log_every
+        settings = fit.TrainerSettings(max_steps=STEPS, val_every=STEPS, checkpoint_every=10 * STEPS)
+        fit.LOG_EVERY = log_every
         method.training = Training(settings, callbacks=lambda: [watch])
         with tempfile.TemporaryDirectory() as folder:
             method.fit(self.data, self.fold, Path(folder))

@@ -38,11 +38,11 @@ from gsparc.hybrid import (
     searched_beyond,
     weight_of,
 )
-from gsparc.learned import LearnedField
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.ops import Pose
-from gsparc.trainer import Training
+from gsparc.training.fit import Training
+from gsparc.training.splatting import LearnedField
 
 log = logging.getLogger(__name__)
 

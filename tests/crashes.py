@@ -17,7 +17,7 @@ from ledger import LEDGER
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["crashes", "campaigns", "gsparc.studies.train", "gsparc.learned", "gsparc.callbacks"]
+    ["crashes", "campaigns", "gsparc.studies.train", "gsparc.training.splatting", "gsparc.callbacks"]
 )
 
 

@@ -28,7 +28,7 @@ from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import FitReport, Prediction
 from gsparc.methods.target_rows import to_real
 from gsparc.physics.lags import BLOCK, Lags
-from gsparc.trainer import Training
+from gsparc.training.fit import Training
 
 log = logging.getLogger(__name__)
 

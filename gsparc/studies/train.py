@@ -26,7 +26,7 @@ from gsparc.methods import checkpoint
 from gsparc.methods.method import Method
 from gsparc.methods.registry import build
 from gsparc.studies import cli, limits
-from gsparc.trainer import Training
+from gsparc.training.fit import Training
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ from campaigns import compose
 
 from gsparc.data.splits import Fold
 from gsparc.methods.registry import build
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
 
 
 def _trained(data, fold, folder, *overrides: str, steps: int = 10):

@@ -16,7 +16,7 @@ from gsparc.methods.gp import GaussianProcess
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 from gsparc.simulate.shoebox import images
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
 
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
 

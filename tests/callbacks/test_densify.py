@@ -12,7 +12,7 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings, Rendered
 from gsparc.ops import Pose
-from gsparc.schedule import OptimizerSettings, optimizer_for
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 

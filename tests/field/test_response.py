@@ -26,7 +26,7 @@ from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
 from gsparc.physics.bartlett import spectra
 from gsparc.simulate.shoebox import LIGHT
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
 
 GRID = SphereGrid.hemisphere(8, 16)
 

@@ -16,7 +16,7 @@ from rasters import GRIDS, origin, random_scene, render
 from gsparc.data.load import load, split_for
 from gsparc.field.losses import spectrum_loss
 from gsparc.methods.registry import build
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

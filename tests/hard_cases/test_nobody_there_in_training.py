@@ -16,7 +16,7 @@ from campaigns import brief, channels, compose, powers, spectra
 from gsparc.data.load import load, split_for
 from gsparc.methods.registry import build
 from gsparc.studies.train import train
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
 
 PRUNE = (
     "callbacks=densify",

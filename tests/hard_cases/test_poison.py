@@ -16,12 +16,12 @@ import torch
 from campaigns import brief, compose, spectra
 from rasters import GRIDS, origin, random_scene, render
 
-from gsparc.learned import LearnedField
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
-from gsparc.module import NonFiniteLoss
 from gsparc.ops.settings import FARTHEST, WIDEST
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
+from gsparc.training.lightning_module import NonFiniteLoss
+from gsparc.training.splatting import LearnedField
 
 
 class Spoil(L.Callback):

@@ -27,10 +27,10 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.methods.registry import build
-from gsparc.module import NonFiniteLoss
 from gsparc.ops import Pose, SphereGrid
-from gsparc.schedule import OptimizerSettings, optimizer_for
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
+from gsparc.training.lightning_module import NonFiniteLoss
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 SITE = Site(
     name="toy",

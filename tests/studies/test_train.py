@@ -16,10 +16,10 @@ from campaigns import brief, channels, compose, powers, spectra
 from omegaconf import open_dict
 
 import gsparc
-from gsparc.learned import LearnedField
 from gsparc.methods import checkpoint
 from gsparc.studies import evaluate
 from gsparc.studies.train import Objects, train
+from gsparc.training.splatting import LearnedField
 
 ROOT = Path(__file__).parents[2]
 CONTRACT = {  # what scripts read of a summary

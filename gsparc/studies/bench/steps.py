@@ -9,9 +9,9 @@ from gsparc.field.losses import spectrum_loss
 from gsparc.field.model import GaussianModel
 from gsparc.ops import Pose, composite
 from gsparc.ops.settings import Projection
-from gsparc.schedule import OptimizerSettings, optimizer_for
 from gsparc.studies.bench.case import Call, Case, Work
 from gsparc.studies.bench.scene import GRID, places, receiver, scene
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
 COUNT, BATCH = 100, 16  # as many Gaussians as the dense tensors of plain PyTorch leave memory for
 

@@ -27,7 +27,7 @@ from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
 from gsparc.methods.timing import machine_facts
 from gsparc.studies.compare.cells import Cell, Contender, key
-from gsparc.trainer import Training
+from gsparc.training.fit import Training
 
 log = logging.getLogger(__name__)
 

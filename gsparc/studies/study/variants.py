@@ -18,7 +18,7 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import Method
 from gsparc.methods.registry import build, method_class
 from gsparc.studies import limits
-from gsparc.trainer import Training
+from gsparc.training.fit import Training
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ FAMILIES = {  # the most special class first
     "gsparc.bearings.field.BearingField": "gsparc.studies.tradeoff.crossings",
     "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.studies.tradeoff.sources",
     "gsparc.methods.gp.GaussianProcess": "gsparc.studies.tradeoff.components",
-    "gsparc.learned.LearnedField": "gsparc.studies.tradeoff.splatted",
+    "gsparc.training.splatting.LearnedField": "gsparc.studies.tradeoff.splatted",
 }
 AS_TRAINED = {
     "keep": 1.0,

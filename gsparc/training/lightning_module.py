@@ -10,14 +10,14 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc.budget import Pace
 from gsparc.data.schema import Batch
 from gsparc.field.confidence import weighted
 from gsparc.field.gaussians import edit
 from gsparc.field.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian
-from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
+from gsparc.training.time_budget import Pace
 
 
 @dataclass(frozen=True)

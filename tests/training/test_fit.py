@@ -10,7 +10,7 @@ from campaigns import brief, compose, spectra
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
 
 
 class Interrupt(L.Callback):

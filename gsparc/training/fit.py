@@ -17,11 +17,11 @@ import lightning.pytorch as L
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.io import CheckpointIO
 
-from gsparc.budget import Budget, Stretched
 from gsparc.data.datamodule import MeasurementsModule
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.module import GaussianModule
+from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.time_budget import Budget, Stretched
 
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 

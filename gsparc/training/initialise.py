@@ -1,6 +1,6 @@
 """What gradient training begins with: features of the emission, places of Gaussians, weights in closed form.
 
-Which start a field takes follows from its target: images (`gsparc.warmstart`), vectors of an array
+Which start a field takes follows from its target: images (`gsparc.training.closed_form`), vectors of an array
 (`gsparc.array.start`) or sources with carrier phase (`gsparc.coherent.start`).
 """
 
@@ -21,8 +21,8 @@ from gsparc.field.encoding import Prior
 from gsparc.field.losses import Snapshot
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
-from gsparc.resolve import Choices
-from gsparc.warmstart import learn_prior, warm_start
+from gsparc.training.auto_settings import Choices
+from gsparc.training.closed_form import learn_prior, warm_start
 
 UNIFORM_GAINS = with_carrier.Gains(length=2.0, constant=0.8, noise=0.1)
 

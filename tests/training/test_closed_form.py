@@ -11,7 +11,7 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
-from gsparc.warmstart import learn_prior, warm_start
+from gsparc.training.closed_form import learn_prior, warm_start
 
 KERNEL = EmissionSettings(EncodingSettings("kernel"), hidden=0, activation="linear", log_distance=False)
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))

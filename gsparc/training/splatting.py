@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.budget import Pace
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.confidence import Confidence, ConfidenceSettings
@@ -25,13 +24,14 @@ from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitReport, Method, Prediction
-from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import Pose
-from gsparc.resolve import Choices, resolve, settled
-from gsparc.resume import GsparcCheckpointIO, interrupted
-from gsparc.schedule import OptimizerSettings
-from gsparc.start import prepare
-from gsparc.trainer import Training, run_stage
+from gsparc.training.auto_settings import Choices, resolve, settled
+from gsparc.training.checkpoint_io import GsparcCheckpointIO, interrupted
+from gsparc.training.fit import Training, run_stage
+from gsparc.training.initialise import prepare
+from gsparc.training.lightning_module import GaussianModule, LossSettings
+from gsparc.training.optimizer import OptimizerSettings
+from gsparc.training.time_budget import Pace
 
 log = logging.getLogger(__name__)
 

@@ -8,11 +8,11 @@ import pytest
 from campaigns import brief, compose, spectra
 from torch import nn
 
-from gsparc import budget
-from gsparc.budget import Budget, Pace, Stretched
-from gsparc.schedule import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.studies.train import train
-from gsparc.trainer import TrainerSettings
+from gsparc.training import time_budget
+from gsparc.training.fit import TrainerSettings
+from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
+from gsparc.training.time_budget import Budget, Pace, Stretched
 
 
 def test_a_schedule_of_steps_is_stretched_over_the_seconds():
@@ -64,7 +64,7 @@ def test_callbacks_see_the_step_of_the_schedule():
 
 def test_validation_is_not_billed_and_a_resumed_run_has_the_rest(monkeypatch):
     now = SimpleNamespace(value=50.0)
-    monkeypatch.setattr(budget.time, "perf_counter", lambda: now.value)
+    monkeypatch.setattr(time_budget.time, "perf_counter", lambda: now.value)
     trainer = SimpleNamespace(should_stop=False, state=SimpleNamespace(fn="fit"))
     watch = Budget(Pace(100, 10.0))
     watch.on_train_start(trainer, None)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.schedule import OptimizerSettings, kind_of, optimizer_for, rate_factor, scheduler_for
+from gsparc.training.optimizer import OptimizerSettings, kind_of, optimizer_for, rate_factor, scheduler_for
 
 SETTINGS = OptimizerSettings(positions=1e-3, positions_final=1e-5, decay=0.1)
 

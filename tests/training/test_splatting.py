@@ -11,11 +11,11 @@ from omegaconf import OmegaConf
 from gsparc import load
 from gsparc.data.load import load as load_data
 from gsparc.data.load import split_for
-from gsparc.learned import QUERY_CHUNK, LearnedField
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
 from gsparc.ops import Pose
-from gsparc.trainer import TrainerSettings, Training
+from gsparc.training.fit import TrainerSettings, Training
+from gsparc.training.splatting import QUERY_CHUNK, LearnedField
 
 
 def learned(file, *more: str, steps: int = 15) -> LearnedField:

@@ -9,7 +9,7 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
-from gsparc.budget import Pace
+from gsparc.training.time_budget import Pace
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,9 @@ def kind_of(name: str) -> str:
     for prefix, kind in KINDS.items():
         if name == prefix or name.startswith(prefix + "."):
             return kind
-    raise KeyError(f"no learning rate is declared for parameter {name!r}: add it to gsparc.schedule.KINDS")
+    raise KeyError(
+        f"no learning rate is declared for parameter {name!r}: add it to gsparc.training.optimizer.KINDS"
+    )
 
 
 def optimizer_for(model: nn.Module, settings: OptimizerSettings) -> Adam:

@@ -8,7 +8,7 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import ModelSettings
-from gsparc.resolve import Choices, resolve, settled
+from gsparc.training.auto_settings import Choices, resolve, settled
 
 
 def open_settings(hidden: int = 0, **more) -> ModelSettings:

@@ -11,9 +11,9 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.module import GaussianModule, LossSettings
 from gsparc.ops import Pose
-from gsparc.schedule import OptimizerSettings
+from gsparc.training.lightning_module import GaussianModule, LossSettings
+from gsparc.training.optimizer import OptimizerSettings
 
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 
