@@ -11,7 +11,7 @@ from typing import Any
 
 from torch import Tensor
 
-from gsparc.bearings.field import BearingField
+from gsparc.array.moving.method import BearingField
 from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site

@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gsparc.array.recovery import recover
-from gsparc.bearings.field import POOR, beyond, site_problem
+from gsparc.array.moving.method import POOR, beyond, site_problem
+from gsparc.array.phase_retrieval import recover
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import Method

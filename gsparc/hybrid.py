@@ -23,8 +23,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.field import ArrayField
-from gsparc.array.tuning import LeftOut, without
+from gsparc.array.cross_validation import LeftOut, without
+from gsparc.array.method import ArrayField
 from gsparc.coherent.complex_gp import ComplexGP
 from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP

@@ -10,7 +10,7 @@ from boxes import room_of_spectra
 from known_arrays import array_site, measure, room_vectors
 from rooms import directed
 
-from gsparc.array.field import ArrayField
+from gsparc.array.method import ArrayField
 from gsparc.data.rfid import load_rfid, planar_array
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold

@@ -12,7 +12,7 @@ from campaigns import compose
 from invented import invent
 from rooms import directed, nmse, rough, shoebox
 
-from gsparc.array.tuning import LeftOut
+from gsparc.array.cross_validation import LeftOut
 from gsparc.coherent.directed import DirectedSources
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load

@@ -31,8 +31,8 @@ METHODS = {
     "complex_gp": "gsparc.coherent.complex_gp.ComplexGP",
     "vsgp": "gsparc.coherent.vsgp.VirtualSourceGP",
     "directed": "gsparc.coherent.directed.DirectedSources",
-    "array": "gsparc.array.field.ArrayField",
-    "bearings": "gsparc.bearings.field.BearingField",
+    "array": "gsparc.array.method.ArrayField",
+    "bearings": "gsparc.array.moving.method.BearingField",
     "gsparc": "gsparc.best.Gsparc",
 }
 

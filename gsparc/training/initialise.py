@@ -1,7 +1,7 @@
 """What gradient training begins with: features of the emission, places of Gaussians, weights in closed form.
 
 Which start a field takes follows from its target: images (`gsparc.training.closed_form`), vectors of an array
-(`gsparc.array.start`) or sources with carrier phase (`gsparc.coherent.start`).
+(`gsparc.array.splat_init`) or sources with carrier phase (`gsparc.coherent.start`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
-from gsparc.array import start as through_array
+from gsparc.array import splat_init as through_array
 from gsparc.coherent import start as with_carrier
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.bearings.field import BearingField
-from gsparc.bearings.sources import bearings, mixed
-from gsparc.bearings.trend import Trend
+from gsparc.array.moving.method import BearingField
+from gsparc.array.moving.power_gp import Trend
+from gsparc.array.moving.triangulate import bearings, mixed
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.target_rows import from_real

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.field import ArrayField
-from gsparc.array.packets import WavePackets
+from gsparc.array.method import ArrayField
+from gsparc.array.wave_packets import WavePackets
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method
 from gsparc.physics.bartlett import SpectrumRenderer

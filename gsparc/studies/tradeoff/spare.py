@@ -25,8 +25,8 @@ from gsparc.studies.tradeoff.view import View
 log = logging.getLogger(__name__)
 
 FAMILIES = {  # the most special class first
-    "gsparc.array.field.ArrayField": "gsparc.studies.tradeoff.packets",
-    "gsparc.bearings.field.BearingField": "gsparc.studies.tradeoff.crossings",
+    "gsparc.array.method.ArrayField": "gsparc.studies.tradeoff.packets",
+    "gsparc.array.moving.method.BearingField": "gsparc.studies.tradeoff.crossings",
     "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.studies.tradeoff.sources",
     "gsparc.methods.gp.GaussianProcess": "gsparc.studies.tradeoff.components",
     "gsparc.training.splatting.LearnedField": "gsparc.studies.tradeoff.splatted",

@@ -12,10 +12,10 @@ import torch
 from boxes import room_of_spectra
 from campaigns import brief, channels, compose
 
-from gsparc.array.field import ArrayField
-from gsparc.array.packets import PacketSettings
-from gsparc.bearings.field import BearingField
-from gsparc.bearings.sources import SearchSettings
+from gsparc.array.method import ArrayField
+from gsparc.array.moving.method import BearingField
+from gsparc.array.moving.triangulate import SearchSettings
+from gsparc.array.wave_packets import PacketSettings
 from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load
 from gsparc.data.splits import Fold

@@ -10,10 +10,10 @@ import pytest
 import torch
 from known_arrays import array_site, measure, walk
 
-from gsparc.array.field import ArrayField
-from gsparc.array.packets import PacketSettings, WavePackets, distil
-from gsparc.array.process import Kernel, learn_process, mirror_elements, settle, twin
-from gsparc.array.tuning import tune
+from gsparc.array.cross_validation import tune
+from gsparc.array.method import ArrayField
+from gsparc.array.vector_gp import Kernel, learn_process, mirror_elements, settle, twin
+from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.load import load, split_for
 from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold, Split, indices_hash
@@ -127,14 +127,14 @@ def test_settling_undoes_phases_and_twins(known_campaign):
 
 def test_leave_out_with_gaps_equals_refitting(known_campaign):
     """The small systems of the tuning give what a process without those samples gives."""
-    from gsparc.array import tuning
+    from gsparc.array import cross_validation
 
     data, truth = known_campaign
     x, v = data.tx[:30], truth[:30] / np.linalg.norm(truth[:30], axis=1, keepdims=True)
     kernel = Kernel(0.15, 0.01)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
-    looks = tuning._Looks(
+    looks = cross_validation._Looks(
         x, np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
     )
     left, drawn = looks.predictions(kernel, np.linalg.inv(kernel.gram(x)), v)

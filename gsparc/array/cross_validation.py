@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.array.process import Kernel, align, settle
+from gsparc.array.vector_gp import Kernel, align, settle
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths
 PIXELS = 600  # drawn from the grid

@@ -17,10 +17,10 @@ import torch
 from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
-from gsparc.bearings.compress import components
-from gsparc.bearings.doubt import Doubt, Looks, learn_doubt
-from gsparc.bearings.sources import SearchSettings, bearings, find_sources, mixed, powers
-from gsparc.bearings.trend import Trend, TrendSettings, learn_trend
+from gsparc.array.moving.compress import components
+from gsparc.array.moving.error_model import Doubt, Looks, learn_doubt
+from gsparc.array.moving.power_gp import Trend, TrendSettings, learn_trend
+from gsparc.array.moving.triangulate import SearchSettings, bearings, find_sources, mixed, powers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import Kernel, choose_kernel

@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 from torch import Tensor, nn
 
-from gsparc.array.process import VectorProcess
+from gsparc.array.vector_gp import VectorProcess
 
 MOST_PACKETS = 2048
 FEWEST_PACKETS = 256

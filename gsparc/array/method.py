@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.packets import PacketSettings, WavePackets, distil
-from gsparc.array.process import learn_process, mirror_elements
-from gsparc.array.store import recovered, report
-from gsparc.array.tuning import LEAST_LEFT, LeftOut, tune
+from gsparc.array.cross_validation import LEAST_LEFT, LeftOut, tune
+from gsparc.array.vector_cache import recovered, report
+from gsparc.array.vector_gp import learn_process, mirror_elements
+from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.evaluation.baseline_cache import platform_cache

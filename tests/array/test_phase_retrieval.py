@@ -9,9 +9,9 @@ import pytest
 import torch
 from known_arrays import array_site, measure, room_vectors, walk
 
-from gsparc.array import store
-from gsparc.array.process import align, mirror_elements, twin
-from gsparc.array.recovery import recover
+from gsparc.array import vector_cache
+from gsparc.array.phase_retrieval import recover
+from gsparc.array.vector_gp import align, mirror_elements, twin
 from gsparc.data.load import load
 from gsparc.data.rfid import planar_array
 from gsparc.ops import SphereGrid
@@ -90,20 +90,20 @@ def test_mirror_elements():
 def test_only_asked_rows_are_recovered_and_kept(known_campaign, tmp_path, monkeypatch):
     data, _ = known_campaign
     asked = []
-    inner = store.recover
-    monkeypatch.setattr(store, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
-    first, seconds = store.recovered(data, np.arange(10), tmp_path)
-    again, later = store.recovered(data, np.arange(5, 15), tmp_path)
+    inner = vector_cache.recover
+    monkeypatch.setattr(vector_cache, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
+    first, seconds = vector_cache.recovered(data, np.arange(10), tmp_path)
+    again, later = vector_cache.recovered(data, np.arange(5, 15), tmp_path)
     assert asked == [10, 5] and seconds > 0 and later > seconds / 2
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
     other = replace(data, site=replace(data.site, sha256="another"))
-    store.recovered(other, np.arange(3), tmp_path)
+    vector_cache.recovered(other, np.arange(3), tmp_path)
     assert asked == [10, 5, 3]
 
 
 def test_an_interrupted_recovery_goes_on(known_campaign, tmp_path, monkeypatch):
     data, _ = known_campaign
-    asked, whole = [], store.recover
+    asked, whole = [], vector_cache.recover
 
     def interrupted(site, images, places, seed):
         asked.append(len(places))
@@ -111,20 +111,20 @@ def test_an_interrupted_recovery_goes_on(known_campaign, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return whole(site, images, places, seed)
 
-    monkeypatch.setattr(store, "AT_ONCE", 5)
-    monkeypatch.setattr(store, "recover", interrupted)
+    monkeypatch.setattr(vector_cache, "AT_ONCE", 5)
+    monkeypatch.setattr(vector_cache, "recover", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        store.recovered(data, np.arange(20), tmp_path)
-    found, _ = store.recovered(data, np.arange(20), tmp_path)
+        vector_cache.recovered(data, np.arange(20), tmp_path)
+    found, _ = vector_cache.recovered(data, np.arange(20), tmp_path)
     assert asked == [5, 5, 5, 5, 5] and len(found.vectors) == 20
 
 
 def test_damaged_store_is_made_anew(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
-    store.recovered(data, np.arange(4), tmp_path)
+    vector_cache.recovered(data, np.arange(4), tmp_path)
     file = next(tmp_path.rglob("*.npz"))
     file.write_bytes(file.read_bytes()[:100])
-    found, _ = store.recovered(data, np.arange(4), tmp_path)
+    found, _ = vector_cache.recovered(data, np.arange(4), tmp_path)
     assert np.isfinite(found.vectors).all() and "made anew" in caplog.text
 
 
@@ -135,7 +135,7 @@ def test_report_names_bad_images(known_campaign, tmp_path, caplog):
     broken = replace(data, target=images)
     rows = np.arange(4)
     found = recover(data.site, images[rows], data.tx[rows], budget_s=0.0)
-    store.report(found, broken, rows, tmp_path / "array_recovery.csv")
+    vector_cache.report(found, broken, rows, tmp_path / "array_recovery.csv")
     lines = (tmp_path / "array_recovery.csv").read_text().splitlines()
     assert [line[-1] for line in lines[1:]] == ["0", "0", "1", "0"] and "row 2" in caplog.text
 

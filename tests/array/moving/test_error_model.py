@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.bearings.doubt import Doubt, Looks, learn_doubt
+from gsparc.array.moving.error_model import Doubt, Looks, learn_doubt
 
 
 def looks(count, seed=0):

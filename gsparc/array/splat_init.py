@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsparc.array.process import learn_process, mirror_elements
-from gsparc.array.store import recovered, report
-from gsparc.array.tuning import tune
+from gsparc.array.cross_validation import tune
+from gsparc.array.vector_cache import recovered, report
+from gsparc.array.vector_gp import learn_process, mirror_elements
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.field.encoding import Prior

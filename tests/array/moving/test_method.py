@@ -8,8 +8,8 @@ import torch
 from boxes import ROOM, TRANSMITTER, room_of_spectra
 from scipy.optimize import nnls
 
-from gsparc.bearings.field import BearingField
-from gsparc.bearings.sources import SearchSettings, find_sources, powers
+from gsparc.array.moving.method import BearingField
+from gsparc.array.moving.triangulate import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
 from gsparc.methods.gp import GaussianProcess

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.array.recovery import Recovered, recover
+from gsparc.array.phase_retrieval import Recovered, recover
 from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements, Site
 from gsparc.methods.target_rows import training_targets

@@ -1,6 +1,6 @@
 import numpy as np
 
-from gsparc.bearings.compress import components
+from gsparc.array.moving.compress import components
 from gsparc.methods.gp import principal_components
 
 
