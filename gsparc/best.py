@@ -12,8 +12,6 @@ from typing import Any
 from torch import Tensor
 
 from gsparc.array.moving.method import BearingField
-from gsparc.coherent.directed import DirectedSources
-from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.effects import (
@@ -40,6 +38,8 @@ from gsparc.hybrid import (
 )
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.multipath.directional_gp import DirectedSources
+from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.ops import Pose
 from gsparc.training.fit import Training
 from gsparc.training.splatting import LearnedField

@@ -25,14 +25,14 @@ from torch import Tensor
 
 from gsparc.array.cross_validation import LeftOut, without
 from gsparc.array.method import ArrayField
-from gsparc.coherent.complex_gp import ComplexGP
-from gsparc.coherent.directed import DirectedSources
-from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.effects import Decision, Switch, fifths, nmse_of
 from gsparc.methods.gp import GaussianProcess, choose_kernel
 from gsparc.methods.method import Method
+from gsparc.multipath.complex_gp import ComplexGP
+from gsparc.multipath.directional_gp import DirectedSources
+from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.ops import Pose
 
 LEVEL_DB = 0.25  # a process of images this far behind an array, left out, is level with it

@@ -13,13 +13,13 @@ from invented import invent
 from rooms import directed, nmse, rough, shoebox
 
 from gsparc.array.cross_validation import LeftOut
-from gsparc.coherent.directed import DirectedSources
-from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.hybrid import Beside, Rest, Told, compared, learn_rest, searched_beyond, weight_of
 from gsparc.methods.mean import Mean
 from gsparc.methods.registry import build
+from gsparc.multipath.directional_gp import DirectedSources
+from gsparc.multipath.image_source_gp import VirtualSourceGP
 
 NONE = Fold(*[np.zeros(0, np.int64)] * 3)
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "furniture": False, "edges": False}

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from gsparc.coherent.rows import tones_of
 from gsparc.data.schema import Site
+from gsparc.multipath.rows import tones_of
 from gsparc.ops import Pose
 from gsparc.ops.channels import channels
 from gsparc.physics.array_response import array_output, element_pattern, normalised, site_problem, steering

@@ -23,7 +23,7 @@ from gsparc.ops import SphereGrid
 SCHEMA_VERSION = 1
 FORMAT = "gsparc-checkpoint"
 MODEL = "model.ckpt"  # of a run's folder
-SEARCHES = "searches"  # what `gsparc.coherent.shelf` calls its own in a last.ckpt
+SEARCHES = "searches"  # what `gsparc.multipath.search_cache` calls its own in a last.ckpt
 
 
 class CheckpointError(ValueError):

@@ -1,7 +1,7 @@
 """What gradient training begins with: features of the emission, places of Gaussians, weights in closed form.
 
 Which start a field takes follows from its target: images (`gsparc.training.closed_form`), vectors of an array
-(`gsparc.array.splat_init`) or sources with carrier phase (`gsparc.coherent.start`).
+(`gsparc.array.splat_init`) or sources with carrier phase (`gsparc.multipath.splat_init`).
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.array import splat_init as through_array
-from gsparc.coherent import start as with_carrier
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
 from gsparc.field.losses import Snapshot
 from gsparc.field.model import GaussianModel, ModelSettings
+from gsparc.multipath import splat_init as with_carrier
 from gsparc.ops import Pose
 from gsparc.training.auto_settings import Choices
 from gsparc.training.closed_form import learn_prior, warm_start

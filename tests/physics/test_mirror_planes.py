@@ -3,8 +3,8 @@ import itertools
 import pytest
 import torch
 
-from gsparc.coherent.parsing import respell, upright, vote
-from gsparc.coherent.process import Scene
+from gsparc.multipath.gp_likelihood import Scene
+from gsparc.multipath.reflection_orders import respell, upright, vote
 from gsparc.physics.mirror_planes import all_words, bisector, images, reflect
 
 WALLS = torch.tensor(

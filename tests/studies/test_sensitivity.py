@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from rooms import directed
 
-from gsparc.coherent.directed import DirectedSources
 from gsparc.data.rfid import load_rfid
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
+from gsparc.multipath.directional_gp import DirectedSources
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
 from gsparc.studies.study.sensitivity import displaced, draw, sweep, turned
 

@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.coherent.offsets import estimate
 from gsparc.data.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method, Prediction
+from gsparc.multipath.phase_offsets import estimate
+from gsparc.multipath.uplink.method import UplinkField
 from gsparc.studies.link.grid import interpolated
-from gsparc.uplink.method import UplinkField
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World

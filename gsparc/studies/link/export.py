@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from gsparc.best import Gsparc
-from gsparc.coherent.directed import DirectedSources
-from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Site
 from gsparc.methods.method import Method, Prediction
+from gsparc.multipath.directional_gp import DirectedSources
+from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.uplink.method import UplinkField
 from gsparc.ops import Pose
 from gsparc.studies.link.grid import interpolated, resource_grid
-from gsparc.uplink.method import UplinkField
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.coherent.inphase import PhasedPosterior, PhasedScene
-from gsparc.coherent.query import Query
-from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method
+from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
+from gsparc.multipath.query import Query
 from gsparc.studies.tradeoff.points import Settings
 from gsparc.studies.tradeoff.view import MeanOnly
 

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 FAMILIES = {  # the most special class first
     "gsparc.array.method.ArrayField": "gsparc.studies.tradeoff.packets",
     "gsparc.array.moving.method.BearingField": "gsparc.studies.tradeoff.crossings",
-    "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.studies.tradeoff.sources",
+    "gsparc.multipath.image_source_gp.VirtualSourceGP": "gsparc.studies.tradeoff.sources",
     "gsparc.methods.gp.GaussianProcess": "gsparc.studies.tradeoff.components",
     "gsparc.training.splatting.LearnedField": "gsparc.studies.tradeoff.splatted",
 }

@@ -16,11 +16,11 @@ from gsparc.array.method import ArrayField
 from gsparc.array.moving.method import BearingField
 from gsparc.array.moving.triangulate import SearchSettings
 from gsparc.array.wave_packets import PacketSettings
-from gsparc.coherent.vsgp import VirtualSourceGP
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
+from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.studies.tradeoff import spare, splatted
 from gsparc.studies.train import train
 

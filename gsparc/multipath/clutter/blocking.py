@@ -1,0 +1,227 @@
+"""Boxes that hide and patches that end mirrors, tested against the legs of every path.
+
+A box lets no leg pass that runs through it for more than a few centimetres. A patch is a rectangle on a
+mirror plane: a plane with patches reflects only inside them, and a patch lets no other leg through. Edges
+are soft, so that they can be moved by gradients.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.clutter.unfold import Paths
+
+MARGIN = 0.03  # [m] of a chord that still passes: legs end on the faces of what reflects them
+SOFT = 0.02  # [m] width of an edge
+NEAR_PLANE = 0.02  # [m]; a leg that ends this close to a patch is reflected by it, not blocked
+
+
+@dataclass(frozen=True)
+class Clutter:
+    """Boxes and patches of one scene, in its frame.
+
+    Attributes:
+        boxes: (B, 6) float32 [m], lower then upper corners.
+        patches: (Q, 4) float32 [m], lower then upper corners along the plane's `tangents`.
+        plane: Q numbers of planes of the scene.
+    """
+
+    boxes: Tensor
+    patches: Tensor
+    plane: tuple[int, ...]
+
+    @staticmethod
+    def none() -> Clutter:
+        """An empty room with endless mirrors."""
+        return Clutter(torch.zeros(0, 6), torch.zeros(0, 4), ())
+
+    def __len__(self) -> int:
+        return len(self.boxes) + len(self.patches)
+
+    def with_box(self, box: Tensor, at: int | None = None) -> Clutter:
+        """One more box (6,), in place `at`."""
+        at = len(self.boxes) if at is None else at
+        return replace(self, boxes=torch.cat([self.boxes[:at], box[None], self.boxes[at:]]))
+
+    def without_box(self, number: int) -> Clutter:
+        """One box less."""
+        return replace(self, boxes=torch.cat([self.boxes[:number], self.boxes[number + 1 :]]))
+
+    def with_patch(self, patch: Tensor, plane: int) -> Clutter:
+        """One more patch (4,)."""
+        patches = torch.cat([self.patches, patch[None]])
+        return replace(self, patches=patches, plane=(*self.plane, plane))
+
+    def without_patch(self, number: int) -> Clutter:
+        """One patch less."""
+        kept = [i for i in range(len(self.plane)) if i != number]
+        return replace(self, patches=self.patches[kept], plane=tuple(self.plane[i] for i in kept))
+
+    def renamed(self, new: dict[int, int]) -> Clutter:
+        """Planes under new numbers; patches of planes without one go."""
+        kept = [i for i, plane in enumerate(self.plane) if plane in new]
+        return replace(self, patches=self.patches[kept], plane=tuple(new[self.plane[i]] for i in kept))
+
+
+def shade(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
+    """How much of each source is seen (K, n) in [0, 1]; differentiable in boxes and patches."""
+    return Screens.of(clutter, planes, paths.valid.shape[0]).shade(paths, soft)
+
+
+@dataclass(frozen=True)
+class Screens:
+    """Clutter of one or more scenes, ready to be tested against paths of all their K sources.
+
+    Attributes:
+        boxes: (B, 6).
+        boxed: (B, K, 1) bool, whose boxes they are.
+        patches: (Q, 4).
+        patched: (Q, K, 1) bool, whose patches they are.
+        letter: (Q,) planes of the patches.
+        normal, offset: (Q, 3), (Q,) of these planes.
+        along: (Q, 2, 3), their tangents.
+        ends: (P + 1,) bool, which planes have patches; the last is no plane.
+    """
+
+    boxes: Tensor
+    boxed: Tensor
+    patches: Tensor
+    patched: Tensor
+    letter: Tensor
+    normal: Tensor
+    offset: Tensor
+    along: Tensor
+    ends: Tensor
+
+    @staticmethod
+    def of(clutter: Clutter, planes: Tensor, sources: int) -> Screens:
+        """From one scene's clutter, planes (P, 4) and number of sources."""
+        letter = torch.tensor(clutter.plane, dtype=torch.long)
+        ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
+        ends[letter] = True
+        used = planes[letter]
+        along = [tangents(plane) for plane in used]
+        return Screens(
+            clutter.boxes,
+            torch.ones(len(clutter.boxes), sources, 1, dtype=torch.bool),
+            clutter.patches,
+            torch.ones(len(letter), sources, 1, dtype=torch.bool),
+            letter,
+            _units(used),
+            (used[:, 3]).float(),
+            torch.stack(along) if along else torch.zeros(0, 2, 3),
+            ends,
+        )
+
+    @staticmethod
+    def beside(many: list[Screens]) -> Screens:
+        """Of several scenes whose sources, and planes, are numbered on."""
+        planes = torch.tensor([0] + [len(s.ends) - 1 for s in many]).cumsum(0).tolist()
+        return Screens(
+            torch.cat([s.boxes for s in many]),
+            _blocks([s.boxed for s in many]),
+            torch.cat([s.patches for s in many]),
+            _blocks([s.patched for s in many]),
+            torch.cat([s.letter + first for s, first in zip(many, planes, strict=False)]),
+            torch.cat([s.normal for s in many]),
+            torch.cat([s.offset for s in many]),
+            torch.cat([s.along for s in many]),
+            torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
+        )
+
+    def shade(self, paths: Paths, soft: float = SOFT) -> Tensor:
+        """How much of each source is seen (K, n) in [0, 1]."""
+        seen = torch.ones(paths.valid.shape)
+        if len(self.boxes):
+            passed = torch.where(self.boxed, past_boxes(paths, self.boxes, soft), 1.0)
+            seen = seen * passed.prod(0)
+        if len(self.patches):
+            seen = seen * self._past_patches(paths, soft)
+        return seen
+
+    def _past_patches(self, paths: Paths, soft: float) -> Tensor:
+        shape = (-1, 1, 1, 1)
+        mine = (self.patched & paths.valid)[..., None]  # (Q, K, n, 1)
+        offset = self.offset.view(shape)
+        above, below = (_dot(p, self.normal) - offset for p in (paths.start, paths.end))
+        ends_here = paths.letter == self.letter.view(shape)
+        crosses = (above * below < 0) & (above.abs() > NEAR_PLANE) & (below.abs() > NEAR_PLANE)
+        share = above / torch.where(crosses, above - below, torch.ones_like(above))
+        share = torch.where(ends_here, torch.ones_like(share), share)[..., None]
+        met = paths.start + share * (paths.end - paths.start)
+        inside = _inside([_dot3(met, self.along[:, i]) for i in range(2)], self.patches, soft, each=True)
+        inside = inside * ((crosses | ends_here) & mine)
+        passed = torch.where(ends_here, 1.0, 1 - inside).prod(0).prod(-1)
+        reflected = 1 - torch.where(ends_here, 1 - inside, 1.0).prod(0)
+        bounded = self.ends[paths.letter]
+        seen = passed * torch.where(bounded, reflected, 1.0).prod(-1)
+        # A mirror that ends is known well enough to say from where its words cannot be seen
+        return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
+
+
+def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
+    """Share (B, K, n) that passes each box."""
+    chord = _chords(paths.start, paths.end, boxes).amax(-1)
+    passed = torch.sigmoid((MARGIN - chord) / soft)
+    return torch.where(paths.valid, passed, torch.ones_like(passed))
+
+
+def within(points: Tensor, patches: Tensor, soft: float = SOFT) -> Tensor:
+    """How far inside patches (Q, 4) points (..., 2) are, as a share (Q, ...)."""
+    return _inside([points[..., 0], points[..., 1]], patches, soft)
+
+
+def _inside(place: list[Tensor], patches: Tensor, soft: float, each: bool = False) -> Tensor:
+    """Patches (Q, 4) against coordinates (...); or, `each`, (Q, ...), against its own."""
+    u, v = place
+    shape = (-1, *[1] * (u.dim() - int(each)))
+    low_u, low_v, high_u, high_v = (patches[:, i].view(shape) for i in range(4))
+    inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
+    return torch.sigmoid(inner / soft)
+
+
+def _dot(points: Tensor, vectors: Tensor) -> Tensor:
+    """(K, n, L, 3) with each of (Q, 3): (Q, K, n, L)."""
+    return (points @ vectors.T).movedim(-1, 0)
+
+
+def _dot3(points: Tensor, vectors: Tensor) -> Tensor:
+    """(Q, K, n, L, 3) with (Q, 3), one each: (Q, K, n, L)."""
+    return (points * vectors[:, None, None, None]).sum(-1)
+
+
+def _blocks(owned: list[Tensor]) -> Tensor:
+    """(B_i, K_i, 1) side by side on a diagonal."""
+    return torch.block_diag(*[o[..., 0].float() for o in owned])[..., None] > 0
+
+
+def tangents(plane: Tensor) -> Tensor:
+    """Two axes (2, 3) float32 along a plane (4,): level where they can be."""
+    normal = _units(plane[None])[0]
+    up, ahead = torch.tensor([0.0, 0.0, 1.0]), torch.tensor([1.0, 0.0, 0.0])
+    first = ahead if normal[2].abs() > 0.7 else torch.linalg.cross(up, normal)
+    first = first - (first @ normal) * normal
+    first = first / first.norm()
+    return torch.stack([first, torch.linalg.cross(normal, first)])
+
+
+def _units(planes: Tensor) -> Tensor:
+    return (planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)).float()
+
+
+def _chords(start: Tensor, end: Tensor, boxes: Tensor) -> Tensor:
+    """Length [m] of legs (...) inside each box (B, ...), negative for those that miss; slab test."""
+    along = end - start
+    along = torch.where(along.abs() < 1e-6, torch.full_like(along, 1e-6), along)
+    inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
+    enter, leave = torch.zeros(()), torch.ones(())
+    for axis in range(3):
+        low, high = (boxes[:, i].view(-1, *[1] * (start.dim() - 1)) for i in (axis, axis + 3))
+        one = (low - start[..., axis]) * inverse[..., axis]
+        other = (high - start[..., axis]) * inverse[..., axis]
+        enter = torch.maximum(enter, torch.minimum(one, other))
+        leave = torch.minimum(leave, torch.maximum(one, other))
+    return (leave - enter) * length

@@ -1,0 +1,127 @@
+"""Where would one more box explain most of what is left? Random boxes, then the best ones evolve."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.clutter.blocking import past_boxes
+from gsparc.multipath.clutter.residual import Explained
+from gsparc.multipath.clutter.unfold import Paths
+
+BLOCK = 64  # candidates at a time
+THINNEST = 0.03  # [m]
+SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
+TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
+
+
+@dataclass(frozen=True)
+class Evolution:
+    """A (mu, lambda) evolution strategy with falling step size.
+
+    Attributes:
+        rounds: of mutation and selection.
+        children: of each parent and round.
+        spread: first standard deviation of a mutation [m].
+        fall: factor from round to round.
+        halved: rounds after which only the better half goes on.
+    """
+
+    rounds: int = 14
+    children: int = 6
+    spread: float = 0.3
+    fall: float = 0.82
+    halved: tuple[int, ...] = (4, 8)
+
+
+def evolve(
+    parents: Tensor,
+    score: Callable[[Tensor], Tensor],
+    repaired: Callable[[Tensor], Tensor],
+    generator: torch.Generator,
+    evolution: Evolution = Evolution(),
+) -> tuple[Tensor, float]:
+    """The best descendant (d,) of parents (m, d), and its score."""
+    best, spread = score(parents), evolution.spread
+    for number in range(evolution.rounds):
+        born = parents.repeat_interleave(evolution.children, 0)
+        which = torch.rand(born.shape, generator=generator) < 0.5
+        born = repaired(born + spread * torch.randn(born.shape, generator=generator) * which)
+        scores, chosen = score(born).view(len(parents), -1).max(1)
+        better = scores > best
+        heirs = born.view(len(parents), -1, born.shape[1])[torch.arange(len(parents)), chosen]
+        parents = torch.where(better[:, None], heirs, parents)
+        best, spread = torch.maximum(best, scores), spread * evolution.fall
+        if number in evolution.halved:
+            kept = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
+            parents, best = parents[kept], best[kept]
+    first = int(best.argmax())
+    return parents[first], float(best[first])
+
+
+def find_box(
+    explained: Explained,
+    paths: Paths,
+    shaded: Tensor,
+    room: Tensor,
+    generator: torch.Generator,
+    *,
+    draws: int = 1000,
+    parents: int = 12,
+    seeds: Tensor | None = None,
+    strongest: int = 24,
+) -> tuple[Tensor, float]:
+    """The box (6,) whose shadow explains most, and the nats it would gain.
+
+    Args:
+        explained: what is left.
+        paths: of all K sources.
+        shaded: (n, K) complex, waves of the sources as they are seen now.
+        room: (2, 3) [m], where boxes may be.
+        generator: of the candidates.
+        draws, parents: random boxes, and how many of them evolve.
+        seeds: (s, 6) more parents.
+        strongest: sources that are looked at.
+    """
+    waves = shaded * explained.gains
+    chosen = waves.abs().square().sum(0).topk(min(strongest, waves.shape[1])).indices
+    few, waves = paths.take(chosen), waves[:, chosen]
+
+    def score(boxes: Tensor) -> Tensor:
+        scores = []
+        for part in boxes.split(BLOCK):
+            hidden = 1 - past_boxes(few, part)
+            lost = torch.complex(
+                torch.einsum("bkn,nk->nb", hidden, waves.real), torch.einsum("bkn,nk->nb", hidden, waves.imag)
+            )
+            scores.append(explained.score(-lost))
+        return torch.cat(scores)
+
+    def repaired(boxes: Tensor) -> Tensor:
+        return inside_out(boxes, room)
+
+    drawn = repaired(_random(draws, room, generator))
+    drawn = drawn[score(drawn).topk(min(parents, draws)).indices]
+    if seeds is not None:
+        drawn = torch.cat([drawn, repaired(seeds)])
+    return evolve(drawn, score, repaired, generator)
+
+
+def inside_out(boxes: Tensor, room: Tensor) -> Tensor:
+    """Boxes (m, 6) cut to the room, their corners in order."""
+    low = torch.minimum(boxes[:, :3], boxes[:, 3:] - THINNEST)
+    return torch.cat([torch.maximum(low, room[0]), torch.minimum(boxes[:, 3:], room[1])], 1)
+
+
+def _random(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
+    middle = room[0] + (room[1] - room[0]) * torch.rand(count, 3, generator=generator)
+    kind = torch.rand(count, generator=generator)
+    size = SMALLEST * torch.exp(torch.rand(count, 3, generator=generator) * math.log(LARGEST / SMALLEST))
+    size[kind < TABLES, 2] = 2 * THINNEST
+    low, high = middle - size / 2, middle + size / 2
+    low[kind > FLOOR, 2] = room[0, 2]
+    return torch.cat([low, high], 1)

@@ -1,0 +1,280 @@
+"""Mirrors that end: the best patch on a known plane, and small mirrors parallel to known walls.
+
+A table top is seen in by few receivers: looked for as a source seen by all, it drowns. Looked for as a patch,
+every receiver whose reflection would lie elsewhere is left out of the sum.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from dataclasses import dataclass
+from itertools import product
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.clutter.blocking import tangents, within
+from gsparc.multipath.clutter.boxes import BLOCK, Evolution, evolve
+from gsparc.multipath.clutter.residual import Explained
+from gsparc.multipath.clutter.unfold import Paths
+from gsparc.multipath.rows import Rows
+from gsparc.physics.mirror_planes import Word, reflect
+from gsparc.physics.waves import LIGHT, NEAR_M
+
+log = logging.getLogger(__name__)
+
+SMALLEST, LARGEST = 0.2, 3.0  # [m] sides of random patches
+LEAST_SIDE = 0.05  # [m]
+PARALLEL = 0.999  # cosine of normals that are one
+CELL = 0.35  # [m] of the raster on which small mirrors are looked for
+STEP = 0.08  # of a wavelength, between planes tried
+BEHIND = 0.4  # [m], how far behind the receivers' box planes are tried
+LONGEST = 6  # cells along each side of a rectangle
+MOST_CELLS = 2e8  # of all rasters along one wall's normal; a site with more is no room
+BLOCK_CELLS = 2e7  # of the rasters held at a time, four numbers each
+TINY = 4  # receivers that a small mirror must serve
+
+
+def find_patch(
+    explained: Explained,
+    paths: Paths,
+    words: tuple[Word, ...],
+    number: int,
+    plane: Tensor,
+    shaded: Tensor,
+    room: Tensor,
+    generator: torch.Generator,
+    draws: int = 300,
+) -> tuple[Tensor, float]:
+    """The patch (4,) on plane `number` that, were its words seen only in it, explains most; and its nats.
+
+    Args:
+        explained: what is left.
+        paths: of all K sources.
+        words: of the sources.
+        number, plane: (4,) which.
+        shaded: (n, K) complex, waves of the sources as they are seen now.
+        room: (2, 3) [m].
+        generator: of the candidates.
+        draws: random patches, of which the best evolve.
+    """
+    mine = [k for k, word in enumerate(words) if number in word]
+    few, waves = paths.take(mine), shaded[:, mine]
+    along = tangents(plane)
+    met, here = few.end @ along.T, few.letter == number
+    ends = room @ along.T
+    low, high = ends.amin(0), ends.amax(0)
+
+    def score(patches: Tensor) -> Tensor:
+        scores = []
+        for part in patches.split(BLOCK):
+            inside = within(met, part)
+            seen = torch.where(here, inside, torch.ones_like(inside)).prod(-1)
+            scores.append(
+                explained.score(
+                    torch.complex(
+                        torch.einsum("bkn,nk->nb", seen, waves.real),
+                        torch.einsum("bkn,nk->nb", seen, waves.imag),
+                    )
+                )
+            )
+        return torch.cat(scores)
+
+    def repaired(patches: Tensor) -> Tensor:
+        lower = torch.minimum(patches[:, :2], patches[:, 2:] - LEAST_SIDE)
+        return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
+
+    middle = low + (high - low) * torch.rand(draws, 2, generator=generator)
+    side = SMALLEST * torch.exp(torch.rand(draws, 2, generator=generator) * math.log(LARGEST / SMALLEST))
+    drawn = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
+    drawn = drawn[score(drawn).topk(8).indices]
+    return evolve(drawn, score, repaired, generator, Evolution(rounds=10))
+
+
+@dataclass(frozen=True)
+class SmallMirror:
+    """A patch on a plane of its own.
+
+    Attributes:
+        plane: (4,) float64.
+        patch: (4,) float32, along its tangents.
+        score: nats that its words together would gain, about.
+    """
+
+    plane: Tensor
+    patch: Tensor
+    score: float
+
+
+def walls(planes: Tensor, words: tuple[Word, ...]) -> list[int]:
+    """Numbers of planes that make a source of one reflection."""
+    return [i for i in range(len(planes)) if (i,) in words]
+
+
+def directions(planes: Tensor, numbers: list[int]) -> Tensor:
+    """Unit normals (D, 3) float64 of the planes with these numbers, parallel ones once."""
+    found: list[Tensor] = []
+    for number in numbers:
+        normal = planes[number, :3] / planes[number, :3].norm()
+        if all((normal @ other).abs() < PARALLEL for other in found):
+            found.append(normal)
+    return torch.stack(found) if found else torch.zeros(0, 3, dtype=planes.dtype)
+
+
+def find_mirrors(
+    rows: Rows,
+    explained: Explained,
+    transmitter: Tensor,
+    planes: Tensor,
+    numbers: list[int],
+    room: Tensor,
+    most: int,
+) -> list[SmallMirror]:
+    """Small mirrors parallel to walls, best first.
+
+    For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its words (itself, after and
+    before each wall) are collected in a raster of where it is met; integral images give every rectangle.
+    In a site so wide, or of waves so short, that these are more than `MOST_CELLS` none is looked for.
+
+    Args:
+        rows: n.
+        explained: what is left.
+        transmitter: (3,) float64 [m].
+        planes, numbers: (P, 4), and which of them are walls.
+        room: (2, 3) [m], where mirrors may be.
+        most: of them.
+    """
+    wavelength = LIGHT / float(rows.frequency.mean())
+    pulled, known = explained.pulled, planes[numbers]
+    found: list[SmallMirror] = []
+    scale = explained.root.square().sum(0).view(2, -1).mean(0)  # what a row knows, diagonal of K^-1
+    for normal in directions(planes, numbers):
+        ends = (room.double() @ normal).sort().values
+        offsets = torch.arange(
+            float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
+        )
+        candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
+        each = math.prod(_cells(room, tangents(candidates[0]))) * (1 + 2 * len(known))
+        if each * len(candidates) > MOST_CELLS:
+            log.info(
+                "small mirrors are not looked for: %.0e cells in a site this wide", each * len(candidates)
+            )
+            continue
+        parts = [
+            _raster(rows, pulled, scale, transmitter, block, known, room)
+            for block in candidates.split(max(1, int(BLOCK_CELLS / each)))
+        ]
+        total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
+        for number in total.topk(min(2 * most, len(total))).indices.tolist():
+            found.append(SmallMirror(candidates[number], corners[number], float(total[number])))
+    return _apart(found, 0.5 * wavelength)[:most]
+
+
+def same_mirror(one: SmallMirror, other: SmallMirror, apart: float) -> bool:
+    """Whether two mirrors are parallel, closer than `apart` [m] and overlap."""
+    if (one.plane[:3] @ other.plane[:3]).abs() < PARALLEL or (one.plane[3] - other.plane[3]).abs() > apart:
+        return False
+    low, high = torch.maximum(one.patch, other.patch)[:2], torch.minimum(one.patch, other.patch)[2:]
+    return bool((high > low).all())
+
+
+def _apart(found: list[SmallMirror], least: float) -> list[SmallMirror]:
+    kept: list[SmallMirror] = []
+    for mirror in sorted(found, key=lambda m: -m.score):
+        if not any(same_mirror(mirror, other, least) for other in kept):
+            kept.append(mirror)
+    return kept
+
+
+def _raster(
+    rows: Rows,
+    pulled: Tensor,
+    scale: Tensor,
+    transmitter: Tensor,
+    candidates: Tensor,
+    known: Tensor,
+    room: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
+    along = tangents(candidates[0])
+    low, cells = (room @ along.T).amin(0), _cells(room, along)
+    matched: list[Tensor] = []
+    power: list[Tensor] = []
+    served: list[Tensor] = []
+    for wave, met in _sources(rows, transmitter, candidates, known):
+        cell = ((met @ along.T - low) / CELL).floor().long()
+        inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
+        index = (cell[..., 0] * cells[1] + cell[..., 1]).clamp(0, cells[0] * cells[1] - 1)
+        own = wave.conj() * pulled
+        for values, into in ((own.real, matched), (own.imag, matched)):
+            into.append(_binned(values * inside, index, cells))
+        power.append(_binned(wave.abs().square() * scale * inside, index, cells))
+        served.append(_binned(inside.float(), index, cells))
+    sums = [_integral(torch.stack(t)) for t in (matched[::2], matched[1::2], power, served)]
+    total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
+    # a few cells, or all there are: a wall that was missed
+    sizes = [sorted({*range(1, min(LONGEST, count) + 1), count}) for count in cells]
+    for wide, high_by in product(*sizes):
+        real, imag, energy, count = (
+            s[..., wide:, high_by:] - s[..., :-wide, high_by:] - s[..., wide:, :-high_by]
+            + s[..., :-wide, :-high_by]
+            for s in sums
+        )  # fmt: skip
+        score = (real.square() + imag.square()) / energy.clamp_min(1e-3) / 2
+        summed = ((score - 1).clamp_min(0) * (count >= TINY)).sum(0)  # words add up: (C, u, v)
+        value, at = summed.flatten(1).max(1)
+        first = torch.stack([at // summed.shape[2], at % summed.shape[2]], 1)
+        span = torch.tensor([wide, high_by])
+        corners = torch.cat([low + CELL * first, low + CELL * (first + span)], 1)
+        better = value > total
+        total = torch.where(better, value, total)
+        best = torch.where(better[:, None], corners, best)
+    return total, best
+
+
+def _cells(room: Tensor, along: Tensor) -> list[int]:
+    """Cells of a raster along each of two tangents (2, 3)."""
+    ends = room @ along.T
+    return ((ends.amax(0) - ends.amin(0)) / CELL).ceil().long().clamp_min(1).tolist()
+
+
+def _sources(
+    rows: Rows, transmitter: Tensor, candidates: Tensor, known: Tensor
+) -> list[tuple[Tensor, Tensor]]:
+    """Waves (C, n) of every word over a candidate, and where the candidate is met (C, n, 3), NaN if not."""
+    places, found = rows.position.float(), []
+    once = reflect(transmitter[None], candidates)  # (C, 3)
+    found.append((_wave(rows, once), _meeting(places, once, candidates)))
+    for wall in known:
+        after = reflect(reflect(transmitter, wall)[None], candidates)
+        found.append((_wave(rows, after), _meeting(places, after, candidates)))
+        before = reflect(once, wall[None])
+        first = _meeting(places, before, wall[None].expand(len(candidates), 4))
+        found.append((_wave(rows, before), _meeting(first, once, candidates)))
+    return found
+
+
+def _wave(rows: Rows, sources: Tensor) -> Tensor:
+    distance = torch.cdist(sources, rows.position).clamp_min(NEAR_M)
+    cycles = distance * (rows.frequency / LIGHT)
+    return torch.polar((1 / distance).float(), ((cycles.round() - cycles) * (2 * math.pi)).float())
+
+
+def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
+    """Where lines from (n, 3) or (C, n, 3) to (C, 3) meet planes (C, 4); NaN where not between."""
+    normal, offset = planes[:, None, :3].float(), planes[:, None, 3].float()
+    end = end[:, None].float()
+    above, below = (start * normal).sum(-1) - offset, (end * normal).sum(-1) - offset
+    share = above / torch.where((above - below).abs() < 1e-6, torch.ones_like(above), above - below)
+    share = torch.where((above * below < 0), share, torch.full_like(share, math.nan))
+    return start + share[..., None] * (end - start)
+
+
+def _binned(values: Tensor, index: Tensor, cells: list[int]) -> Tensor:
+    flat = torch.zeros(len(values), cells[0] * cells[1]).scatter_add_(1, index, values.float())
+    return flat.view(-1, *cells)
+
+
+def _integral(table: Tensor) -> Tensor:
+    return torch.nn.functional.pad(table.cumsum(-1).cumsum(-2), (1, 0, 1, 0))

@@ -1,0 +1,125 @@
+"""Boxes, patches and amplitudes moved together, what varies from place to place held.
+
+Planes and phases move only where they are new: of the others the part that varies is held where it was, and
+would go on explaining what the constant part has left.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.clutter.blocking import SOFT, Clutter, shade
+from gsparc.multipath.clutter.residual import Residual
+from gsparc.multipath.clutter.unfold import Paths
+from gsparc.multipath.gp_likelihood import steering
+from gsparc.multipath.phased_gp import PhasedScene
+from gsparc.physics.mirror_planes import Word, images
+
+ALIKE = 0.7  # standard deviation of the sources' log amplitudes about their mean
+SLOWER = 0.97  # factor of all step sizes from step to step
+
+
+@dataclass(frozen=True)
+class Accord:
+    """How alike mirrors turn the phase: source k's is von Mises about `expected`.
+
+    Materials are nearly lossless or nearly opaque, so a reflection turns by about 0 or pi, the same for most
+    walls of a room. Knowing that tells where a wall is that few receivers see: were its phase free, it could
+    slide along its normal.
+
+    Attributes:
+        turn: of each reflection, 0 or pi [rad].
+        concentration: kappa, by Best and Fisher's approximation from the mean resultant length (N. I. Fisher,
+            "Statistical Analysis of Circular Data", 1993, section 4.5).
+    """
+
+    turn: float
+    concentration: float
+
+    @staticmethod
+    def of(phased: PhasedScene) -> Accord:
+        """From a scene's phases, strong sources counting most."""
+        order = torch.tensor([len(word) for word in phased.scene.words])
+        if len(order) < 4:
+            return Accord(0.0, 0.0)
+        power = phased.scene.log_amplitude.mul(2).exp() * (order > 0)
+        share, turn = max(
+            (float((power * (phased.phase - phased.phase[0] - order * t).cos()).sum() / power.sum()), t)
+            for t in (0.0, math.pi)
+        )
+        share = min(max(share, 0.0), 0.97)
+        return Accord(turn, share * (2 - share**2) / (1 - share**2))
+
+    def expected(self, first: Tensor, words: tuple[Word, ...]) -> Tensor:
+        """Phases (K,) of words, given the transmitter's own."""
+        return first + self.turn * torch.tensor([float(len(word)) for word in words])
+
+    def cost(self, phase: Tensor, words: tuple[Word, ...]) -> Tensor:
+        """Negative log prior of phases (K,), the transmitter's first."""
+        return self.concentration * (1 - (phase - self.expected(phase[0], words)).cos()).sum()
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Step sizes of Adam.
+
+    Attributes:
+        edge: of boxes and patches [m].
+        plane: of normals and offsets (unit, m).
+        phase: [rad].
+        logarithm: of amplitudes.
+    """
+
+    edge: float = 0.02
+    plane: float = 0.003
+    phase: float = 0.03
+    logarithm: float = 0.05
+
+
+def descend(
+    residual: Residual,
+    phased: PhasedScene,
+    paths: Paths,
+    steps: int,
+    soft: float = SOFT,
+    pace: Pace = Pace(),
+    accord: Accord = Accord(0.0, 0.0),
+) -> PhasedScene:
+    """The most likely of the scenes met in `steps` steps; paths are those of the start."""
+    scene, rows = phased.scene, residual.rows
+    start = (
+        scene.clutter.boxes, scene.clutter.patches, scene.planes, phased.phase, scene.log_amplitude,
+    )  # fmt: skip
+    values = [v.clone().requires_grad_() for v in start]
+    rates = (pace.edge, pace.edge, pace.plane, pace.phase, pace.logarithm)
+    groups = [{"params": [v], "lr": rate} for v, rate in zip(values, rates, strict=True)]
+    optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
+    lowest, best = float("inf"), [v.detach() for v in values]
+    for step in range(steps + 1):
+        boxes, patches, planes, phase, log_amplitude = values
+        seen = shade(paths, Clutter(boxes, patches, scene.clutter.plane), scene.planes, soft)
+        waves = steering(rows, images(scene.transmitter, planes, scene.words))
+        waves = waves * torch.polar(torch.ones(()), phase)
+        away = (log_amplitude - log_amplitude.mean().detach()) / ALIKE
+        cost = residual.nll(seen, log_amplitude, waves) + away.square().sum() / 2
+        cost = cost + accord.cost(phase, scene.words)
+        if cost.item() < lowest:
+            lowest, best = cost.item(), [v.detach().clone() for v in values]
+        if step == steps:
+            break
+        optimizer.zero_grad()
+        cost.backward()
+        held = residual.phased.scene
+        for value, count in ((planes, len(held.planes)), (phase, len(held.words))):
+            if value.grad is not None:
+                value.grad[:count] = 0
+        optimizer.step()
+        for group in optimizer.param_groups:
+            group["lr"] *= SLOWER
+    clutter = Clutter(best[0], best[1], scene.clutter.plane)
+    moved = replace(scene, planes=best[2], log_amplitude=best[4], clutter=clutter)
+    return replace(phased, scene=moved, phase=best[3])

@@ -1,0 +1,193 @@
+"""What is left to explain, and how much another box, patch or source would explain of it.
+
+The process of `gsparc.multipath.phased_gp` with its covariance in two parts: what varies from place to place and
+the noise, factored once and held, and the sources' constant gains, a few columns that change with every move
+of a box and are added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.gp_likelihood import JITTER
+from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
+from gsparc.multipath.rows import Rows
+from gsparc.multipath.visibility_kernel import KernelVisibility, View
+
+TRIED = 1.5  # factor between two noise variances tried
+LEAST_NOISE = 3e-4  # variance, in units of the rows' power; less is only found where a search is wrong
+CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # shares tried
+
+
+class Residual:
+    """Rows of one output against a phased scene with a `KernelVisibility`; n rows are 2 n real numbers.
+
+    Args:
+        rows: R = 1.
+        phased: its clutter shades what varies; the constant part is shaded by whoever asks.
+        noise_floor: known variance of the noise, in units of the rows' power.
+
+    Attributes:
+        phased: as given, constant share and noise chosen by likelihood.
+    """
+
+    def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
+        self.rows, self.noise_floor = rows, noise_floor
+        self.target = stacked(rows.target)[0][:, 0]
+        self.waves = phased.unshaded(rows)
+        self._cached = self._parts(phased)
+        self.phased = self._tuned(phased)
+        self._factor(self.phased)
+
+    def _parts(self, phased: PhasedScene) -> tuple[Tensor, Tensor]:
+        """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
+        n, scene = len(self.rows), phased.scene
+        scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
+        law = _law(phased)
+        varying = torch.zeros(2, n, 2, n)
+        for k, source in enumerate(scene.sources):
+            view = View.of(self.rows.position, source)
+            add_source(
+                varying, scaled[:, k], phased.turning, replace(law, constant=0.0).correlation(view, view)
+            )
+        across = stacked(scaled)[1]
+        return varying.view(2 * n, 2 * n), shares(phased.turning)[1] * (across @ across.T)
+
+    def _tuned(self, phased: PhasedScene) -> PhasedScene:
+        """Constant share and noise of the likelihood's choice, one after the other on a grid."""
+        columns = stacked(phased.waves(self.rows) * phased.scene.log_amplitude.exp())[0]
+        law, noise = _law(phased), phased.scene.log_noise
+        constant = min(CONSTANTS, key=lambda c: abs(c - float(law.constant)))
+
+        def cost(constant: float, noise: float) -> float:
+            self._factored(constant, noise, phased.turning)
+            return self._nll(columns * self._constant(constant, phased.turning)).item()
+
+        best = cost(constant, noise)
+        for _ in range(2):
+            place = CONSTANTS.index(constant)
+            for direction in (-1, 1):
+                at = place + direction
+                while 0 <= at < len(CONSTANTS) and (new := cost(CONSTANTS[at], noise)) < best:
+                    best, constant, at = new, CONSTANTS[at], at + direction
+            for step in (-math.log(TRIED), math.log(TRIED)):
+                while noise + step > math.log(LEAST_NOISE) and (new := cost(constant, noise + step)) < best:
+                    best, noise = new, noise + step
+        scene = replace(phased.scene, visibility=replace(law, constant=constant), log_noise=noise)
+        return replace(phased, scene=scene)
+
+    def _factor(self, phased: PhasedScene) -> None:
+        constant = float(_law(phased).constant)
+        self._factored(constant, phased.scene.log_noise, phased.turning)
+        self.share = self._constant(constant, phased.turning)
+        eye = torch.eye(len(self.target))
+        self.root = torch.linalg.solve_triangular(self._lower, eye, upper=False)
+        self.white = self.root @ self.target
+        del self._cached, self._lower
+
+    def _factored(self, constant: float, noise: float, turning: float) -> None:
+        varying, across = self._cached
+        covariance = (1 - constant) * varying + constant * across
+        covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
+        self._lower = torch.linalg.cholesky(covariance)
+        self._determinant = float(self._lower.diagonal().double().log().sum())
+        self._white = torch.linalg.solve_triangular(self._lower, self.target[:, None], upper=False)[:, 0]
+
+    @staticmethod
+    def _constant(constant: float, turning: float) -> float:
+        return math.sqrt(constant * (1 - turning / 2))
+
+    def _nll(self, columns: Tensor) -> Tensor:
+        whitened = torch.linalg.solve_triangular(self._lower, columns, upper=False)
+        return _cost(whitened, self._white, self._determinant)
+
+    # ---- the constant part, shaded ----
+    def columns(self, shade: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+        """Constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
+        scaled = (self.waves if waves is None else waves) * (shade.T * log_amplitude.exp() * self.share)
+        return self.root @ torch.cat([scaled.real, scaled.imag])
+
+    def nll(self, shade: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+        """Negative log likelihood (), in nats; differentiable."""
+        return _cost(self.columns(shade, log_amplitude, waves), self.white, self._determinant)
+
+    def gains_of_each(self, shade: Tensor, log_amplitude: Tensor) -> Tensor:
+        """What the likelihood would lose without each source's constant part (K,) [nats]."""
+        columns = self.columns(shade, log_amplitude)
+        inner = columns.T @ columns + torch.eye(columns.shape[1])
+        inverse = torch.linalg.inv(inner)
+        mean = inverse @ (columns.T @ self.white)
+        spread = inverse.diagonal()
+        return 0.5 * (mean.square() / spread + spread.log())
+
+    def explained(self, shade: Tensor, log_amplitude: Tensor) -> Explained:
+        """The constant parts at their posterior means, taken out."""
+        columns = self.columns(shade, log_amplitude)
+        lower = torch.linalg.cholesky(columns.T @ columns + torch.eye(columns.shape[1]))
+        mean = torch.cholesky_solve((columns.T @ self.white)[:, None], lower)[:, 0]
+        taken = torch.linalg.solve_triangular(lower, columns.T, upper=False)
+        gains = mean * self.share * log_amplitude.exp()
+        return Explained(self.root, taken, self.white - columns @ mean, gains)
+
+
+class Explained:
+    """Residual after the constant parts, and scores of what could be added to them.
+
+    Attributes:
+        gains: (K,) float32, posterior mean of each source's constant gain along its phase.
+    """
+
+    def __init__(self, root: Tensor, taken: Tensor, left: Tensor, gains: Tensor) -> None:
+        self.root, self.taken, self.left, self.gains = root, taken, left, gains
+
+    @property
+    def pulled(self) -> Tensor:
+        """K^-1 y (n,) complex64, constant parts taken out."""
+        n = len(self.left) // 2
+        both = self.root.T @ self.left
+        return torch.complex(both[:n], both[n:])
+
+    def score(self, change: Tensor) -> Tensor:
+        """Nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
+        return self.score_positive(change)[0]
+
+    def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
+        """The same, and the multiples (M,)."""
+        whitened = self.root @ torch.cat([change.real, change.imag])
+        power = whitened.square().sum(0) - (self.taken @ whitened).square().sum(0)
+        matched = (self.left @ whitened).clamp_min(0)
+        multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
+        return multiple * matched / 2, multiple
+
+    def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
+        """Nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
+        parts = [self.root @ part for part in stacked(waves)]
+        seen = [self.taken @ part for part in parts]
+        dot = [
+            [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)] for i in range(2)
+        ]
+        along, across = (self.left @ part for part in parts)
+        determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(1e-9)
+        gain = torch.complex(
+            (dot[1][1] * along - dot[0][1] * across) / determinant,
+            (dot[0][0] * across - dot[0][1] * along) / determinant,
+        )
+        return (along * gain.real + across * gain.imag) / 2, gain
+
+
+def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
+    inner = columns.T @ columns + torch.eye(columns.shape[1])
+    lower = torch.linalg.cholesky(inner)
+    fit = torch.linalg.solve_triangular(lower, (columns.T @ white)[:, None], upper=False)
+    return determinant + lower.diagonal().log().sum() + 0.5 * (white.square().sum() - fit.square().sum())
+
+
+def _law(phased: PhasedScene) -> KernelVisibility:
+    law = phased.scene.visibility
+    if not isinstance(law, KernelVisibility):
+        raise TypeError(f"furniture is learned beside KernelVisibility, not {type(law).__name__}")
+    return law

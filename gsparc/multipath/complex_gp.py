@@ -1,0 +1,116 @@
+"""`model=complex_gp`: a Gaussian process on complex channels that knows the carrier but no sources.
+
+Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al., "Measurement
+of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2 law
+over distance lets it fade. Real and imaginary parts share one kernel: the circular complex process.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.multipath.visibility_kernel import matern32
+from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT
+
+LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, tried for the envelope
+NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, tried
+
+
+class ComplexGP(Method):
+    """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid."""
+
+    name = "complex_gp"
+
+    def __init__(self) -> None:
+        self.site: Site | None = None
+
+    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+        """Learn from `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
+        started = time.monotonic()
+        if data.site.kind != "csi" or data.site.wavelength is None:
+            raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
+        known = np.concatenate([fold.train, fold.val])
+        self.site = data.site
+        self.shape = tuple(data.target.shape[1:])
+        self.places = torch.from_numpy(data.moving[known])
+        target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
+        self.power = max(float(target.abs().square().mean()), 1e-30)
+        tried = [
+            (*self._solve(target, length, noise), length, noise) for length in LENGTHS for noise in NOISES
+        ]
+        _, self.factor, self.weights, length, self.noise = min(tried, key=lambda t: t[0])
+        self.length = length * data.site.wavelength
+        note = f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
+        return FitReport(time.monotonic() - started, (note,))
+
+    def _solve(self, target: Tensor, length: float, noise: float) -> tuple[float, Tensor, Tensor]:
+        """Negative log likelihood with the best power, Cholesky factor, weights."""
+        assert self.site is not None
+        assert self.site.wavelength is not None
+        gram = self._kernel(self.places, self.places, length * self.site.wavelength)
+        gram.diagonal().add_(noise)
+        lower = torch.linalg.cholesky(gram)
+        parts = torch.cat([target.real, target.imag], 1)
+        weights = torch.cholesky_solve(parts, lower)
+        fit = float((parts * weights).sum()) / parts.numel()
+        half = target.shape[1]
+        determinant = float(lower.diagonal().log().sum()) / len(parts)
+        nll = 0.5 * np.log(max(fit, 1e-300)) + determinant
+        return nll, lower, torch.complex(weights[:, :half], weights[:, half:])
+
+    def _kernel(self, a: Tensor, b: Tensor, length: float) -> Tensor:
+        assert self.site is not None
+        assert self.site.carrier_hz is not None
+        distance = torch.cdist(a, b)
+        return torch.sinc(2 * distance * self.site.carrier_hz / LIGHT) * matern32(
+            (distance / length).square()
+        )
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        if self.site is None:
+            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
+        moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        cross = self._kernel(moving.detach().cpu().double(), self.places, self.length)
+        known = torch.linalg.solve_triangular(self.factor, cross.T, upper=False).square().sum(0)
+        left = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
+        return Prediction(
+            self._mean(cross),
+            confidence=(1 - left).float().clamp(0, 1),
+            variance=(self.power * left).float(),
+        )
+
+    def mean_at(self, places: Tensor) -> Tensor:
+        """The mean alone (B, A, K) complex64, at places (B, 3) [m] of the moving end."""
+        return self._mean(self._kernel(places.detach().cpu().double(), self.places, self.length))
+
+    def _mean(self, cross: Tensor) -> Tensor:
+        mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)
+        return mean.to(torch.complex64).reshape(len(cross), *self.shape)
+
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        if self.site is None:
+            raise ValueError("complex_gp: not fitted yet; call fit or restore first")
+        names = ("places", "weights", "factor", "length", "noise", "power")
+        return {**{name: getattr(self, name) for name in names}, "shape": list(self.shape)}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.shape = site, tuple(int(n) for n in state["shape"])
+        self.places, self.weights, self.factor = state["places"], state["weights"], state["factor"]
+        self.length, self.noise, self.power = (float(state[k]) for k in ("length", "noise", "power"))
+
+    def size(self) -> int:
+        """Training samples kept."""
+        return len(self.places) if self.site is not None else 0

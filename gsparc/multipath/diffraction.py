@@ -1,0 +1,231 @@
+"""Edges: sources whose diffraction point slides along a straight edge as the receiver moves.
+
+The ray of J. B. Keller (1962) reaches a receiver after s' + s metres, both legs measured along the straight
+line that is left when the half planes through transmitter and receiver are unfolded about the edge, with
+amplitude `1 / sqrt(s s' (s + s'))`. The wave looks as if it came from a point that turns about the edge with
+the receiver, so that no fixed source can stand for it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.gp_likelihood import JITTER, Factor, Posterior, Scene
+from gsparc.multipath.refine import refine
+from gsparc.multipath.rows import Rows
+from gsparc.multipath.source_types import about_edge
+from gsparc.physics.waves import NEAR_M, reduced_phase
+
+BLOCK = 512  # candidates at a time
+GIVING_WAY = 12  # steps of refinement after an edge
+
+
+@dataclass(frozen=True)
+class EdgeSearch:
+    """When an edge is worth having, and how hard to look.
+
+    Attributes:
+        most: edges in all.
+        least_nats: gain of log likelihood below which there is none: an edge is four numbers and a gain.
+        candidates: drawn in the box; axes along x, y or z, tilted a little.
+        polished: best of them, moved uphill.
+        steps: of the ascent.
+        step_m: its step size [m]; axes turn by as many radians.
+        tilt: standard deviation of an axis' departure from x, y or z [rad].
+    """
+
+    most: int = 4
+    least_nats: float = 20.0
+    candidates: int = 40_000
+    polished: int = 48
+    steps: int = 60
+    step_m: float = 0.02
+    tilt: float = 0.03
+
+
+@dataclass(frozen=True)
+class Edges:
+    """K edges and the complex gain each has for R outputs.
+
+    Attributes:
+        point: (K, 3) float64 [m], any point of each.
+        axis: (K, 3) float64 unit vectors along them.
+        gain: (K, R) complex64.
+    """
+
+    point: Tensor
+    axis: Tensor
+    gain: Tensor
+
+    @staticmethod
+    def none() -> Edges:
+        """No edge."""
+        nothing = torch.zeros(0, 3, dtype=torch.float64)
+        return Edges(nothing, nothing, torch.zeros(0, 1, dtype=torch.complex64))
+
+    def __len__(self) -> int:
+        return len(self.point)
+
+    def field(self, places: Tensor, frequency_hz: Tensor, transmitter: Tensor) -> Tensor:
+        """What they add (n, R) complex64 at places (n, 3) [m] and frequencies (n,) [Hz]."""
+        if not len(self):
+            return torch.zeros(len(places), 1, dtype=torch.complex64)
+        return edge_wave(places, self.point, self.axis, transmitter, frequency_hz) @ self.gain
+
+    def over_band(self, places: Tensor, tones_hz: Tensor, transmitter: Tensor) -> Tensor:
+        """The same at every tone (F,): (n, R, F)."""
+        each = [self.field(places, tone.expand(len(places)), transmitter) for tone in tones_hz]
+        return torch.stack(each, -1)
+
+
+def diffracted(places: Tensor, edges: Edges, transmitter: Tensor) -> tuple[Tensor, Tensor]:
+    """Ranges (n, K) float64 [m] of the rays by way of the edges, and where they meet them (n, K, 3) [m]."""
+    length, across_rx, across, along_rx, along_tx = _unfolded(places, edges.point, edges.axis, transmitter)
+    met = along_rx + (along_tx - along_rx) * across_rx / across.clamp_min(NEAR_M)
+    return length, edges.point + met[..., None] * edges.axis
+
+
+def _unfolded(places: Tensor, point: Tensor, axis: Tensor, transmitter: Tensor) -> tuple[Tensor, ...]:
+    """Length of the straight line, distance of the place and of both ends from the edge, and along it."""
+    along_rx, across_rx = about_edge(places, point, axis)
+    along_tx, across_tx = about_edge(transmitter[None], point, axis)
+    across = across_rx + across_tx
+    length = ((along_rx - along_tx).square() + across.square() + NEAR_M**2).sqrt()
+    return length, across_rx, across, along_rx, along_tx
+
+
+def edge_wave(
+    places: Tensor, point: Tensor, axis: Tensor, transmitter: Tensor, frequency_hz: Tensor
+) -> Tensor:
+    """Unit-gain diffracted waves (n, K) complex64; the range is reduced in float64.
+
+    Args:
+        places: (n, 3) float64 [m].
+        point, axis: (K, 3) float64 of the edges.
+        transmitter: (3,) float64 [m].
+        frequency_hz: (n,) float64 [Hz].
+    """
+    length, across_rx, across = _unfolded(places, point, axis, transmitter)[:3]
+    after = length * across_rx / across.clamp_min(NEAR_M)
+    spread = (after.clamp_min(NEAR_M) * (length - after).clamp_min(NEAR_M) * length).sqrt()
+    return torch.polar((1 / spread).float(), reduced_phase(length, frequency_hz[:, None]))
+
+
+def propose(
+    rows: Rows,
+    factor: Factor,
+    transmitter: Tensor,
+    box: Tensor,
+    generator: torch.Generator,
+    search: EdgeSearch,
+) -> tuple[Tensor, Tensor] | None:
+    """Point and axis (3,) of the edge that explains most beside what `factor` holds; None when none pays.
+
+    Args:
+        rows: what the sources are confronted with.
+        factor: of the covariance of the sources found so far.
+        transmitter: (3,) float64 [m].
+        box: (2, 3) float64 [m] where edges may pass.
+        generator: of the candidates.
+        search: effort and threshold.
+    """
+    drawn = torch.rand(search.candidates, 3, generator=generator, dtype=torch.float64)
+    point = box[0] + (box[1] - box[0]) * drawn
+    axis = torch.eye(3, dtype=torch.float64)[torch.arange(len(point)) % 3]
+    axis = axis + search.tilt * torch.randn(axis.shape, generator=generator, dtype=torch.float64)
+    axis = torch.nn.functional.normalize(axis, dim=1)
+    rough = torch.cat(
+        [_matched(rows, p, a, transmitter, factor) for p, a in zip(*_blocks(point, axis), strict=True)]
+    )
+    top = rough.topk(min(search.polished, len(rough))).indices
+    point, axis = _polished(rows, point[top], axis[top], transmitter, factor, search)
+    gained = _score(rows, point, axis, transmitter, factor)
+    best = int(gained.argmax())
+    # A free complex gain that explains nothing but noise is worth one nat.
+    if float(gained[best] - gained[best].log() - 1) < search.least_nats:
+        return None
+    return point[best], axis[best]
+
+
+def find_edges(
+    rows: Rows,
+    scene: Scene,
+    box: Tensor,
+    generator: torch.Generator,
+    noise_floor: float = JITTER,
+    search: EdgeSearch = EdgeSearch(),
+) -> Edges:
+    """Edges one by one, as long as the marginal likelihood wants another; the sources give way in between.
+
+    Args:
+        rows: a few hundred.
+        scene: sources found so far.
+        box: (2, 3) float64 [m] where edges may pass.
+        generator: of the candidates.
+        noise_floor: known variance of the noise, in units of the rows' power.
+        search: effort and threshold.
+    """
+    edges, left = Edges.none(), rows
+    while len(edges) < search.most:
+        factor = Posterior(left, scene, noise_floor).factor
+        found = propose(left, factor, scene.transmitter, box, generator, search)
+        if found is None:
+            break
+        point, axis = (torch.cat([a, b[None]]) for a, b in zip((edges.point, edges.axis), found, strict=True))
+        edges = with_gains(rows, point, axis, scene, noise_floor)
+        left = without(rows, edges, scene.transmitter)
+        scene = refine(left, scene, GIVING_WAY, noise_floor=noise_floor)
+    return edges
+
+
+def without(rows: Rows, edges: Edges, transmitter: Tensor) -> Rows:
+    """The rows less what the edges explain."""
+    return replace(rows, target=rows.target - edges.field(rows.position, rows.frequency, transmitter))
+
+
+def with_gains(rows: Rows, point: Tensor, axis: Tensor, scene: Scene, noise_floor: float = JITTER) -> Edges:
+    """Gains by generalised least squares beside the scene's sources: `(W^H K^-1 W)^-1 W^H K^-1 y`."""
+    if not len(point):
+        return Edges.none()
+    factor = Posterior(rows, scene, noise_floor).factor
+    waves = edge_wave(rows.position, point, axis, scene.transmitter, rows.frequency)
+    white = factor.root @ waves
+    gram = white.mH @ white
+    gram.diagonal().add_(1e-6 * gram.diagonal().real.mean())
+    return Edges(point, axis, torch.linalg.solve(gram, waves.mH @ factor.alpha))
+
+
+def _blocks(*parts: Tensor) -> list[tuple[Tensor, ...]]:
+    return [part.split(BLOCK) for part in parts]
+
+
+def _matched(rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor) -> Tensor:
+    """`|a^H K^-1 y|^2 / |a|^2` (m,)."""
+    waves = edge_wave(rows.position, point, axis, transmitter, rows.frequency)
+    return (waves.mH @ factor.alpha).abs().square().sum(1) / waves.abs().square().sum(0)
+
+
+def _score(rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor) -> Tensor:
+    """`|a^H K^-1 y|^2 / (a^H K^-1 a)` (m,), in nats per output."""
+    waves = edge_wave(rows.position, point, axis, transmitter, rows.frequency)
+    matched = (waves.mH @ factor.alpha).abs().square().sum(1)
+    return matched / (factor.root @ waves).abs().square().sum(0) / factor.alpha.shape[1]
+
+
+def _polished(
+    rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor, search: EdgeSearch
+) -> tuple[Tensor, Tensor]:
+    """Points and axes moved uphill, each on its own hill."""
+    point, axis = point.clone().requires_grad_(), axis.clone().requires_grad_()
+    optimizer = torch.optim.Adam([point, axis], lr=search.step_m, betas=(0.8, 0.95))
+    for step in range(search.steps):
+        optimizer.param_groups[0]["lr"] = search.step_m * 0.5 * (1 + math.cos(math.pi * step / search.steps))
+        optimizer.zero_grad()
+        unit = torch.nn.functional.normalize(axis, dim=1)
+        (-_score(rows, point, unit, transmitter, factor).log().sum()).backward()
+        optimizer.step()
+    return point.detach(), torch.nn.functional.normalize(axis.detach(), dim=1)

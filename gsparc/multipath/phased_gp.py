@@ -1,0 +1,180 @@
+"""Gains that keep their phase: the final process, once the sources are known.
+
+A mirror turns the phase the same way wherever it is seen from; what varies from place to place is how much of
+a source is seen. So `g_k(x) = exp(j phi_k) (u_k(x) + j v_k(x))` with real Gaussian processes u_k and v_k, and
+nearly all the variance in u_k: a share `turning / 2` is left to v_k (1 / 2 would be the circular process of
+`gsparc.multipath.gp_likelihood`). In real and imaginary parts, n complex rows are 2 n real numbers of covariance
+
+    sum_k s_k^2 C_k * [(1 - turning / 2) p p^T + turning / 2 q q^T] + noise / 2
+
+with p = (Re w_k, Im w_k), q = (-Im w_k, Re w_k), w_k = a_k exp(j phi_k). It halves what must be learned of
+each source's visibility; the phases must be known first, so the search itself stays circular.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
+from gsparc.multipath.rows import Rows
+from gsparc.multipath.visibility_kernel import KernelVisibility, View
+
+
+@dataclass(frozen=True)
+class PhasedScene:
+    """A scene whose sources have phases.
+
+    Attributes:
+        scene: positions, amplitudes, visibility, noise.
+        phase: (K,) float32 [rad], phi_k.
+        turning: in (0, 1]; 1 with several outputs, which have no common phase.
+    """
+
+    scene: Scene
+    phase: Tensor
+    turning: float
+
+    @staticmethod
+    def of(rows: Rows, scene: Scene, turning: float) -> PhasedScene:
+        """Phases as the circular process sees them: those of each source's mean gain."""
+        posterior = Posterior(rows, scene)
+        gain = (posterior.waves.mH @ posterior.factor.alpha).sum(1)
+        return PhasedScene(scene, gain.angle(), turning if rows.target.shape[1] == 1 else 1.0)
+
+    def waves(self, rows: Rows) -> Tensor:
+        """w_k at the rows, (n, K) complex64."""
+        return self.scene.waves(rows) * torch.polar(torch.ones(()), self.phase)
+
+    def unshaded(self, rows: Rows) -> Tensor:
+        """The same as if the clutter were not there."""
+        return steering(rows, self.scene.sources) * torch.polar(torch.ones(()), self.phase)
+
+
+def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
+    """p and q, each (2 n, ...) float32, of complex (n, ...)."""
+    return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
+
+
+def shares(turning: float) -> Tensor:
+    """Variance along and across a gain's phase, (2,)."""
+    return torch.tensor([1 - turning / 2, turning / 2])
+
+
+def add_source(covariance: Tensor, wave: Tensor, turning: float, correlation: Tensor) -> None:
+    """Add one source to a covariance (2, n, 2, n); `wave` (n,) complex is s_k w_k."""
+    pair = torch.stack(stacked(wave), 1)
+    covariance.addcmul_(
+        ((pair * shares(turning)) @ pair.T).view_as(covariance), correlation[None, :, None, :]
+    )
+
+
+@dataclass(frozen=True)
+class RealFactor:
+    """A factored covariance of 2 n real numbers with R outputs.
+
+    Attributes:
+        lower: (2 n, 2 n) float32, Cholesky factor.
+        alpha: (2 n, R) float32, K^-1 y.
+        nll: negative log marginal likelihood up to a constant.
+    """
+
+    lower: Tensor
+    alpha: Tensor
+    nll: float
+
+    @staticmethod
+    def of(covariance: Tensor, target: Tensor) -> RealFactor:
+        """From a positive definite covariance (2, n, 2, n), noise included, and targets (n, R) complex."""
+        size = 2 * len(target)
+        lower = torch.linalg.cholesky(covariance.reshape(size, size))
+        flat = stacked(target)[0]
+        alpha = torch.cholesky_solve(flat, lower)
+        determinant = lower.diagonal().double().log().sum()
+        nll = 0.5 * (flat * alpha).double().sum() + target.shape[1] * determinant
+        return RealFactor(lower, alpha, float(nll))
+
+    @cached_property
+    def root(self) -> Tensor:
+        """(2 n, 2 n), inverse of `lower`: K^-1 = root^T root."""
+        return torch.linalg.solve_triangular(self.lower, torch.eye(len(self.lower)), upper=False)
+
+    @cached_property
+    def inverse(self) -> Tensor:
+        """K^-1 (2 n, 2 n)."""
+        return torch.cholesky_inverse(self.lower)
+
+    @property
+    def slope(self) -> Tensor:
+        """G = R K^-1 - alpha alpha^T (2 n, 2 n): d nll = trace(G dK) / 2."""
+        return torch.addmm(self.inverse, self.alpha, self.alpha.T, beta=self.alpha.shape[1], alpha=-1)
+
+
+class PhasedPosterior:
+    """A phased scene confronted with rows."""
+
+    def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
+        self.rows, self.phased, self.noise_floor = rows, phased, noise_floor
+        self.scene = phased.scene
+
+    @cached_property
+    def waves(self) -> Tensor:
+        """w_k at the rows, (n, K) complex64."""
+        return self.phased.waves(self.rows)
+
+    @cached_property
+    def factor(self) -> RealFactor:
+        """Of the covariance and the rows' targets."""
+        n, scene = len(self.rows), self.scene
+        covariance = torch.zeros(2, n, 2, n)
+        for k, source in enumerate(scene.sources):
+            view = View.of(self.rows.position, source)
+            scaled = self.waves[:, k] * scene.log_amplitude[k].exp()
+            add_source(covariance, scaled, self.phased.turning, scene.visibility.correlation(view, view))
+        noise = math.exp(scene.log_noise) + self.noise_floor
+        covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)
+        return RealFactor.of(covariance, self.rows.target)
+
+    @property
+    def pulled(self) -> Tensor:
+        """What each row adds to u_k + j v_k (K, n, R) complex64, before the correlation over places."""
+        n, (along, across) = len(self.rows), shares(self.phased.turning)
+        alpha = torch.complex(self.factor.alpha[:n], self.factor.alpha[n:])
+        power = self.scene.log_amplitude.mul(2).exp()
+        raw = (self.waves.conj() * power).T[:, :, None] * alpha
+        return torch.complex(along * raw.real, across * raw.imag)
+
+    @property
+    def mean_gains(self) -> Tensor:
+        """Each source's gain (K, R) complex64 as far as it is the same everywhere."""
+        law = self.scene.visibility
+        share = float(law.constant) if isinstance(law, KernelVisibility) else 1.0
+        return share * self.pulled.sum(1) * torch.polar(torch.ones(()), self.phased.phase)[:, None]
+
+    def gains(self, places: Tensor) -> Tensor:
+        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], as far as seen."""
+        pulled, per_source = self.pulled, []
+        for k, source in enumerate(self.scene.sources):
+            here, there = View.of(places, source), View.of(self.rows.position, source)
+            correlation = self.scene.visibility.correlation(here, there)
+            per_source.append(torch.complex(correlation @ pulled[k].real, correlation @ pulled[k].imag))
+        turn = torch.polar(self.scene.shade(places), self.phased.phase.expand(1, -1))
+        return torch.stack(per_source, 1) * turn[:, :, None]
+
+    def left_out(self) -> Tensor:
+        """Each row predicted from the rows of all other receivers (n, R) complex64.
+
+        Rasmussen and Williams (2006), eq. 5.12, in blocks.
+        """
+        n, alpha, inverse = len(self.rows), self.factor.alpha, self.factor.inverse
+        order = torch.argsort(self.rows.receiver, stable=True)
+        counts = torch.unique_consecutive(self.rows.receiver[order], return_counts=True)[1]
+        error = torch.empty_like(alpha)
+        for group in order.split(counts.tolist()):
+            both = torch.cat([group, group + n])
+            error[both] = torch.linalg.solve(inverse[both[:, None], both], alpha[both])
+        return self.rows.target - torch.complex(error[:n], error[n:])

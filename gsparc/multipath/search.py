@@ -1,0 +1,221 @@
+"""Finding the sources: greedy back-projection over free space and over words of planes found so far."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.backprojection import Effort, pick_apart, score, search_box
+from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
+from gsparc.multipath.refine import learn_visibility, refine
+from gsparc.multipath.reflection_orders import prune, respell, upright, vote, without_planes
+from gsparc.multipath.rows import Rows
+from gsparc.multipath.visibility_kernel import KernelVisibility
+from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
+from gsparc.physics.waves import LIGHT
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """When a source is worth having, and how long to look.
+
+    Attributes:
+        margin: the box of receivers and transmitter is enlarged by this on every side [m].
+        order: most reflections of a word.
+        max_sources: the search ends there.
+        word_score: least score of a word over known planes.
+        free_score: least score of a source with a plane of its own.
+        words_per_round, free_per_round: most new sources in a round.
+        steps: of refinement after each round.
+        final_steps: of refinement at the end.
+        prune: least gain of a source kept [nats].
+        patience: rounds without a gain of `progress` nats before the search ends.
+        progress: [nats].
+        learn_visibility_from: sources from which on the visibility's lengths are learned.
+        noise: variance at the start, of unit signal power.
+        visibility: the law at the start and the centre of its prior.
+        effort: of each look at free space.
+    """
+
+    margin: float = 8.0
+    order: int = 3
+    max_sources: int = 60
+    word_score: float = 8.0
+    free_score: float = 15.0
+    words_per_round: int = 4
+    free_per_round: int = 2
+    steps: int = 12
+    final_steps: int = 80
+    prune: float = 5.0
+    patience: int = 3
+    progress: float = 8.0
+    learn_visibility_from: int = 12
+    noise: float = 0.1
+    visibility: KernelVisibility = field(default_factory=KernelVisibility)
+    effort: Effort = field(default_factory=Effort)
+
+
+class Search:
+    """One search over one set of rows (unit mean power, places about the middle of the scene).
+
+    Args:
+        rows: a few hundred.
+        transmitter: (3,) float64 [m].
+        settings: how.
+        seed: of the candidates.
+        deadline: `time.monotonic()` after which no new round starts.
+    """
+
+    def __init__(
+        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int, deadline: float = math.inf
+    ) -> None:
+        self.rows, self.settings, self.deadline = rows, settings, deadline
+        self.generator = torch.Generator().manual_seed(seed)
+        self.wavelength = LIGHT / float(rows.frequency.mean())
+        everything = torch.cat([rows.position, transmitter[None]])
+        self.box = torch.stack([everything.amin(0) - settings.margin, everything.amax(0) + settings.margin])
+        waves = steering(rows, transmitter[None])
+        gain = (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
+        self.scene = Scene(
+            transmitter,
+            torch.zeros(0, 4, dtype=torch.float64),
+            ((),),
+            gain.log().reshape(1),
+            math.log(settings.noise),
+            settings.visibility,
+        )
+
+    def run(self) -> Scene:
+        """Search until nothing more pays, then settle."""
+        s, stale, best = self.settings, 0, math.inf
+        self._refine(s.steps)
+        for number in range(60):
+            grown = self._grow_words()
+            free = not grown
+            if free:
+                grown = self._grow_free()
+            if not grown or time.monotonic() > self.deadline:
+                break
+            self._refine(s.steps)
+            if free or number % 2:
+                self.scene = without_planes(self.rows, self.scene, 2 * self.wavelength)
+            if number >= 4 and number % 3 == 1:
+                self._revote()
+            if number % 2:
+                self.scene = prune(self.rows, self.scene, s.prune)
+            if number % 3 == 2:
+                self._learn_visibility(6)
+            nll = Posterior(self.rows, self.scene).nll
+            log.debug(
+                "round %d: %d sources, %d planes, nll %.1f, %s",
+                number, len(self.scene.words), len(self.scene.planes), nll, self.scene.visibility,
+            )  # fmt: skip
+            if len(self.scene.words) >= s.max_sources:
+                break
+            stale, best = (0, nll) if nll < best - s.progress else (stale + 1, best)
+            if stale >= s.patience:
+                break
+        return self._settle()
+
+    def _settle(self) -> Scene:
+        s = self.settings
+        self._refine(20)
+        self._revote()
+        self._respell(upright(self.scene))
+        self.scene = without_planes(self.rows, self.scene, 3 * self.wavelength)
+        self._grow_words()
+        self._refine(s.steps)
+        self.scene = prune(self.rows, self.scene, s.prune)
+        self._learn_visibility(10)
+        self._refine(s.final_steps)
+        return self.scene
+
+    def _refine(self, steps: int) -> None:
+        self.scene = refine(self.rows, self.scene, steps)
+
+    def _learn_visibility(self, steps: int) -> None:
+        if len(self.scene.words) >= self.settings.learn_visibility_from:
+            few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
+            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
+
+    def _grow_words(self, most: int | None = None) -> int:
+        """Add the best words over the planes there are; returns how many."""
+        s, scene = self.settings, self.scene
+        letters = list(range(len(scene.planes)))
+        longer: list[Word] = [
+            (*w, i) for w in scene.words if len(w) < s.order for i in letters if not w or w[-1] != i
+        ]
+        known = set(scene.words)
+        words = [w for w in dict.fromkeys(longer + all_words(letters, 2)) if w not in known]
+        if not words:
+            return 0
+        position = images(scene.transmitter, scene.planes, words)
+        scores, amplitude = score(self.rows, position, Posterior(self.rows, scene).factor)
+        clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
+        chosen = pick_apart(
+            position, scores * clear, 0.5 * self.wavelength, most or s.words_per_round, s.word_score
+        )
+        if chosen:
+            self.scene = scene.with_words([words[i] for i in chosen], amplitude[chosen])
+        return len(chosen)
+
+    def _grow_free(self) -> int:
+        """Add the best sources anywhere in the box, each with a plane of its own; returns how many."""
+        s, posterior = self.settings, Posterior(self.rows, self.scene)
+        found = search_box(
+            self.rows, posterior.factor, self.box, 0.5 * self.wavelength, s.free_per_round,
+            self.generator, s.effort,
+        )  # fmt: skip
+        added = 0
+        for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
+            if gained < s.free_score:
+                continue
+            parent, plane = self._parent(position, posterior)
+            planes = torch.cat([self.scene.planes, plane[None]])
+            word = (*parent, len(planes) - 1)
+            self.scene = replace(self.scene, planes=planes).with_words([word], amplitude[None])
+            added += 1
+        return added
+
+    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Word, Tensor]:
+        """The known source whose bisector with a new one, as a mirror, would explain most of what is left."""
+        scene = posterior.scene
+        able = [i for i, word in enumerate(scene.words) if len(word) < self.settings.order]
+        planes = bisector(scene.sources[able], position)
+        mirrored = reflect(scene.sources[None], planes[:, None])  # (parents, K, 3)
+        flat = mirrored.flatten(0, 1)
+        taken = torch.cat([scene.sources, position[None]])
+        new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
+        scores = score(self.rows, flat, posterior.factor)[0] * new
+        letters = torch.tensor([len(scene.words[i]) for i in able])
+        gain = (scores.reshape(mirrored.shape[:2]) - 6).clamp_min(0).sum(1) - 1.5 * letters
+        best = int(gain.argmax())
+        return scene.words[able[best]], planes[best]
+
+    def _revote(self) -> None:
+        """Find the walls among all pairs of sources and spell every source over them, if that is shorter."""
+        if len(self.scene.words) < 6:
+            return
+        self._respell(vote(self.scene.sources))
+
+    def _respell(self, walls: Tensor | None) -> None:
+        """Spell every source over these walls, if that is shorter."""
+        if walls is None:
+            return
+        before = self.scene
+        self.scene = respell(before, walls)
+        self._refine(20)
+        for _ in range(2):
+            if self._grow_words(6):
+                self._refine(self.settings.steps)
+        saved = len(before.planes) - len(self.scene.planes)
+        allowed = Posterior(self.rows, before).nll + 4 * saved
+        if Posterior(self.rows, self.scene).nll >= allowed:
+            self.scene = before

@@ -1,0 +1,186 @@
+"""`model=uplink`: find the sources in the fresh uplink, hear them again in the downlink's band."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.uplink_method import UplinkMethod
+from gsparc.multipath.uplink.error_model import Heard, Trust, learn, signs, unheard_noise
+from gsparc.multipath.uplink.posterior import Sources
+from gsparc.multipath.uplink.search import SearchSettings, SourceSearch
+from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
+
+LIGHT = 299_792_458.0  # [m/s]
+CHUNK = 32  # snapshots searched together
+LEAKAGES = (1e-4, 3e-4, 1e-3)
+PIECES, PIECE_TONES = 4, 5  # of the downlink, one antenna each, that the confidence is also learned on
+
+
+class UplinkField(UplinkMethod):
+    """A field of plane-wave sources, found anew in every snapshot.
+
+    Directions and delays are the same in both halves of a band; only their interference differs. What is
+    learned from training snapshots is how much the hardware leaks, and how wrong a set of sources will be.
+
+    Args:
+        search: how sources are looked for.
+        teachers: training snapshots that the confidence is learned from, at most.
+        shrink: pull predictions towards zero by the error that is to be expected.
+        seed: of the draw of the teachers.
+    """
+
+    name = "uplink"
+
+    def __init__(
+        self,
+        search: SearchSettings | None = None,
+        teachers: int = 1200,
+        shrink: bool = True,
+        seed: int = 0,
+    ) -> None:
+        if teachers < 50:
+            raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
+        self.settings, self.teachers = search or SearchSettings(), teachers
+        self.shrink, self.seed = shrink, seed
+        self.trust: Trust | None = None
+
+    # ---- learning ----
+    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+        """Choose the leakage on validation rows, learn the confidence on training rows."""
+        started = time.perf_counter()
+        self.site = self._need_uplink(data)
+        self.trust = None
+        rng = np.random.default_rng(self.seed)
+        few = rng.permutation(fold.val if len(fold.val) else fold.train)[:100]
+        errors = {}
+        for leakage in LEAKAGES:
+            self._prepare(self.site, replace(self.settings, leakage=leakage))
+            errors[leakage] = float(np.median(self._taught(data, few, rng, 0)[1]))
+        best = min(errors, key=lambda leakage: errors[leakage])
+        self._prepare(self.site, replace(self.settings, leakage=best))
+        # Nothing of the search is fitted to training rows: their errors are as honest as any.
+        rows = rng.permutation(fold.train)[: self.teachers]
+        self.trust = learn(*self._taught(data, rows, rng, PIECES))
+        note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
+        return FitReport(time.perf_counter() - started, (note,))
+
+    @torch.no_grad()
+    def _taught(
+        self, data: Measurements, rows: np.ndarray, rng: np.random.Generator, pieces: int
+    ) -> tuple[Tensor, Tensor]:
+        """Signs (n, S) and relative errors (n,) of snapshots whose downlink is known, whole and in pieces.
+
+        Pieces are one antenna and a few tones: whoever asks for a narrow grid on one antenna meets fades
+        that the whole downlink never shows.
+        """
+        seen, wrong = [], []
+        whole = self._downlink
+        antennas, tones = len(whole.places), len(whole.tones)
+        for start in range(0, len(rows), CHUNK):
+            batch = data.batch(rows[start : start + CHUNK])
+            assert batch.uplink is not None
+            heard = self._hear(batch.uplink, batch.noise_variance)
+            views = [(slice(None), slice(None))]
+            for _ in range(pieces if tones > PIECE_TONES else 0):
+                one, first = int(rng.integers(antennas)), int(rng.integers(tones - PIECE_TONES + 1))
+                views.append((slice(one, one + 1), slice(first, first + PIECE_TONES)))
+            everything = heard.sources.response(whole)
+            for some, band in views:
+                aperture = Aperture(whole.places[some], whole.tones[band])
+                mean, true = everything[:, some, band], batch.target[:, some, band]
+                wrong.append(_power(mean - true) / _power(true).clamp_min(1e-30))
+                seen.append(signs(heard, mean, aperture))
+        return torch.cat(seen), torch.cat(wrong)
+
+    # ---- answering ----
+    def sources(self, uplink: Tensor, noise: Tensor | None = None) -> Sources:
+        """The sources of snapshots (B, U, L): directions, delays, gains."""
+        return self._hear(uplink, noise).sources
+
+    def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
+        """See `UplinkMethod.listen`; the variance is the expected squared error per entry."""
+        return self._judged(uplink, noise, self._downlink)
+
+    def listen_at(
+        self,
+        uplink: Tensor,
+        frequency_hz: Tensor,
+        noise: Tensor | None = None,
+        antennas: slice = slice(None),
+    ) -> Prediction:
+        """The same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
+        tones = ((frequency_hz.double() - self._middle_hz) / self._spacing_hz).float()
+        return self._judged(uplink, noise, Aperture(self._downlink.places[antennas], tones))
+
+    def _judged(self, uplink: Tensor, noise: Tensor | None, aperture: Aperture) -> Prediction:
+        assert self.trust is not None
+        with torch.inference_mode():  # a fifth less overhead in a single query
+            heard = self._hear(uplink, noise)
+            mean = heard.sources.response(aperture)
+            wrong = self.trust.expected(signs(heard, mean, aperture))
+            if self.shrink:
+                mean = mean / (1 + wrong)[:, None, None]
+            variance = wrong * _power(mean)
+        mean, wrong, variance = (part.clone() for part in (mean, wrong, variance))  # ordinary tensors again
+        return Prediction(mean, confidence=1 / (1 + wrong), variance=variance)
+
+    def _hear(self, uplink: Tensor, noise: Tensor | None) -> Heard:
+        aperture = self.search.aperture
+        if noise is None:
+            noise = unheard_noise(uplink, aperture, self.settings.delay_window)
+        # Timing is the snapshot's own: delays are sought about their mean, and put back where they were.
+        mean = mean_delay(uplink)
+        straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
+        parts = [
+            self.search(straight[i : i + CHUNK], noise[i : i + CHUNK]) for i in range(0, len(uplink), CHUNK)
+        ]
+        found, left = parts[0]
+        if len(parts) > 1:
+            found = Sources(*(torch.cat([getattr(p, name) for p, _ in parts]) for name in vars(found)))
+            left = torch.cat([rest for _, rest in parts])
+        return Heard(replace(found, delay=found.delay + mean[:, None]), left, uplink, noise)
+
+    def _prepare(self, site: Site, settings: SearchSettings) -> None:
+        assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
+        assert site.subcarriers_hz is not None and site.carrier_hz is not None
+        self._middle_hz = float(site.uplink_hz.mean())
+        self._spacing_hz = float(np.diff(np.sort(site.uplink_hz)).min())
+        places = flat_places(site.uplink_array, LIGHT / site.carrier_hz)
+
+        def tones(frequency: np.ndarray) -> Tensor:
+            return torch.from_numpy((frequency - self._middle_hz) / self._spacing_hz).float()
+
+        self.search = SourceSearch(Aperture(places, tones(site.uplink_hz)), settings)
+        chosen = torch.from_numpy(np.asarray(site.antennas))
+        self._downlink = Aperture(places[chosen], tones(site.subcarriers_hz))
+
+    # ---- keeping ----
+    def state(self) -> dict[str, Any]:
+        """See `Method.state`."""
+        trust = None if self.trust is None else vars(self.trust)
+        return {"search": asdict(self.search.settings), "trust": trust}
+
+    def restore(self, site: Site, state: Mapping[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site = site
+        self._prepare(site, SearchSettings(**state["search"]))
+        self.trust = None if state["trust"] is None else Trust(**state["trust"])
+
+    def size(self) -> int:
+        """Sources of a snapshot."""
+        return self.settings.rounds * self.settings.picks
+
+
+def _power(channel: Tensor) -> Tensor:
+    return channel.abs().square().mean((1, 2))
