@@ -33,7 +33,7 @@ METHODS = {
     "directed": "gsparc.multipath.directional_gp.DirectedSources",
     "array": "gsparc.array.method.ArrayField",
     "bearings": "gsparc.array.moving.method.BearingField",
-    "gsparc": "gsparc.best.Gsparc",
+    "gsparc": "gsparc.auto.method.Gsparc",
 }
 
 

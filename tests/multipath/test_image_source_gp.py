@@ -9,9 +9,9 @@ from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
 
 from gsparc import load
+from gsparc.auto.decide import probe_phase
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
-from gsparc.effects import probe_phase
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import method_class
 from gsparc.multipath.image_source_gp import VirtualSourceGP

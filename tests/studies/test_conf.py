@@ -73,7 +73,7 @@ def test_a_typo_gets_the_nearest_right_name(override, hint):
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
-    """A new `auto` must be settled (gsparc/training/auto_settings.py, gsparc/effects.py) and be named here."""
+    """A new `auto` must be settled (gsparc/training/auto_settings.py, gsparc/auto/decide.py) and be named here."""
 
     def still_open(node: dict, prefix: str = ""):
         for key, value in node.items():

@@ -7,8 +7,8 @@ import pytest
 from clocks import WoundClock
 from invented import invent
 
+from gsparc.auto.decide import decide_array
 from gsparc.data.splits import Fold
-from gsparc.effects import decide_array
 from gsparc.methods import timing
 from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitReport

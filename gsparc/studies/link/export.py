@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.best import Gsparc
+from gsparc.auto.method import Gsparc
 from gsparc.data.schema import Site
 from gsparc.methods.method import Method, Prediction
 from gsparc.multipath.directional_gp import DirectedSources

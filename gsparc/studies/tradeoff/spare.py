@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.best import Gsparc
+from gsparc.auto.combine import Companion
+from gsparc.auto.method import Gsparc
 from gsparc.data.schema import Measurements
-from gsparc.hybrid import Companion
 from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
 from gsparc.studies.tradeoff.points import Settings

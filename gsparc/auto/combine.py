@@ -25,9 +25,9 @@ from torch import Tensor
 
 from gsparc.array.cross_validation import LeftOut, without
 from gsparc.array.method import ArrayField
+from gsparc.auto.decide import Decision, Switch, fifths, nmse_of
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.effects import Decision, Switch, fifths, nmse_of
 from gsparc.methods.gp import GaussianProcess, choose_kernel
 from gsparc.methods.method import Method
 from gsparc.multipath.complex_gp import ComplexGP

@@ -13,9 +13,9 @@ from invented import invent
 from rooms import directed, nmse, rough, shoebox
 
 from gsparc.array.cross_validation import LeftOut
+from gsparc.auto.combine import Beside, Rest, Told, compared, learn_rest, searched_beyond, weight_of
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
-from gsparc.hybrid import Beside, Rest, Told, compared, learn_rest, searched_beyond, weight_of
 from gsparc.methods.mean import Mean
 from gsparc.methods.registry import build
 from gsparc.multipath.directional_gp import DirectedSources

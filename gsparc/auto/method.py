@@ -12,9 +12,17 @@ from typing import Any
 from torch import Tensor
 
 from gsparc.array.moving.method import BearingField
-from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold
-from gsparc.effects import (
+from gsparc.auto.combine import (
+    Companion,
+    Rest,
+    Told,
+    learn_rest,
+    left_out_nmse,
+    restored,
+    searched_beyond,
+    weight_of,
+)
+from gsparc.auto.decide import (
     SPLAT,
     Decision,
     EffectSettings,
@@ -25,17 +33,9 @@ from gsparc.effects import (
     probe_array,
     probe_phase,
 )
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold
 from gsparc.field.response import ResponseSettings
-from gsparc.hybrid import (
-    Companion,
-    Rest,
-    Told,
-    learn_rest,
-    left_out_nmse,
-    restored,
-    searched_beyond,
-    weight_of,
-)
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitReport, Method, Prediction
 from gsparc.multipath.directional_gp import DirectedSources

@@ -11,10 +11,7 @@ from known_arrays import array_site, measure, room_vectors
 from rooms import directed
 
 from gsparc.array.method import ArrayField
-from gsparc.data.rfid import load_rfid, planar_array
-from gsparc.data.schema import Site
-from gsparc.data.splits import Fold
-from gsparc.effects import (
+from gsparc.auto.decide import (
     contest_array,
     decide_array,
     decide_directions,
@@ -23,6 +20,9 @@ from gsparc.effects import (
     probe_array,
     spacing_in_wavelengths,
 )
+from gsparc.data.rfid import load_rfid, planar_array
+from gsparc.data.schema import Site
+from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.ops import SphereGrid
 from gsparc.simulate.rfid_sim import ensure_rfid_sim

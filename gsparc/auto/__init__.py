@@ -1,0 +1,1 @@
+"""Which candidate or effect a site calls for, decided by left-out error."""
