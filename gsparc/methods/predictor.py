@@ -12,13 +12,13 @@ from torch import Tensor
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import Kind, Site
 from gsparc.methods import checkpoint
+from gsparc.methods.confidence import Trusted, kept
 from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
-from gsparc.studies.calibrate.stored import Trusted, kept
 
 if TYPE_CHECKING:
-    from gsparc.studies.link.export import Paths
-    from gsparc.studies.tradeoff.stored import Operating
+    from gsparc.methods.export import Paths
+    from gsparc.methods.stored_front import Operating
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to where it was measured is the same
 
@@ -88,7 +88,7 @@ class Predictor:
         """
         if uplink is None and frequency_hz is None and symbols is None:
             return self._ask("csi", tx, rx)
-        from gsparc.studies.link import export
+        from gsparc.methods import export
 
         if uplink is not None:
             channel = export.heard(self.method, self.site, uplink, frequency_hz)
@@ -101,12 +101,12 @@ class Predictor:
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Gains, delays and directions: of what a fresh uplink (B, U, L) holds, or of a coherent field at
-        positions; see `gsparc.studies.link.export`.
+        positions; see `gsparc.methods.export`.
 
         Raises:
             ValueError: the model's channels are not made of paths.
         """
-        from gsparc.studies.link import export
+        from gsparc.methods import export
 
         if uplink is not None:
             return export.heard_paths(self.method, self.site, uplink)
@@ -149,7 +149,7 @@ class Predictor:
     def _sure(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
         """Confidences (B,), whether one was asked for, and whether torch was given."""
         if uplink is not None:
-            from gsparc.studies.link import export
+            from gsparc.methods import export
 
             said = export.judged(self.method, self.site, uplink)
             single, like, places = np.ndim(uplink) == 2, isinstance(uplink, Tensor), None
@@ -259,7 +259,7 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
         trusted.check(confidence)
     if budget_ms is None:
         return Predictor(method, stored.site, trusted=trusted, kind=confidence)
-    from gsparc.studies.tradeoff.choose import within
+    from gsparc.methods.operating_point import within
 
     chosen, point = within(method, stored, budget_ms)
     return Predictor(chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence)

@@ -7,10 +7,10 @@ import pytest
 
 import gsparc
 from gsparc.methods import checkpoint
+from gsparc.methods.confidence import Trusted, as_confidence, keep
+from gsparc.methods.confidence_scores import gather, known_positions, position_kernel
 from gsparc.methods.gp import GaussianProcess
-from gsparc.studies.calibrate.evidence import gather, known_positions, position_kernel
-from gsparc.studies.calibrate.stored import Trusted, as_confidence, keep
-from gsparc.studies.calibrate.threshold import Promise
+from gsparc.methods.risk_threshold import Promise
 
 
 @pytest.fixture

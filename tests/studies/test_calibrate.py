@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from gsparc.methods.confidence_scores import Evidence, gather, joined
+from gsparc.methods.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
 from gsparc.studies.calibrate.command import figures, tables
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
-from gsparc.studies.calibrate.evidence import Evidence, gather, joined
-from gsparc.studies.calibrate.threshold import Promise, Threshold, choose, levels_of, spread_out
 from gsparc.studies.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
 
 

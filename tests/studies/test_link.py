@@ -12,13 +12,13 @@ from cities import city, fold
 
 from gsparc import load
 from gsparc.methods import checkpoint
+from gsparc.methods.resource_grid import centred, interpolated, resource_grid
+from gsparc.methods.risk_threshold import binomial_interval
 from gsparc.multipath.uplink.method import UplinkField
 from gsparc.multipath.uplink.search import SearchSettings
-from gsparc.studies.calibrate.threshold import binomial_interval
 from gsparc.studies.link.adaptation import Rates
 from gsparc.studies.link.beams import gain, loss_db
 from gsparc.studies.link.channels import truth
-from gsparc.studies.link.grid import centred, interpolated, resource_grid
 from gsparc.studies.link.statistics import crossing
 from gsparc.studies.link.study import beam_facts, rate_facts
 

@@ -21,7 +21,7 @@ from gsparc.evaluation.report.intervals import interval, over_seeds
 from gsparc.evaluation.report.learning import curve, validation_figure
 from gsparc.evaluation.report.runs import PER_SAMPLE, Run
 from gsparc.evaluation.report.tables import BASELINES, HEADS, grouped
-from gsparc.studies.tradeoff.points import front
+from gsparc.methods.pareto import front
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95

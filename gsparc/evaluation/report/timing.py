@@ -11,9 +11,9 @@ import torch
 
 from gsparc.evaluation.report.runs import Run
 from gsparc.evaluation.summary import write_samples
+from gsparc.methods.interleaved_timing import Pace, in_turns
 from gsparc.studies.evaluate import open_files
 from gsparc.studies.tradeoff.sweep import asker
-from gsparc.studies.tradeoff.timing import Pace, in_turns
 
 log = logging.getLogger(__name__)
 

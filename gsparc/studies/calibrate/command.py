@@ -19,11 +19,8 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods.method import Method
-from gsparc.methods.timing import machine_facts
-from gsparc.studies import cli
-from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
-from gsparc.studies.calibrate.evidence import (
+from gsparc.methods.confidence import Trusted, keep, threshold_of
+from gsparc.methods.confidence_scores import (
     CHUNK,
     Evidence,
     gather,
@@ -31,9 +28,12 @@ from gsparc.studies.calibrate.evidence import (
     known_positions,
     position_kernel,
 )
+from gsparc.methods.method import Method
+from gsparc.methods.risk_threshold import Promise
+from gsparc.methods.timing import machine_facts
+from gsparc.studies import cli
+from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.studies.calibrate.pictures import draw
-from gsparc.studies.calibrate.stored import Trusted, keep, threshold_of
-from gsparc.studies.calibrate.threshold import Promise
 from gsparc.studies.calibrate.trial import How, Trial, accept, divisible, trials
 from gsparc.studies.evaluate import open_files
 

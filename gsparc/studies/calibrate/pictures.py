@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from gsparc.methods.confidence_scores import Evidence
 from gsparc.studies.calibrate.curves import bounded, risk_coverage
-from gsparc.studies.calibrate.evidence import Evidence
 from gsparc.studies.calibrate.trial import Trial
 
 NAMES = {

@@ -8,9 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from gsparc.studies.calibrate.curves import bounded, risk_coverage
-from gsparc.studies.calibrate.evidence import Evidence
-from gsparc.studies.calibrate.threshold import (
+from gsparc.methods.confidence_scores import Evidence
+from gsparc.methods.risk_threshold import (
     Promise,
     Threshold,
     binomial_interval,
@@ -18,6 +17,7 @@ from gsparc.studies.calibrate.threshold import (
     levels_of,
     spread_out,
 )
+from gsparc.studies.calibrate.curves import bounded, risk_coverage
 
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate

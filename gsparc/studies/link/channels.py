@@ -13,9 +13,9 @@ from torch import Tensor
 from gsparc.data.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.resource_grid import interpolated
 from gsparc.multipath.phase_offsets import estimate
 from gsparc.multipath.uplink.method import UplinkField
-from gsparc.studies.link.grid import interpolated
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World

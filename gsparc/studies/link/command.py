@@ -16,15 +16,15 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.methods.resource_grid import SUBCARRIERS_PER_BLOCK, centred
+from gsparc.methods.risk_threshold import Promise
 from gsparc.methods.timing import machine_facts
 from gsparc.studies import cli
-from gsparc.studies.calibrate.threshold import Promise
 from gsparc.studies.calibrate.trial import accept
 from gsparc.studies.evaluate import open_files
 from gsparc.studies.link.adaptation import Band
 from gsparc.studies.link.channels import Channels, channels
 from gsparc.studies.link.evidence import on_band
-from gsparc.studies.link.grid import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.studies.link.pictures import draw_acceptance, draw_errors, draw_rates
 from gsparc.studies.link.pusch import RECEIVERS, Pusch, frequency_correlation
 from gsparc.studies.link.study import (

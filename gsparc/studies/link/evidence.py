@@ -6,8 +6,8 @@ import numpy as np
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.methods.confidence_scores import Evidence, expected_score, rivals
 from gsparc.methods.method import Prediction
-from gsparc.studies.calibrate.evidence import Evidence, expected_score, rivals
 from gsparc.studies.link.channels import Channels
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from gsparc.studies.calibrate.threshold import binomial_interval
+from gsparc.methods.risk_threshold import binomial_interval
 from gsparc.studies.link.adaptation import Rates
 from gsparc.studies.link.study import Curve
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.studies.calibrate.threshold import binomial_interval
+from gsparc.methods.risk_threshold import binomial_interval
 from gsparc.studies.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.studies.link.beams import LEAST, gain, loss_db
 from gsparc.studies.link.pusch import Blocks, Pusch

@@ -14,6 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from gsparc.auto.reduce import combinations, measure, reduced
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baseline_cache import baseline, platform_cache
@@ -21,17 +22,15 @@ from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.metrics import DECIDING, score_of
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
-from gsparc.methods import checkpoint
+from gsparc.methods import checkpoint, stored_front
+from gsparc.methods.interleaved_timing import Pace
 from gsparc.methods.method import Method
+from gsparc.methods.pareto import Point, cost_of_halving, front
 from gsparc.methods.timing import COPY, machine_facts, peak_memory, reference_copy
 from gsparc.studies import cli
 from gsparc.studies.evaluate import Opened, open_files
-from gsparc.studies.tradeoff import stored
 from gsparc.studies.tradeoff.picture import Rival, beaten_by, draw
-from gsparc.studies.tradeoff.points import Point, cost_of_halving, front
-from gsparc.studies.tradeoff.spare import combinations, measure, reduced
 from gsparc.studies.tradeoff.sweep import asker, candidate, sweep
-from gsparc.studies.tradeoff.timing import Pace
 
 log = logging.getLogger(__name__)
 
@@ -58,7 +57,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
-        stored.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
+        stored_front.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
         name: Rival(value, float(np.median(other_ms[name])), float(np.quantile(other_ms[name], 0.95)))
         for name, (_, value) in rivals.items()

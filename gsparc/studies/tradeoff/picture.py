@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.evaluation.metrics import lower_is_better, score_of
-from gsparc.studies.tradeoff.points import Point
+from gsparc.methods.pareto import Point
 
 NAMES = {
     "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"

@@ -16,11 +16,11 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import Scores, rows_of, score
+from gsparc.methods.interleaved_timing import Pace, in_turns
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.pareto import Point, Settings, worded
 from gsparc.methods.predictor import Predictor
-from gsparc.studies.tradeoff.points import Point, Settings, worded
-from gsparc.studies.tradeoff.timing import Pace, in_turns
-from gsparc.studies.tradeoff.view import View
+from gsparc.methods.reduced import View
 
 log = logging.getLogger(__name__)
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.ops import SphereGrid
-from gsparc.studies.tradeoff.coarse import Filled, coarser
 
 
 @pytest.mark.parametrize("stride", [2, 3, 5])

@@ -15,13 +15,12 @@ from hydra.core.hydra_config import HydraConfig
 
 import gsparc
 from gsparc.evaluation.scores import score
-from gsparc.methods import checkpoint
+from gsparc.methods import checkpoint, operating_point, stored_front
+from gsparc.methods.interleaved_timing import Pace, in_turns
+from gsparc.methods.pareto import Point
 from gsparc.methods.timing import COPY
-from gsparc.studies.tradeoff import choose, stored
 from gsparc.studies.tradeoff.command import task
-from gsparc.studies.tradeoff.points import Point
 from gsparc.studies.tradeoff.sweep import Heard, closeness
-from gsparc.studies.tradeoff.timing import Pace, in_turns
 
 
 @pytest.fixture(scope="module")
@@ -72,9 +71,9 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
 def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
     _, _, ckpt = swept
     before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
-    points, measured = stored.kept(after.extra)
-    assert points and "contribution" in measured and stored.kept(before.extra) == ([], {})
-    assert after.config == before.config and set(after.extra) == {*before.extra, stored.KEY}
+    points, measured = stored_front.kept(after.extra)
+    assert points and "contribution" in measured and stored_front.kept(before.extra) == ([], {})
+    assert after.config == before.config and set(after.extra) == {*before.extra, stored_front.KEY}
     place = field.data.site.origin + 0.1
     same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
     assert np.array_equal(*same)
@@ -98,9 +97,9 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
 
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt = swept
-    points, _ = stored.kept(checkpoint.read(ckpt).extra)
+    points, _ = stored_front.kept(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
-    monkeypatch.setattr(choose, "in_turns", lambda calls, threads, pace: pretended)
+    monkeypatch.setattr(operating_point, "in_turns", lambda calls, threads, pace: pretended)
     best = max(points, key=lambda p: p.score)
     assert gsparc.load(ckpt, budget_ms=1e6).point == best
     assert gsparc.load(ckpt, budget_ms=1.5).point == points[0]
@@ -135,7 +134,7 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
     )
     point = Point("as trained", {}, 1, {"psnr_db": 1.0}, 1.0, np.ones(3))
     with pytest.raises(KeyboardInterrupt):
-        stored.keep(ckpt, [point], "psnr_db", {})
+        stored_front.keep(ckpt, [point], "psnr_db", {})
     assert ckpt.read_bytes() == before and list(tmp_path.iterdir()) == [ckpt]
 
 

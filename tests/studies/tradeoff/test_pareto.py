@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsparc.methods.pareto import Point, cost_of_halving, front, worded
 from gsparc.studies.tradeoff.picture import Rival, beaten_by
-from gsparc.studies.tradeoff.points import Point, cost_of_halving, front, worded
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 

@@ -16,13 +16,14 @@ from gsparc.array.method import ArrayField
 from gsparc.array.moving.method import BearingField
 from gsparc.array.moving.triangulate import SearchSettings
 from gsparc.array.wave_packets import PacketSettings
+from gsparc.auto import reduce
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
 from gsparc.multipath.image_source_gp import VirtualSourceGP
-from gsparc.studies.tradeoff import spare, splatted
 from gsparc.studies.train import train
+from gsparc.training import reduce
 
 
 def answer(method, data, rows):
@@ -39,10 +40,10 @@ def away(method, other, data, rows) -> float:
 def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(field):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
     before = answer(method, data, fold.test).mean.clone()
-    measured = spare.measure(method, data, fold.train)
+    measured = reduce.measure(method, data, fold.train)
     assert measured["contribution"].shape == (40,) and (measured["contribution"] >= 0).all()
-    assert away(method, spare.reduced(method, {"keep": 1.0}, measured), data, fold.test) < 1e-3
-    half, few = (spare.reduced(method, {"keep": share}, measured) for share in (0.5, 0.1))
+    assert away(method, reduce.reduced(method, {"keep": 1.0}, measured), data, fold.test) < 1e-3
+    half, few = (reduce.reduced(method, {"keep": share}, measured) for share in (0.5, 0.1))
     assert half.size() == 20 and few.size() == 4 and method.size() == 40
     assert away(method, half, data, fold.test) < 0.2 < away(method, few, data, fold.test)
     assert torch.equal(answer(method, data, fold.test).mean, before)
@@ -50,8 +51,8 @@ def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(fiel
 
 def test_the_order_of_keeping_is_spread_over_the_sky(field):
     method, fold = field.methods[0], field.split.folds[0]
-    measured = spare.measure(method, field.data, fold.train)
-    order = splatted.spread(method.fitted(), measured)
+    measured = reduce.measure(method, field.data, fold.train)
+    order = reduce.spread(method.fitted(), measured)
     assert sorted(order.tolist()) == list(range(40)) and order[0] == measured["contribution"].argmax()
     seen = torch.nn.functional.normalize(method.fitted().gaussians.means - measured["receiver"][0], dim=1)
 
@@ -73,7 +74,7 @@ def test_the_order_of_keeping_is_spread_over_the_sky(field):
 )
 def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    reduced = spare.reduced(method, settings, spare.measure(method, data, fold.train))
+    reduced = reduce.reduced(method, settings, reduce.measure(method, data, fold.train))
     found = answer(reduced, data, fold.test).mean
     assert found.shape == data.batch(fold.test).target.shape
     assert away(method, reduced, data, fold.test) < near
@@ -81,7 +82,7 @@ def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
 
 def test_confidence_that_is_spared_is_not_computed(field):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    reduced = spare.reduced(method, {"confidence": False}, spare.measure(method, data, fold.train))
+    reduced = reduce.reduced(method, {"confidence": False}, reduce.measure(method, data, fold.train))
     assert answer(reduced, data, fold.test).confidence is None
     assert answer(method, data, fold.test).confidence is not None
     assert away(method, reduced, data, fold.test) == 0
@@ -99,13 +100,13 @@ def packets(tmp_path_factory):
 
 def test_fewer_packets_say_what_all_of_them_said(packets):
     method, data, fold = packets
-    measured = spare.measure(method, data, fold.train)
-    half = spare.reduced(method, {"keep": 0.5}, measured)
-    few = spare.reduced(method, {"keep": 0.05}, measured)
+    measured = reduce.measure(method, data, fold.train)
+    half = reduce.reduced(method, {"keep": 0.5}, measured)
+    few = reduce.reduced(method, {"keep": 0.05}, measured)
     assert half.size() == 48 and few.size() == 5 and method.size() == 96
     error = [away(method, way, data, fold.test) for way in (half, few)]
     assert error[0] < 0.01 and error[0] < error[1]
-    coarse = spare.reduced(method, {"stride": 3, "confidence": False}, measured)
+    coarse = reduce.reduced(method, {"stride": 3, "confidence": False}, measured)
     assert away(method, coarse, data, fold.test) < 0.05 and answer(coarse, data, fold.test).confidence is None
 
 
@@ -115,12 +116,12 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     fold = Fold(rows[rows % 3 > 0], rows[:0], rows[::3])
     method = VirtualSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
     method.fit(data, fold, tmp_path)
-    measured = spare.measure(method, data, fold.train)
-    silent = spare.reduced(method, {"confidence": False}, measured)
+    measured = reduce.measure(method, data, fold.train)
+    silent = reduce.reduced(method, {"confidence": False}, measured)
     assert away(method, silent, data, fold.test) < 1e-9 and answer(silent, data, fold.test).variance is None
-    one = spare.reduced(method, {"searches": 1}, measured)
+    one = reduce.reduced(method, {"searches": 1}, measured)
     assert len(one.members) == 1 and answer(one, data, fold.test).variance is not None
-    few = spare.reduced(method, {"keep": 0.3}, measured)
+    few = reduce.reduced(method, {"keep": 0.3}, measured)
     assert 1 <= few.size() <= method.size() and torch.isfinite(answer(few, data, fold.test).mean).all()
 
 
@@ -128,10 +129,10 @@ def test_a_gaussian_process_spares_components_pixels_and_its_variance(field):
     data, fold = field.data, field.split.folds[0]
     method = GaussianProcess()
     method.fit(data, fold, Path())
-    whole = spare.reduced(method, {"confidence": False}, {})
+    whole = reduce.reduced(method, {"confidence": False}, {})
     assert away(method, whole, data, fold.test) < 1e-8 and answer(whole, data, fold.test).variance is None
-    assert spare.reduced(method, {"confidence": True}, {}) is method
-    few = spare.reduced(method, {"keep": 0.2, "stride": 2}, {})
+    assert reduce.reduced(method, {"confidence": True}, {}) is method
+    few = reduce.reduced(method, {"keep": 0.2, "stride": 2}, {})
     assert few.size() < len(method.axes) and 0 < away(method, few, data, fold.test) < 0.3
 
 
@@ -149,28 +150,28 @@ def crossings(tmp_path_factory):
 
 def test_one_search_is_not_swept_as_two(crossings):
     method, trends = crossings[0], crossings[0].trends
-    assert ("searches" in spare.knobs(method)) == (len(trends) > 1)
+    assert ("searches" in reduce.knobs(method)) == (len(trends) > 1)
     try:
         method.trends = trends[:1] * 2
-        assert "searches" in spare.knobs(method)
+        assert "searches" in reduce.knobs(method)
         method.trends = trends[:1]
-        assert "searches" not in spare.knobs(method)
+        assert "searches" not in reduce.knobs(method)
     finally:
         method.trends = trends
 
 
 def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
     method, data, fold = crossings
-    measured = spare.measure(method, data, fold.train)
-    assert spare.reduced(method, {"confidence": True}, measured) is method
-    silent = spare.reduced(method, {"confidence": False}, measured)
+    measured = reduce.measure(method, data, fold.train)
+    assert reduce.reduced(method, {"confidence": True}, measured) is method
+    silent = reduce.reduced(method, {"confidence": False}, measured)
     assert away(method, silent, data, fold.test) < 1e-8 and answer(silent, data, fold.test).variance is None
     error = [
-        away(method, spare.reduced(method, settings, measured), data, fold.test)
+        away(method, reduce.reduced(method, settings, measured), data, fold.test)
         for settings in ({"keep": 0.5}, {"keep": 0.05})
     ]
     assert 0 < error[0] < error[1] < 0.3
-    coarse = spare.reduced(method, {"stride": 2}, measured)
+    coarse = reduce.reduced(method, {"stride": 2}, measured)
     assert answer(coarse, data, fold.test).mean.shape == data.batch(fold.test).target.shape
     assert 0 < away(method, coarse, data, fold.test) < 0.05
 
@@ -181,38 +182,38 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
     method.fit(field.data, field.split.folds[0], Path())
     columns = field.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
-    assert list(spare.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
+    assert list(reduce.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
     assert f"stride=3: does not divide the {columns} columns" in caplog.text
 
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.split.folds[0], Path())
-    assert list(spare.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
-    assert spare.reduced(method, {"keep": 0.5}, {}) is method
+    assert list(reduce.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
+    assert reduce.reduced(method, {"keep": 0.5}, {}) is method
 
 
 def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
     found = train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1]
     method, data, fold = found.methods[0], found.data, found.split.folds[0]
-    measured = spare.measure(method, data, fold.train)
-    assert "frozen" not in spare.knobs(method)
-    strongest = spare.reduced(method, {"keep": 0.5}, measured)
-    weakest = spare.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
+    measured = reduce.measure(method, data, fold.train)
+    assert "frozen" not in reduce.knobs(method)
+    strongest = reduce.reduced(method, {"keep": 0.5}, measured)
+    weakest = reduce.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
     assert strongest.size() == weakest.size() == 20
     assert away(method, strongest, data, fold.test) < away(method, weakest, data, fold.test)
-    assert away(method, spare.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
+    assert away(method, reduce.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
 
 
 def test_what_a_hybrid_adds_stays_unless_it_is_spared(field):
     data, fold = field.data, field.split.folds[0]
     method = copy.copy(field.methods[0])
-    measured = spare.measure(method, data, fold.train)
-    assert "hybrid" not in spare.knobs(method)
+    measured = reduce.measure(method, data, fold.train)
+    assert "hybrid" not in reduce.knobs(method)
     method._rest = SimpleNamespace(completed=lambda mean, tx, rx: mean + 1.0)
-    assert "hybrid" in spare.knobs(method)
+    assert "hybrid" in reduce.knobs(method)
     plain, added = (
-        answer(spare.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
+        answer(reduce.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
         for on in (False, True)
     )
     assert torch.equal(plain + 1, added)

@@ -16,13 +16,13 @@ from gsparc.array.moving.method import BearingField
 from gsparc.array.moving.power_gp import Trend
 from gsparc.array.moving.triangulate import bearings, mixed
 from gsparc.data.schema import Measurements
+from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import View
 from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
 from gsparc.physics.lags import Lags
-from gsparc.studies.tradeoff.coarse import Filled, coarser
-from gsparc.studies.tradeoff.points import Settings
-from gsparc.studies.tradeoff.view import View
 
 
 def knobs(method: BearingField) -> tuple[str, ...]:

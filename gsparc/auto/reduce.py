@@ -18,18 +18,18 @@ from gsparc.auto.combine import Companion
 from gsparc.auto.method import Gsparc
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import View
 from gsparc.ops import Pose
-from gsparc.studies.tradeoff.points import Settings
-from gsparc.studies.tradeoff.view import View
 
 log = logging.getLogger(__name__)
 
 FAMILIES = {  # the most special class first
-    "gsparc.array.method.ArrayField": "gsparc.studies.tradeoff.packets",
-    "gsparc.array.moving.method.BearingField": "gsparc.studies.tradeoff.crossings",
-    "gsparc.multipath.image_source_gp.VirtualSourceGP": "gsparc.studies.tradeoff.sources",
-    "gsparc.methods.gp.GaussianProcess": "gsparc.studies.tradeoff.components",
-    "gsparc.training.splatting.LearnedField": "gsparc.studies.tradeoff.splatted",
+    "gsparc.array.method.ArrayField": "gsparc.array.reduce",
+    "gsparc.array.moving.method.BearingField": "gsparc.array.moving.reduce",
+    "gsparc.multipath.image_source_gp.VirtualSourceGP": "gsparc.multipath.reduce",
+    "gsparc.methods.gp.GaussianProcess": "gsparc.methods.gp_reduced",
+    "gsparc.training.splatting.LearnedField": "gsparc.training.reduce",
 }
 AS_TRAINED = {
     "keep": 1.0,

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.reduced import View
 from gsparc.ops import Pose, SphereGrid
-from gsparc.studies.tradeoff.view import View
 
 
 def coarser(grid: SphereGrid, stride: int) -> SphereGrid:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from gsparc.auto.reduce import Measured
 from gsparc.methods import checkpoint
-from gsparc.studies.tradeoff.points import Point, Settings
-from gsparc.studies.tradeoff.spare import Measured
+from gsparc.methods.pareto import Point, Settings
 
 KEY = "operating"
 

@@ -12,11 +12,11 @@ from torch import Tensor
 from gsparc.auto.method import Gsparc
 from gsparc.data.schema import Site
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.resource_grid import interpolated, resource_grid
 from gsparc.multipath.directional_gp import DirectedSources
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.uplink.method import UplinkField
 from gsparc.ops import Pose
-from gsparc.studies.link.grid import interpolated, resource_grid
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.methods.coarse_grid import Filled
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import View
 from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
-from gsparc.studies.tradeoff.coarse import Filled
-from gsparc.studies.tradeoff.points import Settings
-from gsparc.studies.tradeoff.view import View
 
 
 def knobs(method: GaussianProcess) -> tuple[str, ...]:

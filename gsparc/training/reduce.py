@@ -13,11 +13,11 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.field.gaussians import edit
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
+from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import View
 from gsparc.ops import Pose, SphereGrid, mean_weights
-from gsparc.studies.tradeoff.coarse import Filled, coarser
-from gsparc.studies.tradeoff.points import Settings
-from gsparc.studies.tradeoff.view import View
 from gsparc.training.splatting import LearnedField
 
 RIDGE = 1e-5  # relative to the mean footprint energy; footprints overlap

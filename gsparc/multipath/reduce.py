@@ -11,11 +11,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import MeanOnly
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
-from gsparc.studies.tradeoff.points import Settings
-from gsparc.studies.tradeoff.view import MeanOnly
 
 
 def knobs(method: VirtualSourceGP) -> tuple[str, ...]:

@@ -11,10 +11,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.methods import checkpoint
+from gsparc.methods.confidence_scores import KINDS, expected_score, process_variance
 from gsparc.methods.gp import Kernel
 from gsparc.methods.method import Prediction
-from gsparc.studies.calibrate.evidence import KINDS, expected_score, process_variance
-from gsparc.studies.calibrate.threshold import Promise, Threshold
+from gsparc.methods.risk_threshold import Promise, Threshold
 
 KEY = "confidence"
 

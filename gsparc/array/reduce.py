@@ -13,11 +13,11 @@ from torch import Tensor
 from gsparc.array.method import ArrayField
 from gsparc.array.wave_packets import WavePackets
 from gsparc.data.schema import Measurements
+from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import MeanOnly
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.studies.tradeoff.coarse import Filled, coarser
-from gsparc.studies.tradeoff.points import Settings
-from gsparc.studies.tradeoff.view import MeanOnly
 
 RIDGE = 1e-6  # relative to a feature's mean square, as when the packets were taught
 
