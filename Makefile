@@ -46,7 +46,7 @@ browser: ## Debian's chromium for the test of the report, where packages can be 
 
 results: setup ## README's results table, measured anew (RFID=folder of the release; about five minutes)
 	$(RUN) train.py -m experiment=results dataset.root=$(RFID) hydra.sweep.dir=outputs/results
-	$(RUN) -m gsparc.evaluation.report outputs/results readme=README.md
+	$(RUN) -m gsparc report outputs/results readme=README.md
 
 test-slow: setup sionna browser ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(RUN) -m pytest -m slow --durations=10
@@ -55,7 +55,7 @@ hard-cases: setup ## every hard case on every backend, and the tables of docs/ha
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md
 
 bench: setup ## timings of the kernels as ratios
-	$(RUN) -m gsparc.studies.bench.command
+	$(RUN) -m gsparc bench
 
 cuda: setup ## build the CUDA kernels for this machine's GPU (otherwise done when first used)
 	$(RUN) -P -m gsparc.ops.cuda_library

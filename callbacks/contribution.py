@@ -8,7 +8,7 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc.field.gaussians import edit
+from gsparc.field import edit
 from gsparc.field.response import PathResponse
 
 log = logging.getLogger(__name__)

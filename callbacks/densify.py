@@ -10,7 +10,7 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc.field.gaussians import edit
+from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 
 log = logging.getLogger(__name__)

@@ -1,8 +1,9 @@
 """The Argos release's layout: `csidata.npy` [N, 8, 52] and `base-station.yml`, uplink in, downlink out.
 
 The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Nobody noted where the
-users were: positions come from an encoder of the uplink (`gsparc.data.position_encoder`), or from the stand-in's truth.
-Whoever predicts here has heard a fresh uplink of the very snapshot, if only to know where the user is.
+users were: positions come from an encoder of the uplink (`gsparc.data.position_encoder`), or from the
+stand-in's truth. Whoever predicts here has heard a fresh uplink of the very snapshot, if only to know where
+the user is.
 """
 
 from __future__ import annotations

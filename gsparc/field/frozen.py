@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.field.gaussians import edit
+from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan

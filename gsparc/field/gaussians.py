@@ -22,7 +22,7 @@ class FieldSettings:
         init: `uniform` in the scene box enlarged by `margin` (the paper), `sphere`: evenly spread
             directions around the static receiver at distances between `near` and `far`, or
             `backprojection`: one Gaussian at each source that a search of the training channels finds
-            (then `count` is not used). `auto` is settled by `gsparc.training.auto_settings` before a field is made.
+            (then `count` is not used). `auto` is settled by `gsparc.training.auto_settings`.
         margin: enlargement of the box on each side [m].
         near, far: range of distances of `sphere` [m].
         opacity: initial opacity in (0, 1).

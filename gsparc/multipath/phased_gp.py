@@ -3,8 +3,8 @@
 A mirror turns the phase the same way wherever it is seen from; what varies from place to place is how much of
 a source is seen. So `g_k(x) = exp(j phi_k) (u_k(x) + j v_k(x))` with real Gaussian processes u_k and v_k, and
 nearly all the variance in u_k: a share `turning / 2` is left to v_k (1 / 2 would be the circular process of
-`gsparc.multipath.gp_likelihood`). In real and imaginary parts, n complex rows are 2 n real numbers of covariance
-
+`gsparc.multipath.gp_likelihood`). In real and imaginary parts, n complex rows are 2 n real numbers of
+covariance
     sum_k s_k^2 C_k * [(1 - turning / 2) p p^T + turning / 2 q q^T] + noise / 2
 
 with p = (Re w_k, Im w_k), q = (-Im w_k, Re w_k), w_k = a_k exp(j phi_k). It halves what must be learned of

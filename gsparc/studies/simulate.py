@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.evaluation.evaluate import summary
+from gsparc.evaluation import summary
 from gsparc.simulate import pictures
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate

@@ -1,1 +1,1 @@
-"""How the field learns: the LightningModule, initial values, schedules, time budget, checkpoints to resume from."""
+"""How the field learns: the LightningModule, initial values, schedules, time budget, resuming."""

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch
+from gsparc.field import edit
 from gsparc.field.confidence import weighted
-from gsparc.field.gaussians import edit
 from gsparc.field.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.ops import UnsoundGaussian

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.gaussians import edit
+from gsparc.field import edit
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
 from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method, Prediction

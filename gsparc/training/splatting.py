@@ -15,11 +15,12 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.field import edit
 from gsparc.field.confidence import Confidence, ConfidenceSettings
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
-from gsparc.field.gaussians import FieldSettings, edit
+from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.methods import checkpoint

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from test_module import module
+from modules import module
 
 from gsparc.ops import Pose, backends, door
 from gsparc.ops.plan import Plan

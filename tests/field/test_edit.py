@@ -2,8 +2,9 @@ from __future__ import annotations
 
 import torch
 
+from gsparc.field import edit
 from gsparc.field.edit import Edit, resize, row_parameters
-from gsparc.field.gaussians import GaussianField, edit
+from gsparc.field.gaussians import GaussianField
 
 
 class Root(torch.nn.Module):

@@ -1,8 +1,9 @@
 """Half precision: 1 - 1e-6 rounds to 1; opacities, transmittances, logarithms and SSIM lose what they say.
 
 Remedy: features, confidence and the closed-form start compute in float32 whatever autocast says
-(gsparc/field/model.py, confidence.py, warmstart.py); float16 and bfloat16 tensors are refused at the rasterizer's
-door. Shown: a run under bfloat16 autocast is finite and ends within 1 % of float32's error.
+(gsparc/field/model.py, confidence.py, gsparc/training/closed_form.py); float16 and bfloat16 tensors are
+refused by the rasterizer. Shown: a run under bfloat16 autocast is finite and ends within 1 % of float32's
+error.
 """
 
 from __future__ import annotations

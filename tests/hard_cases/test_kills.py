@@ -1,9 +1,9 @@
 """Kills: SIGKILL at random moments of training and of simulation.
 
-Remedy: every file appears by renaming (gsparc/methods/checkpoint.py, gsparc/simulate/shards.py); all that a run needs
-to go on is in its last checkpoint, or in its finished shards. Shown: after any kill what is there is whole;
-going on always works; the end is bit-identical to an uninterrupted run's. Tolerance: none. Naive: a file that
-is written in place is cut short by the kill.
+Remedy: every file appears by renaming (gsparc/methods/checkpoint.py, gsparc/simulate/shards.py); all that a
+run needs to go on is in its last checkpoint, or in its finished shards. Shown: after any kill what is there
+is whole; going on always works; the end is bit-identical to an uninterrupted run's. Tolerance: none. Naive:
+a file that is written in place is cut short by the kill.
 """
 
 from __future__ import annotations

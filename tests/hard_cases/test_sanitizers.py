@@ -66,7 +66,7 @@ def watched(module: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     }
     command = [
         sys.executable,
-        "tests/sanitized.py",
+        "tests/helpers/sanitized.py",
         str(module),
         "-q",
         "-s",

@@ -73,7 +73,7 @@ def test_a_typo_gets_the_nearest_right_name(override, hint):
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
-    """A new `auto` must be settled (gsparc/training/auto_settings.py, gsparc/auto/decide.py) and be named here."""
+    """A new `auto` must be settled (training/auto_settings.py, auto/decide.py) and be named here."""
 
     def still_open(node: dict, prefix: str = ""):
         for key, value in node.items():
@@ -116,7 +116,7 @@ def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
     assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
 
 
-@pytest.mark.parametrize("command", ["train", "calibration", "link", "tradeoff"])
+@pytest.mark.parametrize("command", ["train", "calibrate", "link", "tradeoff"])
 def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monkeypatch, capsys):
     """`--help` listed names and values without a word about them."""
     monkeypatch.setattr(sys, "argv", [command, "--help"])

@@ -5,32 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from modules import module
 
-from gsparc.field.confidence import ConfidenceSettings, weighted
-from gsparc.field.emission import EmissionSettings
-from gsparc.field.encoding import EncodingSettings
-from gsparc.field.gaussians import FieldSettings
-from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.ops import Pose
-from gsparc.training.lightning_module import GaussianModule, LossSettings
-from gsparc.training.optimizer import OptimizerSettings
-
-RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
-
-
-def module(data, run_dir, confidence: bool = True) -> GaussianModule:
-    torch.manual_seed(0)
-    emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", log_distance=False)
-    settings = ModelSettings(
-        field=FieldSettings(count=20, init="uniform"),
-        emission=emission,
-        confidence=ConfidenceSettings(enabled=confidence),
-    )
-    shape = data.target.shape[1:] if data.site.kind == "csi" else None
-    model = GaussianModel(settings, data.site, RECEIVER, shape=shape)
-    made = GaussianModule(model, LossSettings(0.0), OptimizerSettings(), 10, run_dir)
-    made.log = lambda *a, **k: None  # type: ignore[method-assign]
-    return made
+from gsparc.field.confidence import weighted
 
 
 def test_the_loss_is_weighted_by_confidence_per_sample(campaign, tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 from jinja2 import Environment
 from PIL import Image
 
-from gsparc.evaluation.evaluate.report import effects, learning, plots, tables
+from gsparc.evaluation.report import effects, learning, plots, tables
 from gsparc.evaluation.report.runs import Run, by_study, told_apart
 from gsparc.evaluation.report.table import Table
 from gsparc.evaluation.summary import BUSY, circumstances, simpler_wins

@@ -67,7 +67,7 @@ class SweepReport(Callback):
 
 def report(folder: Path, title: str, console: Console, settings: SweepReport) -> None:
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
-    from gsparc.evaluation.evaluate.report import plots
+    from gsparc.evaluation.report import plots
     from gsparc.evaluation.report.page import studies, write
     from gsparc.evaluation.report.runs import by_study, find_runs, told_apart
     from gsparc.evaluation.report.tables import seeds

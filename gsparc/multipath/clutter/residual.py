@@ -1,8 +1,8 @@
 """What is left to explain, and how much another box, patch or source would explain of it.
 
-The process of `gsparc.multipath.phased_gp` with its covariance in two parts: what varies from place to place and
-the noise, factored once and held, and the sources' constant gains, a few columns that change with every move
-of a box and are added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
+The process of `gsparc.multipath.phased_gp` with its covariance in two parts: what varies from place to
+place and the noise, factored once and held, and the sources' constant gains, a few columns that change with
+every move of a box and are added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
 """
 
 from __future__ import annotations

@@ -225,7 +225,7 @@ def _broken(trial: Trial) -> str:
 
 def main() -> None:
     """Entry point."""
-    cli.run(task, "calibration")
+    cli.run(task, "calibrate")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,7 @@ import pytest
 from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
 
-from gsparc.evaluation.evaluate.report import plots
+from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import html, studies, warnings
 from gsparc.evaluation.report.readme import BEGIN, END, refresh
 from gsparc.evaluation.report.runs import find_runs

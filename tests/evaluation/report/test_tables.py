@@ -9,7 +9,7 @@ import json
 import numpy as np
 import pytest
 
-from gsparc.evaluation.evaluate.report import effects, learning, tables
+from gsparc.evaluation.report import effects, learning, tables
 from gsparc.evaluation.report.intervals import Interval, bootstrap, interval
 from gsparc.evaluation.report.plots import _short
 from gsparc.evaluation.report.runs import Run, columns, find_runs, told_apart

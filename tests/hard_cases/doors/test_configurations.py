@@ -1,6 +1,7 @@
 """Configurations with a slip of the finger at any depth: the nearest right name, before anything is computed.
 
-Remedy: gsparc/studies/limits.py (what each setting may be) and gsparc/studies/cli.py (one line, the nearest name).
+Remedy: gsparc/studies/limits.py (what each setting may be), gsparc/studies/cli.py (one line, the nearest
+name).
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.studies.train import train
-from gsparc.training import reduce
+from gsparc.training import reduce as field_reduce
 
 
 def answer(method, data, rows):
@@ -52,7 +52,7 @@ def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(fiel
 def test_the_order_of_keeping_is_spread_over_the_sky(field):
     method, fold = field.methods[0], field.split.folds[0]
     measured = reduce.measure(method, field.data, fold.train)
-    order = reduce.spread(method.fitted(), measured)
+    order = field_reduce.spread(method.fitted(), measured)
     assert sorted(order.tolist()) == list(range(40)) and order[0] == measured["contribution"].argmax()
     seen = torch.nn.functional.normalize(method.fitted().gaussians.means - measured["receiver"][0], dim=1)
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from gsparc.data.rfid import HEIGHT, WIDTH
 
-REAL = Path(__file__).resolve().parents[2] / "shared" / "data"
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data"
 
 
 def real(name: str) -> Path:

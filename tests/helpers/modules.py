@@ -1,0 +1,31 @@
+"""A small LightningModule around a field with hidden layers."""
+
+from __future__ import annotations
+
+import torch
+
+from gsparc.field.confidence import ConfidenceSettings
+from gsparc.field.emission import EmissionSettings
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
+from gsparc.field.model import GaussianModel, ModelSettings
+from gsparc.ops import Pose
+from gsparc.training.lightning_module import GaussianModule, LossSettings
+from gsparc.training.optimizer import OptimizerSettings
+
+RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
+
+
+def module(data, run_dir, confidence: bool = True) -> GaussianModule:
+    torch.manual_seed(0)
+    emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", log_distance=False)
+    settings = ModelSettings(
+        field=FieldSettings(count=20, init="uniform"),
+        emission=emission,
+        confidence=ConfidenceSettings(enabled=confidence),
+    )
+    shape = data.target.shape[1:] if data.site.kind == "csi" else None
+    model = GaussianModel(settings, data.site, RECEIVER, shape=shape)
+    made = GaussianModule(model, LossSettings(0.0), OptimizerSettings(), 10, run_dir)
+    made.log = lambda *a, **k: None  # type: ignore[method-assign]
+    return made
