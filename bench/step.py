@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -25,9 +26,9 @@ from hydra import compose, initialize_config_module
 
 from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.training import fit
-from gsparc.training.fit import Training
 from gsparc.training.lightning_module import GaussianModule
 
 STEPS, TURNS = 40, 4
@@ -66,18 +67,19 @@ class Steps:
     def under_lightning(self, log_every: int) -> tuple[float, GaussianModule]:
         """Milliseconds of a step, and the module."""
         method, watch = build(self.config.model), Watch()
-        settings = fit.TrainerSettings(max_steps=STEPS, val_every=STEPS, checkpoint_every=10 * STEPS)
         fit.LOG_EVERY = log_every
-        method.training = Training(settings, callbacks=lambda: [watch])
+        trainer = partial(fit.DEFAULTS, max_steps=STEPS, val_check_interval=STEPS)
         with tempfile.TemporaryDirectory() as folder:
-            method.fit(self.data, self.fold, Path(folder))
+            method.fit(
+                self.data, self.fold, FitContext(Path(folder), trainer=trainer, callbacks=lambda: [watch])
+            )
         assert watch.module is not None
         return median_step(watch.ends), watch.module
 
     def bare(self, adam: Callable, ssim: bool = True) -> float:
         """Milliseconds of a step of a loop that does nothing else."""
         module, ends = self.module, []
-        batch = self.data.batch(self.fold.train[: self.config.trainer.batch_size])
+        batch = self.data.batch(self.fold.train[: self.config.dataset.batch_size])
         module.log = lambda *a, **k: None
         module.loss = type(module.loss)(0.2 if ssim else 0.0)
         optimizer = adam([{"params": [p]} for p in module.parameters() if p.requires_grad])

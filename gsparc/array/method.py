@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +11,17 @@ import torch
 from torch import Tensor
 
 from gsparc.array.cross_validation import LEAST_LEFT, LeftOut, tune
+from gsparc.array.image_gp import compared
+from gsparc.array.phase_retrieval import recover
+from gsparc.array.reduce import reduced
 from gsparc.array.vector_cache import recovered, report
 from gsparc.array.vector_gp import learn_process, mirror_elements
 from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.evaluation.baseline_cache import platform_cache
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
+from gsparc.methods.pareto import Settings
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import site_problem, steering
@@ -26,10 +29,11 @@ from gsparc.physics.bartlett import SpectrumRenderer
 
 log = logging.getLogger(__name__)
 
+ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
 QUERY_CHUNK = 4  # spectra drawn at a time: they stay in the cache
 
 
-class ArrayField(Method):
+class ArrayField(PredictsVariance):
     """The complex field at a static array, as wave packets of the transmitter's position.
 
     Args:
@@ -62,7 +66,7 @@ class ArrayField(Method):
         self.seen = 0
         self.left_out: LeftOut | None = None  # known after `fit`, not stored
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Recover the vectors of the training rows, learn them, distil.
 
         The seconds include the recovery, also when it was found on disk (then as it was first measured).
@@ -82,7 +86,7 @@ class ArrayField(Method):
             log.info("%s: learning from %d of the training spectra", self.name, len(rows))
         found, recovery_s = recovered(data, rows, platform_cache() if self.cache else None, self.seed)
         waited = time.perf_counter() - begin
-        report(found, data, rows, run_dir / "array_recovery.csv")
+        report(found, data, rows, context.run_dir / "array_recovery.csv")
         begin = time.perf_counter()
         self._learn(data, rows, found.vectors)
         seconds = recovery_s + time.perf_counter() - begin
@@ -133,6 +137,39 @@ class ArrayField(Method):
         share = ((left + LEAST_LEFT) / (1 + LEAST_LEFT)) ** self.error[1]
         far = self.error[0] * (1 + LEAST_LEFT) ** self.error[1]
         return Prediction(mean, 1 - share, far * share)
+
+    def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
+        """See `Explains`: whether vectors of one number per element make the images of rows (n,)."""
+        found = recover(data.site, data.target[rows], data.moving[rows], seed=seed)
+        share = 1 - float(found.suspect.mean())
+        assert data.site.array is not None
+        elements = len(data.site.array)
+        reason = f"{share:.0%} of {len(rows)} probed images are explained by {elements} complex numbers each"
+        return share >= ARRAY_SHARE, reason
+
+    def compared_with_gp(self) -> tuple[float, float] | None:
+        """See `ComparesWithGP`."""
+        return None if self.left_out is None else compared(self.left_out)
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        return ("keep", "stride", "confidence")
+
+    @torch.no_grad()
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """`contribution` (N,): the mean power each packet adds at training rows (n,).
+
+        `places` (n, 3) [m]: those rows' positions, where fewer packets learn what all of them predict.
+        """
+        assert self.field is not None
+        places = torch.from_numpy(data.moving[rows].astype(np.float32))
+        features = self.field.features(places)
+        power = (features.square().mean(0) * self.field.gains.square().sum(1)).view(2, -1).sum(0)
+        return {"contribution": power, "places": places}
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        return reduced(self, settings, measured)
 
     def state(self) -> dict[str, Any]:
         """Packets, background, error model."""

@@ -5,39 +5,22 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.method import ArrayField
 from gsparc.array.wave_packets import WavePackets
-from gsparc.data.schema import Measurements
 from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
 from gsparc.physics.bartlett import SpectrumRenderer
 
+if TYPE_CHECKING:
+    from gsparc.array.method import ArrayField
+
 RIDGE = 1e-6  # relative to a feature's mean square, as when the packets were taught
-
-
-def knobs(method: ArrayField) -> tuple[str, ...]:
-    """What can be turned."""
-    return ("keep", "stride", "confidence")
-
-
-@torch.no_grad()
-def measure(method: ArrayField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """`contribution` (N,): the mean power each packet adds at training rows (n,).
-
-    `places` (n, 3) [m]: those rows' positions, where fewer packets learn what all of them said.
-    """
-    assert method.field is not None
-    places = torch.from_numpy(data.moving[rows].astype(np.float32))
-    features = method.field.features(places)
-    power = (features.square().mean(0) * method.field.gains.square().sum(1)).view(2, -1).sum(0)
-    return {"contribution": power, "places": places}
 
 
 @torch.no_grad()

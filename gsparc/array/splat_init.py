@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from gsparc.data.schema import Measurements
 from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import seen_by_array
+from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
@@ -45,6 +47,17 @@ class Vectors:
     prior: Prior
     waited_s: float
     billed_s: float
+
+
+class ThroughArray:
+    """Gaussians whose emissions through the array make the recovered vectors; see `Initialiser`."""
+
+    def __call__(self, task: InitTask) -> Start:
+        """Recover the vectors of the training rows."""
+        assert task.receiver is not None
+        found = settled_vectors(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+        solve = partial(start, data=task.data, found=found, receiver=task.receiver)
+        return Start(found.prior, None, solve, found.billed_s, found.waited_s)
 
 
 def settled_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Vectors:

@@ -9,16 +9,11 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from scipy.spatial import cKDTree
 
-from gsparc.array.moving.method import POOR, beyond, site_problem
-from gsparc.array.phase_retrieval import recover
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import Method
-from gsparc.methods.target_rows import to_real
-from gsparc.physics.lags import Lags
+from gsparc.methods.method import Explains, FitContext, Method
 
 Switch = bool | Literal["auto", "splat"]
 SPLAT = "splat"
@@ -27,7 +22,6 @@ DENSE = 0.25  # neighbours closer than this many wavelengths can be interpolated
 PROBE_IMAGES = 12
 LOOSE = 0.5  # wavelengths between neighbours beyond which their vectors need not tell of one another
 CONTEST_ROWS = 400  # neighbouring training spectra that a contest of two methods is held on
-ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
 
 
 @dataclass(frozen=True)
@@ -200,7 +194,7 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
         )
     errors = {}
     for name, method in (("coherent", trial), ("interpolation", rival)):
-        method.fit(data, inner, Path())
+        method.fit(data, inner, FitContext())
         errors[name] = nmse_of(method, data, inner.test)
     better = errors["coherent"] < errors["interpolation"]
     reason = (
@@ -212,19 +206,13 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
     return Decision("phase", better, reason, time.perf_counter() - started)
 
 
-def probe_array(data: Measurements, fold: Fold, seed: int) -> Decision:
+def probe_array(candidate: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
     """Can the declared array have measured a few of the training images?"""
     started = time.perf_counter()
     spread = np.linspace(0, len(fold.train) - 1, min(PROBE_IMAGES, len(fold.train))).astype(int)
-    rows = np.unique(fold.train[spread])
-    if data.site.static_end == "tx":
-        return _probe_moving_array(data, rows, started)
-    found = recover(data.site, data.target[rows], data.moving[rows], seed=seed)
-    share = 1 - float(found.suspect.mean())
-    assert data.site.array is not None
-    elements = len(data.site.array)
-    reason = f"{share:.0%} of {len(rows)} probed images are explained by {elements} complex numbers each"
-    return Decision("array", share >= ARRAY_SHARE, reason, time.perf_counter() - started)
+    assert isinstance(candidate, Explains)
+    holds, reason = candidate.explains(data, np.unique(fold.train[spread]), seed)
+    return Decision("array", holds, reason, time.perf_counter() - started)
 
 
 def contest_array(trial: Method, rival: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
@@ -251,21 +239,10 @@ def contest_array(trial: Method, rival: Method, data: Measurements, fold: Fold, 
     batch, errors = data.batch(inner.test), []
     for method in (trial, rival):
         with tempfile.TemporaryDirectory() as aside:  # what a trial writes is no part of the run
-            method.fit(data, inner, Path(aside))
+            method.fit(data, inner, FitContext(Path(aside)))
         errors.append(float((method.predict(batch.tx, batch.rx).mean - batch.target).square().mean()))
     reason = (
         f"neighbours are {apart:.2f} wavelengths apart; on a held-out fifth of the training spectra the "
         f"array's squared error is {errors[0]:.4f}, the Gaussian process's {errors[1]:.4f}"
     )
     return Decision("array", errors[0] < errors[1], reason, time.perf_counter() - started)
-
-
-def _probe_moving_array(data: Measurements, rows: np.ndarray, started: float) -> Decision:
-    problem, site = site_problem(data), data.site
-    if problem is not None:
-        return Decision("array", False, problem, time.perf_counter() - started)
-    assert site.array is not None and site.grid is not None and site.wavelength is not None
-    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
-    _, left = beyond(Lags(site.array, site.grid, site.wavelength), images)
-    reason = f"{left:.1%} of the energy of {len(rows)} probed images is beyond the moving array"
-    return Decision("array", left <= POOR, reason, time.perf_counter() - started)

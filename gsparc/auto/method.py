@@ -6,20 +6,17 @@ import copy
 import logging
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from gsparc.array.moving.method import BearingField
 from gsparc.auto.combine import (
     Companion,
-    Rest,
-    Told,
-    learn_rest,
+    DirectionalEnsemble,
+    held_out_ratio,
+    learn_companion,
     left_out_nmse,
     restored,
-    searched_beyond,
     weight_of,
 )
 from gsparc.auto.decide import (
@@ -36,19 +33,19 @@ from gsparc.auto.decide import (
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.response import ResponseSettings
-from gsparc.methods.gp import GaussianProcess
-from gsparc.methods.method import FitReport, Method, Prediction
-from gsparc.multipath.directional_gp import DirectedSources
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.methods.method import FitContext, FitReport, HasPaths, LeaveOneOut, Method, Prediction, Resumable
+from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import View, contributions, knobs, reduced
+from gsparc.methods.registry import method_class
 from gsparc.ops import Pose
-from gsparc.training.fit import Training
 from gsparc.training.splatting import LearnedField
 
 log = logging.getLogger(__name__)
 
-# The say of directed sources above which nobody else is asked, below which they are not.
-ALONE, UNHEARD = 0.9, 0.05
+# Weight of the directional model above which it predicts alone, below which it is not used.
+ALONE, UNUSED = 0.9, 0.05
 HOPELESS = 0.9  # NMSE of held-out channels from which on a short search promises nothing of a long one
+LEAST_BUDGET_S = 1.0  # left to what was decided on, however long deciding took
 
 
 class Gsparc(LearnedField):
@@ -59,9 +56,9 @@ class Gsparc(LearnedField):
         phase_model: what predicts where `phase` is on.
         phase_probe: the same with a small budget, for the probe.
         array_model: what predicts where `array` is on and the receiver is static.
-        bearing_model: what predicts where `array` is on and the receiver moves.
-        directed_model: what predicts, alone or with `phase_model`, where `directions` is on; checkpoints of
-            before there was one have none.
+        moving_array_model: what predicts where `array` is on and the receiver moves.
+        directional_model: what predicts, alone or with `phase_model`, where `directions` is on; None in
+            early checkpoints.
         **field: see `LearnedField`.
     """
 
@@ -69,10 +66,10 @@ class Gsparc(LearnedField):
         self,
         effects: EffectSettings,
         phase_model: Method,
-        phase_probe: VirtualSourceGP,
+        phase_probe: Method,
         array_model: Method,
-        bearing_model: Method,
-        directed_model: DirectedSources | None = None,
+        moving_array_model: Method,
+        directional_model: Method | None = None,
         **field: Any,
     ) -> None:
         response = replace(
@@ -82,83 +79,80 @@ class Gsparc(LearnedField):
         )
         super().__init__(response=response, **field)
         self.switches = effects
-        self._models: dict[str, Method] = {"phase": phase_model, "array": array_model}
-        self._directed, self._optimism = directed_model or DirectedSources(), 1.0
-        self._models |= {"bearings": bearing_model, "directions": self._directed}
-        self._followed = FitReport(0.0)
+        self._models = {"phase": phase_model, "array": array_model, "moving_array": moving_array_model}
+        self._models["directions"] = directional_model or method_class("directional_gp")()
+        self._directional, self._ratio = self._models["directions"], 1.0
+        self._directional_report = FitReport(0.0)
         self._probe = phase_probe
         self._chosen: str | None = None
-        self._rest: Companion | None = None
+        self._companion: Companion | None = None
         self.decisions: tuple[Decision, ...] = ()
 
     @property
-    def effects(self) -> str:
+    def effects(self) -> str:  # type: ignore[override]
         """The effects that are computed, for `summary.json`."""
-        response = self.settings.response
+        response, companion, directions = self.settings.response, self._companion, ""
         splatted = [name for name, on in (("array", response.array), ("phase", response.carrier)) if on]
-        told, rest = ("+directions", self._rest.rest) if isinstance(self._rest, Told) else ("", self._rest)
+        if isinstance(companion, DirectionalEnsemble):
+            directions, companion = "+directions", companion.rest
         chosen = self._chosen or "+".join(f"{name} (splat)" for name in splatted) or "none"
-        return chosen + told + ("" if rest is None else "+hybrid")
+        return chosen + directions + ("" if companion is None else "+hybrid")
 
-    @property
-    def answering(self) -> tuple[Method, Companion | None]:
-        """What computes the answers, itself when no effect is on, and what completes them."""
-        return (self if self._chosen is None else self._models[self._chosen]), self._rest
+    # -- learning ----------------------------------------------------------------------------------
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Decide, then train what was decided on; the probe's time is part of the bill."""
         self.site = data.site
-        self.decisions = self._decide(data, fold)
+        self.decisions = self._decide(data, fold, context.seed)
         for decision in self.decisions:
             log.info("%s", decision)
         others = (d.effect for d in self.decisions if d.on and getattr(self.switches, d.effect) != SPLAT)
-        self._chosen = next(others, None)
-        if self._chosen == "array" and data.site.static_end == "tx":
-            self._chosen = "bearings"
+        self._chosen = self._named(next(others, None), data.site)
         if self._chosen is None:
-            report = super().fit(data, fold, run_dir)
+            report = super().fit(data, fold, context)
         else:
-            if (
-                self._chosen != "directions"
-            ):  # they were followed while deciding: nothing is left to go on with
-                self._go_on(self._models[self._chosen])
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
-            chosen, budget_s = self._models[self._chosen], self.training.settings.budget_s
-            if budget_s is not None:
-                _limit(chosen, self.training, budget_s - sum(d.seconds for d in self.decisions))
-            report = self._followed if self._chosen == "directions" else chosen.fit(data, fold, run_dir)
-            decision, self._rest = learn_rest(self.switches.hybrid, self._models[self._chosen], data, fold)
+            report = self._fit_chosen(data, fold, context)
+            decision, self._companion = learn_companion(
+                self.switches.hybrid, self._models[self._chosen], data, fold
+            )
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
-            self._listen()
+            self._weigh_directional()
         return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
 
-    def _listen(self) -> None:
-        """Weigh sources of measured directions beside searched ones."""
-        told = any(d.effect == "directions" and d.on for d in self.decisions)
-        searched = None if self._chosen is None else self._models[self._chosen]
-        if not told or not isinstance(searched, VirtualSourceGP):
-            return
-        weight = weight_of(self._directed, searched, self._optimism)
-        log.info("effects.directions: %.0f%% of the say, by left-out channels", 100 * weight)
-        if weight > ALONE:
-            self._chosen, self._rest = "directions", None
-        elif weight > UNHEARD:
-            assert self._rest is None or isinstance(self._rest, Rest)
-            self._rest = Told(self._directed, weight, self._rest)
+    @staticmethod
+    def _named(effect: str | None, site: Site) -> str | None:
+        return "moving_array" if effect == "array" and site.static_end == "tx" else effect
 
-    def _go_on(self, model: Method) -> None:
-        """Hand over what an interrupted run has left."""
-        if self.training.resume is None:
-            return
-        if not hasattr(model, "resume"):
+    def _fit_chosen(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        chosen = self._models[self._chosen or ""]
+        if chosen is self._directional:  # fitted while deciding
+            return self._directional_report
+        if context.resume is not None and not isinstance(chosen, Resumable):
             raise ValueError(
-                f"ckpt_path: effects.{self._chosen} finds the vectors it has recovered by itself; "
+                f"ckpt_path: effects.{self._chosen} trains in one piece (recovered vectors are cached); "
                 "start again without ckpt_path"
             )
-        model.resume = self.training.resume
+        if context.budget_s is not None:
+            left = context.budget_s - sum(d.seconds for d in self.decisions)
+            context = replace(context, budget_s=max(left, LEAST_BUDGET_S))
+        return chosen.fit(data, fold, context)
 
-    def _decide(self, data: Measurements, fold: Fold) -> tuple[Decision, ...]:
+    def _weigh_directional(self) -> None:
+        """Weigh sources of measured directions beside searched ones."""
+        wanted = any(d.effect == "directions" and d.on for d in self.decisions)
+        searched = None if self._chosen is None else self._models[self._chosen]
+        if not wanted or searched is self._directional or not isinstance(searched, LeaveOneOut):
+            return
+        weight = weight_of(self._directional, searched, self._ratio)  # type: ignore[arg-type]
+        log.info("effects.directions: weight %.0f%%, by left-out channels", 100 * weight)
+        if weight > ALONE:
+            self._chosen, self._companion = "directions", None
+        elif weight > UNUSED:
+            self._companion = DirectionalEnsemble(self._directional, weight, self._companion)
+
+    def _decide(self, data: Measurements, fold: Fold, seed: int) -> tuple[Decision, ...]:
         hidden = self.settings.emission.hidden
         splatting = f"emission.hidden={hidden}" if hidden else None
         antennas = data.target.shape[1] if data.site.kind == "csi" else 1
@@ -167,83 +161,133 @@ class Gsparc(LearnedField):
         sources = phase.on and self.switches.phase != SPLAT
         directions = decide_directions(self.switches.directions, sources, data)
         if directions.on:
-            directions = self._follow(data, fold)
+            directions = self._fit_directional(data, fold)
         if directions.on and sources:
-            phase = self._search_beside(data, fold)
+            phase = self._search_beside(data, fold, seed)
         elif phase.on and self.switches.phase == "auto":
-            phase = probe_phase(self._probe, GaussianProcess(), data, fold, self.training.seed)
+            phase = probe_phase(self._probe, method_class("gp")(), data, fold, seed)
         if array.on and self.switches.array == "auto":
-            array = probe_array(data, fold, self.training.seed)
+            candidate = self._models[self._named("array", data.site) or ""]
+            array = probe_array(candidate, data, fold, seed)
             if array.on and data.site.static_end == "rx":
-                array = self._contest(array, data, fold)
+                array = self._contest(array, data, fold, seed)
         return phase, array, directions
 
-    def _contest(self, array: Decision, data: Measurements, fold: Fold) -> Decision:
-        """The array's vectors explain the spectra; whether they also foretell them."""
+    def _contest(self, array: Decision, data: Measurements, fold: Fold, seed: int) -> Decision:
+        """The array's vectors explain the spectra; whether they predict held-out spectra."""
         trial = copy.deepcopy(self._models["array"])
-        contest = contest_array(trial, GaussianProcess(), data, fold, self.training.seed)
+        contest = contest_array(trial, method_class("gp")(), data, fold, seed)
         if contest.on:
             return replace(array, seconds=array.seconds + contest.seconds)
         return replace(contest, seconds=array.seconds + contest.seconds)
 
-    def _search_beside(self, data: Measurements, fold: Fold) -> Decision:
+    def _search_beside(self, data: Measurements, fold: Fold, seed: int) -> Decision:
         """Whether a search is worth its time beside measured directions."""
         started = time.perf_counter()
-        error, self._optimism = searched_beyond(self._probe, data, fold.train, self.training.seed)
+        error, self._ratio = held_out_ratio(self._probe, data, fold.train, seed)
         reason = (
             f"short searches leave NMSE {error:.3f} of held-out channels, "
-            f"{self._optimism:.1f} times what they promise"
+            f"{self._ratio:.1f} times their leave-one-out error"
         )
         on = error < HOPELESS or self.switches.phase is True
         return Decision("phase", on, reason, time.perf_counter() - started)
 
-    def _follow(self, data: Measurements, fold: Fold) -> Decision:
+    def _fit_directional(self, data: Measurements, fold: Fold) -> Decision:
         """Sources of measured directions, used where they predict left-out channels at all."""
         wanted = self.switches.directions is True
         try:
-            report = self._directed.fit(data, fold, Path())
-            self._followed = replace(report, seconds=0.0)  # the decision's own
+            report = self._directional.fit(data, fold, FitContext())
+            self._directional_report = replace(report, seconds=0.0)  # the decision's own
         except ValueError as error:
             if wanted:
                 raise
             return Decision("directions", False, str(error))
-        nmse = left_out_nmse(self._directed, data)
-        reason = f"{self._directed.size()} sources where rays meet leave NMSE {nmse:.3f} of left-out channels"
+        nmse = left_out_nmse(self._directional, data)
+        reason = (
+            f"{self._directional.size()} sources where rays meet leave NMSE {nmse:.3f} of left-out channels"
+        )
         return Decision("directions", wanted or nmse < 1, reason, report.seconds)
 
+    # -- answering ---------------------------------------------------------------------------------
+
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; the variance errs high by what a process beside it explains."""
+        """See `Method.predict`; the variance errs high by what a companion explains."""
         if self._chosen is None:
             return super().predict(tx, rx)
-        said = self._models[self._chosen].predict(tx, rx)
-        if self._rest is None:
-            return said
-        return replace(said, mean=self._rest.completed(said.mean, tx, rx))
+        found = self._models[self._chosen].predict(tx, rx)
+        if self._companion is None:
+            return found
+        return replace(found, mean=self._companion.completed(found.mean, tx, rx))
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `Differentiable`; of what was chosen, where that has gradients, without a companion."""
+        if self._chosen is None:
+            return super().mean_at(tx, rx)
+        return self._models[self._chosen].mean_at(tx, rx)  # type: ignore[attr-defined]
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+        """See `HasPaths`; of what was chosen, without a companion."""
+        chosen = None if self._chosen is None else self._models[self._chosen]
+        if not isinstance(chosen, HasPaths):
+            raise ValueError("its channels are not made of paths")
+        return chosen.paths(tx, rx)
+
+    def trainer_options(self) -> bool:
+        """See `TrainsByGradient`: where no effect but splatted ones was chosen."""
+        return self._chosen is None
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`; `hybrid=false` is without the companion."""
+        own = super().knobs() if self._chosen is None else knobs(self._models[self._chosen])
+        return own if self._companion is None else (*own, "hybrid")
+
+    def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
+        """See `Reducible`."""
+        if self._chosen is None:
+            return super().contributions(data, rows)
+        return contributions(self._models[self._chosen], data, rows)
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        own = {knob: value for knob, value in settings.items() if knob != "hybrid"}
+        if self._chosen is None:
+            found = super().reduced(own, measured)
+        else:
+            found = reduced(self._models[self._chosen], own, measured)
+        keep = self._companion is not None and settings.get("hybrid", True)
+        return Completed(found, self._companion) if keep else found  # type: ignore[arg-type]
+
+    # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """What was chosen, and its state."""
         inner = super().state() if self._chosen is None else self._models[self._chosen].state()
-        rest = None if self._rest is None else self._rest.state()
-        return {"chosen": self._chosen, "inner": inner, "rest": rest}
+        companion = None if self._companion is None else self._companion.state()
+        return {"chosen": self._chosen, "inner": inner, "rest": companion}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self._chosen = site, state["chosen"]
+        self.site, self._chosen = site, {"bearings": "moving_array"}.get(state["chosen"], state["chosen"])
         if self._chosen is None:
             super().restore(site, state["inner"])
         else:
             self._models[self._chosen].restore(site, state["inner"])
-        rest = state.get("rest")
-        self._rest = None if rest is None else restored(site, rest)
+        companion = state.get("rest")
+        self._companion = None if companion is None else restored(site, companion)
 
     def size(self) -> int:
         """Number of Gaussians or sources."""
         return super().size() if self._chosen is None else self._models[self._chosen].size()
 
 
-def _limit(chosen: Method, training: Training, budget_s: float) -> None:
-    """Leave a method that takes a budget what the probes have left of it [s]."""
-    if isinstance(chosen, VirtualSourceGP):
-        chosen.budget_s = budget_s
-    elif isinstance(chosen, BearingField):
-        chosen.training = Training(replace(training.settings, budget_s=max(budget_s, 1.0)), training.seed)
+class Completed(View):
+    """A reduced method with the companion of the whole one."""
+
+    def __init__(self, inner: Method, companion: Companion) -> None:
+        super().__init__(inner)
+        self.companion = companion
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        found = self.inner.predict(tx, rx)
+        return replace(found, mean=self.companion.completed(found.mean, tx, rx))

@@ -17,7 +17,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
 from gsparc.methods import checkpoint
-from gsparc.methods.method import Method
+from gsparc.methods.method import FitContext, Method
 from gsparc.methods.registry import method_class
 
 log = logging.getLogger(__name__)
@@ -76,7 +76,7 @@ def baseline(
             method = method_class(name)()
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
-            report = method.fit(data, known, room or Path())
+            report = method.fit(data, known, FitContext(room or Path()))
             spent = time.process_time() - spent  # a busy machine's clock is not to be kept
             for note in report.notes:
                 log.info("fold %d: %s", number, note)

@@ -88,7 +88,7 @@ def evaluate(
     facts |= {
         "model/name": methods[0].name,
         "model/num_gaussians": methods[0].size(),
-        "model/effects": getattr(methods[0], "effects", None),
+        "model/effects": methods[0].effects,
     }
     facts |= dataset_facts(data) | split_facts(split) | peak_memory()
     return Evaluation(facts, _columns(scores, others, data))

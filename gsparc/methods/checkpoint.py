@@ -17,6 +17,7 @@ from torch import Tensor
 from gsparc.data.files import whole_file
 from gsparc.data.schema import Site
 from gsparc.methods.method import Method
+from gsparc.methods.old_names import OLD_NAMES, renamed
 from gsparc.methods.registry import METHODS, build, method_class
 from gsparc.ops import SphereGrid
 
@@ -65,7 +66,7 @@ class Stored:
             raise CheckpointError(
                 f"{self.path}: its configuration is not YAML; the file is damaged"
             ) from None
-        return loaded if isinstance(loaded, dict) else {}
+        return renamed(loaded) if isinstance(loaded, dict) else {}
 
 
 def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None) -> None:
@@ -80,7 +81,7 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     Raises:
         CheckpointError: something in the state is of another type, its place is named; or there is no room.
     """
-    site = getattr(method, "site", None)
+    site = method.site
     if site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
     content = {
@@ -165,7 +166,7 @@ def read(path: str | Path) -> Stored:
     try:
         return Stored(
             method=str(content["method"]),
-            target=str(content["target"]),
+            target=OLD_NAMES.get(str(content["target"]), str(content["target"])),
             config=str(content["config"]),
             site=_site_from(content["site"]),
             state=dict(content["state"]),

@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.auto.method import Gsparc
 from gsparc.data.schema import Site
-from gsparc.methods.method import Method, Prediction
+from gsparc.methods.method import HasPaths, Method, Prediction
 from gsparc.methods.resource_grid import interpolated, resource_grid
-from gsparc.multipath.directional_gp import DirectedSources
-from gsparc.multipath.image_source_gp import VirtualSourceGP
-from gsparc.multipath.uplink.method import UplinkField
+from gsparc.methods.uplink_method import SeparatesPaths, UplinkMethod
 from gsparc.ops import Pose
+
+WITH_PATHS = "(model=image_source_gp and directional_gp are, or uplink with uplink=)"
 
 
 @dataclass(frozen=True)
@@ -44,9 +43,7 @@ class Paths:
 
 def judged(method: Method, site: Site, uplink: Any) -> Prediction:
     """Channels of the measured tones in stored units with their confidence and variance; see `heard`."""
-    snapshots = _snapshots(method, site, uplink)
-    assert isinstance(method, UplinkField)
-    return method.listen(snapshots)
+    return _reader(method).listen(_snapshots(method, site, uplink))
 
 
 def heard(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> Tensor:
@@ -56,18 +53,15 @@ def heard(method: Method, site: Site, uplink: Any, frequency_hz: Any = None) -> 
         ValueError: the model reads no uplink, or one of another shape.
     """
     snapshots = _snapshots(method, site, uplink)
-    assert isinstance(method, UplinkField)
     if frequency_hz is None:
         frequency_hz = site.subcarriers_hz
     wanted = torch.from_numpy(np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64)))
-    return method.listen_at(snapshots, wanted).mean * site.target_scale
+    return _separator(method).listen_at(snapshots, wanted).mean * site.target_scale
 
 
 def heard_paths(method: Method, site: Site, uplink: Any) -> Paths:
     """The sources of uplinks (B, U, L), physical units; see `heard`."""
-    snapshots = _snapshots(method, site, uplink)
-    assert isinstance(method, UplinkField)
-    found = method.sources(snapshots)
+    found = _separator(method).sources(_snapshots(method, site, uplink))
     assert site.uplink_hz is not None
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
     return Paths(
@@ -86,16 +80,13 @@ def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:
     Raises:
         ValueError: the model's channels are not made of paths.
     """
-    method = method.answering[0] if isinstance(method, Gsparc) else method
-    if not isinstance(method, VirtualSourceGP | DirectedSources):
-        raise ValueError(f"paths: channels of {method.name} are not made of paths (model=vsgp, uplink)")
-    gain, delay, direction = method.paths(tx, rx)
-    return Paths(
-        (gain * site.target_scale).numpy(),
-        delay.numpy(),
-        method.frame.carrier_hz,
-        direction=direction.numpy(),
-    )
+    if not isinstance(method, HasPaths):
+        raise ValueError(f"paths: channels of {method.name} are not made of paths {WITH_PATHS}")
+    try:
+        gain, delay, direction, carrier_hz = method.paths(tx, rx)
+    except ValueError as error:
+        raise ValueError(f"paths: {method.name}: {error} {WITH_PATHS}") from error
+    return Paths((gain * site.target_scale).numpy(), delay.numpy(), carrier_hz, direction=direction.numpy())
 
 
 def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
@@ -118,9 +109,22 @@ def on_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None)
     return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
 
 
+def _reader(method: Method) -> UplinkMethod:
+    if not isinstance(method, UplinkMethod):
+        raise ValueError(f"uplink=: {method.name} reads no uplink, it predicts at positions")
+    return method
+
+
+def _separator(method: Method) -> SeparatesPaths:
+    if not isinstance(method, SeparatesPaths):
+        raise ValueError(f"uplink=: {method.name} knows only the measured tones, no paths (model=uplink)")
+    return method
+
+
 def _snapshots(method: Method, site: Site, uplink: Any) -> Tensor:
-    if not isinstance(method, UplinkField) or site.uplink_array is None or site.uplink_hz is None:
-        raise ValueError(f"uplink=: {method.name} reads no uplink, it answers positions")
+    _reader(method)
+    if site.uplink_array is None or site.uplink_hz is None:
+        raise ValueError(f"uplink=: {site.name} has no uplink")
     shape = (len(site.uplink_array), len(site.uplink_hz))
     given = torch.as_tensor(uplink).to(torch.complex64)
     given = given[None] if given.ndim == 2 else given

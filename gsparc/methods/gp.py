@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,10 +14,13 @@ from scipy.optimize import minimize
 from sklearn.gaussian_process.kernels import Matern
 from torch import Tensor
 
-from gsparc.data.schema import Kind
+from gsparc.data.schema import Kind, Measurements
+from gsparc.methods.gp_reduced import reduced
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import Prediction
+from gsparc.methods.method import Method, Prediction, PredictsVariance
+from gsparc.methods.pareto import Settings
 from gsparc.methods.target_rows import entry_variance, to_real
+from gsparc.ops import Pose
 
 
 @dataclass(frozen=True)
@@ -136,7 +140,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     return Kernel(length, noise, leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[1])
 
 
-class GaussianProcess(Interpolator):
+class GaussianProcess(Interpolator, PredictsVariance):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
     Args:
@@ -186,11 +190,26 @@ class GaussianProcess(Interpolator):
             variance=entry_variance(variance, mean, self.site.kind),
         )
 
-    def mean_at(self, places: Tensor) -> Tensor:
-        """The mean (B, ...) alone at places (B, 3) [m]; the variance is most of a prediction."""
-        cross = self.kernel.cross(places.detach().cpu().double().numpy(), self.positions)
-        scores = (torch.from_numpy(cross) @ self.weights).float()
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
+        places = torch.from_numpy(self.positions)
+        squared = (self._queries(tx, rx)[:, None] - places).square().sum(-1)
+        far = squared.clamp_min(1e-24).sqrt() * (math.sqrt(3) / self.kernel.length)  # finite slope at 0
+        scores = (((1 + far) * torch.exp(-far)) @ self.weights).float()
         return self._decode(torch.addmm(self.mean, scores, self.axes))
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        assert self.site is not None
+        return ("keep", "confidence", *(("stride",) if self.site.kind == "spectrum" else ()))
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Nothing: what a component contributes stands in the process."""
+        return {}
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        return reduced(self, settings)
 
     def _learned(self) -> dict[str, Any]:
         return {

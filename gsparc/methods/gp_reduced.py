@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Measurements
 from gsparc.methods.coarse_grid import Filled
-from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View
 from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
 
-
-def knobs(method: GaussianProcess) -> tuple[str, ...]:
-    """What can be turned."""
-    assert method.site is not None
-    return ("keep", "confidence", *(("stride",) if method.site.kind == "spectrum" else ()))
+if TYPE_CHECKING:
+    from gsparc.methods.gp import GaussianProcess
 
 
-def measure(method: GaussianProcess, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """Nothing: what a component contributes stands in the process."""
-    return {}
-
-
-def reduced(method: GaussianProcess, settings: Settings, measured: dict[str, Tensor]) -> Method:
+def reduced(method: GaussianProcess, settings: Settings) -> Method:
     """The mean of the process with the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
     assert method.site is not None
     if set(settings) <= {"confidence"} and settings.get("confidence", True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.target_rows import from_real, training_targets
 from gsparc.ops import Pose
 
@@ -30,7 +29,7 @@ class Interpolator(Method):
         self.shape: tuple[int, ...] = ()
         self.seen = 0
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none."""
         rows = np.concatenate([fold.train, fold.val])
         if not len(rows):
@@ -44,8 +43,13 @@ class Interpolator(Method):
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
         if self.site is None:
             raise ValueError(f"{self.name}: fit or restore it first")
-        queries = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
-        return self._look_up(queries.detach().cpu().double().numpy())
+        return self._look_up(self._queries(tx, rx).detach().numpy())
+
+    def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Places (B, 3) float64 [m] of the moving end."""
+        assert self.site is not None
+        moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        return moving.cpu().double()
 
     def state(self) -> dict[str, Any]:
         """Target shape, number of rows, and what the subclass learned."""

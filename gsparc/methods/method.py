@@ -1,12 +1,15 @@
-"""The one face of every method: learned fields, Gaussian processes and the mean image alike."""
+"""What every method is (`Method`), what some can do besides, and what a fit is given (`FitContext`)."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
@@ -42,13 +45,56 @@ class FitReport:
     notes: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class FitContext:
+    """What a run brings along to a fit.
+
+    Attributes:
+        run_dir: where the fit may write.
+        seed: of whatever is random and has no seed of its own.
+        budget_s: seconds of training; None: as the method is configured.
+        resume: what an interrupted run left, to go on from.
+        init_from: a checkpoint of the same model whose weights training starts from.
+        batch_size: rows of a step of gradient training.
+        trainer: makes a Lightning Trainer from further options; None: with `DEFAULTS` of `training.fit`.
+        callbacks: makes fresh Lightning callbacks.
+        loggers: made once per run, closed by the caller.
+        config_yaml: the whole configuration, stored in every checkpoint.
+
+    Raises:
+        ValueError: a budget that is no time, or a batch without rows.
+    """
+
+    run_dir: Path = Path()
+    seed: int = 0
+    budget_s: float | None = None
+    resume: Path | None = None
+    init_from: Path | None = None
+    batch_size: int = 16
+    trainer: partial[Any] | None = None
+    callbacks: Callable[[], Sequence[Any]] = tuple
+    loggers: Sequence[Any] = ()
+    config_yaml: str = ""
+
+    def __post_init__(self) -> None:
+        if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
+            raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
+        if type(self.batch_size) is not int or self.batch_size < 1:
+            raise ValueError(
+                f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
+            )
+
+
 class Method(ABC):
     """fit, predict, save, load; nothing else is asked of a method."""
 
     name: str
+    site: Site | None = None  # what was learned from; None before `fit` or `restore`
+    effects: str | None = None  # the propagation effects that are computed, for `summary.json`
+    guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
 
     @abstractmethod
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Learn from `fold.train` (and choose settings on `fold.val`); `fold.test` is not looked at."""
 
     @abstractmethod
@@ -70,3 +116,110 @@ class Method(ABC):
     def size(self) -> int:
         """Number of Gaussians, sources or stored training samples."""
         return 0
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Training rows predicted from all others.
+
+    Attributes:
+        rows: (n,) rows of the measurements, ascending where each occurs once.
+        residual: (n, R) complex, what was measured less what the others predict, stored units.
+        aligned: whether a phase of every snapshot's own was estimated and removed before.
+    """
+
+    rows: np.ndarray
+    residual: Tensor
+    aligned: bool = False
+
+
+@runtime_checkable
+class LeaveOneOut(Protocol):
+    """Predicts its training rows, each without itself (Rasmussen and Williams 2006, eq. 5.12)."""
+
+    def leave_one_out(self) -> LeftOut:
+        """Residuals of the rows it was fitted on."""
+
+
+@runtime_checkable
+class ComparesWithGP(Protocol):
+    """Can say by left-out rows how much a Gaussian process on whole targets would add to it."""
+
+    def compared_with_gp(self) -> tuple[float, float] | None:
+        """How far the process is behind [dB], and its best weight in their mean; None: too few rows."""
+
+
+@runtime_checkable
+class Explains(Protocol):
+    """Can say before it is fitted whether its model of the measurement holds."""
+
+    def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
+        """Whether it can have made the targets of rows (n,), and the measurement that decided, one clause."""
+
+
+@runtime_checkable
+class HasPaths(Protocol):
+    """Its channels are sums of propagation paths."""
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+        """Gains (B, A, N), delays (B, A, N) [s], directions of arrival (B, N, 3), and the carrier [Hz].
+
+        Raises:
+            ValueError: what was fitted here has none.
+        """
+
+
+@runtime_checkable
+class Reducible(Protocol):
+    """Answers faster and less accurately when asked to."""
+
+    def knobs(self) -> tuple[str, ...]:
+        """Names of the settings that mean something to what was fitted."""
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """What must be known of training rows (n,) to reduce it; stored with the model."""
+
+    def reduced(self, settings: dict[str, Any], measured: dict[str, Tensor]) -> Method:
+        """A method that answers with these settings; this one is left as it is."""
+
+
+class PredictsVariance(Method):
+    """Methods whose every prediction has a variance; makes them `HasVariance`."""
+
+    def variance_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `HasVariance`."""
+        variance = self.predict(tx, rx).variance
+        assert variance is not None
+        return variance
+
+
+@runtime_checkable
+class HasVariance(Protocol):
+    """Knows the expected squared error of its predictions."""
+
+    def variance_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """(B,) float32, expected squared error per entry, stored units."""
+
+
+@runtime_checkable
+class Differentiable(Protocol):
+    """Its mean has gradients by position."""
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean of `predict`, with autograd, at tx (B, 3) [m] and one shared or B receiver poses."""
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """Goes on from what an interrupted run left (`FitContext.resume`)."""
+
+    def resume_problem(self) -> str | None:
+        """Why it cannot with its present settings; None when it can."""
+
+
+@runtime_checkable
+class TrainsByGradient(Protocol):
+    """Trains under a Lightning Trainer and heeds its options."""
+
+    def trainer_options(self) -> bool:
+        """Whether it does with its present settings; known before `fit` or settled by it."""

@@ -10,12 +10,12 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from gsparc.auto.reduce import reduced
 from gsparc.data.schema import Site
 from gsparc.methods.checkpoint import Stored
 from gsparc.methods.interleaved_timing import Pace, in_turns
 from gsparc.methods.method import Method
 from gsparc.methods.predictor import Predictor
+from gsparc.methods.reduced import reduced
 from gsparc.methods.stored_front import Operating, kept
 
 log = logging.getLogger(__name__)

@@ -29,12 +29,23 @@ METHODS = {
     "fire": "gsparc.peers.fire.Fire",
     "uplink": "gsparc.multipath.uplink.method.UplinkField",
     "complex_gp": "gsparc.multipath.complex_gp.ComplexGP",
-    "vsgp": "gsparc.multipath.image_source_gp.VirtualSourceGP",
-    "directed": "gsparc.multipath.directional_gp.DirectedSources",
+    "image_source_gp": "gsparc.multipath.image_source_gp.VirtualSourceGP",
+    "directional_gp": "gsparc.multipath.directional_gp.DirectedSources",
     "array": "gsparc.array.method.ArrayField",
-    "bearings": "gsparc.array.moving.method.BearingField",
+    "moving_array": "gsparc.array.moving.method.BearingField",
     "gsparc": "gsparc.auto.method.Gsparc",
 }
+
+INITIALISERS = {  # of a splatted field, by the coherent term they are for
+    "carrier": "gsparc.multipath.splat_init.FromSources",
+    "array": "gsparc.array.splat_init.ThroughArray",
+}
+
+
+def initialiser(name: str) -> Any:
+    """The initialiser (`gsparc.field.initial.Initialiser`) called `name`."""
+    module, _, attribute = INITIALISERS[name].rpartition(".")
+    return getattr(import_module(module), attribute)()
 
 
 def suggest(name: str, known: Mapping[str, Any] | list[str]) -> str:

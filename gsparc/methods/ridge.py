@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.method import FitContext, FitReport, Prediction
 from gsparc.methods.uplink_method import UplinkMethod
 
 PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -32,7 +31,7 @@ class Ridge(UplinkMethod):
             raise ValueError(f"ridge: inputs={inputs!r} is none of own, all")
         self.inputs = inputs
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Solve the normal equations for each penalty and scaling, keep what validates best."""
         started = time.perf_counter()
         self.site = self._need_uplink(data)

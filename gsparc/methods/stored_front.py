@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsparc.auto.reduce import Measured
 from gsparc.methods import checkpoint
 from gsparc.methods.pareto import Point, Settings
+from gsparc.methods.reduced import Measured
 
 KEY = "operating"
 

@@ -3,12 +3,26 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.methods.method import Method, Prediction
 from gsparc.ops import Pose
+
+
+@runtime_checkable
+class SeparatesPaths(Protocol):
+    """Finds the propagation paths of an uplink."""
+
+    def sources(self, uplink: Tensor) -> Any:
+        """Gains, delays and directions (B, N) of uplinks (B, U, L)."""
+
+    def listen_at(
+        self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
+    ) -> Prediction:
+        """Channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
 
 
 class UplinkMethod(Method):

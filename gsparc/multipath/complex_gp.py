@@ -8,7 +8,6 @@ over distance lets it fade. Real and imaginary parts share one kernel: the circu
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
 from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
@@ -26,7 +25,7 @@ LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, tried for the envelope
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, tried
 
 
-class ComplexGP(Method):
+class ComplexGP(PredictsVariance):
     """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid."""
 
     name = "complex_gp"
@@ -34,7 +33,7 @@ class ComplexGP(Method):
     def __init__(self) -> None:
         self.site: Site | None = None
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Learn from `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
         started = time.monotonic()
         if data.site.kind != "csi" or data.site.wavelength is None:
@@ -80,8 +79,8 @@ class ComplexGP(Method):
         """See `Method.predict`."""
         if self.site is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
-        moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
-        cross = self._kernel(moving.detach().cpu().double(), self.places, self.length)
+        with torch.no_grad():
+            cross = self._cross(tx, rx)
         known = torch.linalg.solve_triangular(self.factor, cross.T, upper=False).square().sum(0)
         left = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
         return Prediction(
@@ -90,9 +89,20 @@ class ComplexGP(Method):
             variance=(self.power * left).float(),
         )
 
-    def mean_at(self, places: Tensor) -> Tensor:
-        """The mean alone (B, A, K) complex64, at places (B, 3) [m] of the moving end."""
-        return self._mean(self._kernel(places.detach().cpu().double(), self.places, self.length))
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean alone (B, A, K) complex64; see `Differentiable`."""
+        return self._mean(self._cross(tx, rx))
+
+    def leave_one_out(self) -> LeftOut:
+        """See `LeaveOneOut`; rows are those of the fit, counted from 0."""
+        inverse = torch.cholesky_inverse(self.factor).diagonal()
+        return LeftOut(np.arange(len(self.places)), self.weights / inverse[:, None])
+
+    def _cross(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Covariance (B, n) of the moving end's places with those learned from."""
+        assert self.site is not None
+        moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        return self._kernel(moving.cpu().double(), self.places, self.length)
 
     def _mean(self, cross: Tensor) -> Tensor:
         mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)

@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
 from gsparc.multipath.frame import Frame, frame_of, refuse
 from gsparc.multipath.gp_likelihood import JITTER, Factor, steering
 from gsparc.multipath.position_refine import Pinning
@@ -95,7 +94,7 @@ LAWS = tuple(Law(c, length, noise) for c in CONSTANTS for length in LENGTHS_M fo
 PINNING = Law(0.97, 2.0, 0.01)  # while places are pinned
 
 
-class DirectedSources(Method):
+class DirectedSources(PredictsVariance):
     """Channels of a moving receiver whose directions of arrival were measured; queries need none.
 
     Args:
@@ -103,16 +102,16 @@ class DirectedSources(Method):
         seed: of which, where there are more.
     """
 
-    name = "directed"
+    name = "directional_gp"
 
     def __init__(self, rows: int = 3000, seed: int = 0) -> None:
         if rows < 8:
-            raise ValueError(f"directed: rows must be at least 8, got {rows}")
+            raise ValueError(f"directional_gp: rows must be at least 8, got {rows}")
         self.row_limit, self.seed = rows, seed
         self.site: Site | None = None
 
     # ---- learning ----
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Learn from `train` and `val`.
 
         Raises:
@@ -121,7 +120,7 @@ class DirectedSources(Method):
         started = time.monotonic()
         refuse(data.site, self.name)
         if data.directions is None:
-            raise ValueError("directed: needs directions of arrival; this dataset has none")
+            raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
         known = _some(np.concatenate([fold.train, fold.val]), self.seed)
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
@@ -130,7 +129,7 @@ class DirectedSources(Method):
         seen = torch.from_numpy(bundles.seen(found))
         often = torch.nonzero(seen.sum(0) >= LEAST_SEEN).flatten()
         if not len(often):
-            raise ValueError("directed: the directions of arrival meet nowhere")
+            raise ValueError("directional_gp: the directions of arrival meet nowhere")
         often = often[seen[:, often].sum(0).argsort(descending=True, stable=True)[:MOST_SOURCES]]
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
@@ -145,7 +144,7 @@ class DirectedSources(Method):
         self._relearn()
         changed = self._revote()
         note = (
-            f"directed: {len(self.sources)} sources where rays meet, their directions' error "
+            f"directional_gp: {len(self.sources)} sources where rays meet, their directions' error "
             f"{math.degrees(bundles.error):.2g} degrees; "
             f"{changed} sightings by the channels; {self.law.constant:.1%} of a gain is the same everywhere"
         )
@@ -269,7 +268,7 @@ class DirectedSources(Method):
         loudness = (self.frame.carrier_hz / tones).float()
         return (mean * (loudness * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
 
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """What `predict` sums, one path a source: see `VirtualSourceGP.paths`."""
         query = self._query(tx, rx)
         gain = query.likely * wave(query.away, self.frame.carrier_hz)
@@ -278,7 +277,8 @@ class DirectedSources(Method):
         away = query.away.view(query.count, -1, len(self.sources))
         delay = (away / LIGHT).expand(-1, self.antennas, -1)
         towards = self.sources - query.places.view(query.count, -1, 3).mean(1)[:, None]
-        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        return gain, delay, towards, self.frame.carrier_hz
 
     def _query(self, tx: Tensor, rx: Pose) -> Query:
         """What the regression needs to know of places, antennas of the receivers in its frame."""
@@ -314,10 +314,10 @@ class DirectedSources(Method):
         doubt = (loud * likely * (1 - likely)).sum(1)
         return gains.clamp_min(0) + doubt + self.law.noise, (loud * likely).sum(1) + self.law.noise
 
-    def left_over(self) -> tuple[np.ndarray, Tensor]:
-        """Receivers (n,) and what all others leave unexplained of their channels (n, R), in stored units.
+    def leave_one_out(self) -> LeftOut:
+        """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`.
 
-        Who sees what is left out, too.
+        A receiver's own visibility of the sources is left out, too.
         """
         self._fitted()
         likely = self.sightings.left_out[self.observer].float()
@@ -331,7 +331,7 @@ class DirectedSources(Method):
             own = torch.linalg.solve(self.factor.inverse[group[:, None], group], self.factor.alpha[group])
             said[group] -= cross[group] @ (self.factor.inverse[:, group] @ own)
         loud = (self.frame.carrier_hz / self.rows.frequency).float()[:, None] * self.frame.scale
-        return self.rows.receiver.numpy(), (self.rows.target - said) * loud
+        return LeftOut(self.rows.receiver.numpy(), (self.rows.target - said) * loud)
 
     # ---- keeping ----
     def state(self) -> dict[str, Any]:
@@ -366,7 +366,7 @@ class DirectedSources(Method):
 
     def _fitted(self) -> Site:
         if self.site is None:
-            raise ValueError("directed: not fitted yet; call fit or restore first")
+            raise ValueError("directional_gp: not fitted yet; call fit or restore first")
         return self.site
 
 

@@ -7,7 +7,6 @@ import time
 from collections import Counter
 from dataclasses import replace
 from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction, PredictsVariance
+from gsparc.methods.pareto import Settings
 from gsparc.multipath.clutter.blocking import Clutter
 from gsparc.multipath.diffraction import Edges, diffracted, edge_wave, find_edges, with_gains, without
 from gsparc.multipath.ensemble import Budget, Member, agreed, search_many, weights
@@ -25,6 +25,7 @@ from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
+from gsparc.multipath.reduce import reduced
 from gsparc.multipath.rows import Rows, elements, gather, query_elements, tones_of
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Shelf
@@ -43,7 +44,7 @@ ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
 ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
 
 
-class VirtualSourceGP(Method):
+class VirtualSourceGP(PredictsVariance):
     """The virtual-source Gaussian process for a moving receiver, or for a transmitter before one antenna.
 
     Args:
@@ -54,7 +55,7 @@ class VirtualSourceGP(Method):
         rows: receivers times tones that the final process holds.
         margin, max_sources, order: see `SearchSettings`.
         offsets: what every snapshot has of its own: `none`, `phase`, or `phase_timing`; it is estimated.
-        furniture: look for boxes that hide and mirrors that end, shared by all sources.
+        clutter: look for occluding boxes and finite mirrors, shared by all sources.
         edges: look for edges, whose diffraction point slides with the receiver; kept when the likelihood
             wants them.
         seed: of everything random.
@@ -63,8 +64,7 @@ class VirtualSourceGP(Method):
         ValueError: the data are not channels, or their phase means nothing.
     """
 
-    name = "vsgp"
-    resume: Path | None = None  # what an interrupted run has left
+    name = "image_source_gp"
 
     def __init__(
         self,
@@ -76,18 +76,18 @@ class VirtualSourceGP(Method):
         max_sources: int = 60,
         order: int = 3,
         offsets: Offsets = "none",
-        furniture: bool = True,
+        clutter: bool = True,
         edges: bool = True,
         seed: int = 0,
     ) -> None:
         if offsets not in KINDS:
-            raise ValueError(f"vsgp: offsets={offsets!r} is none of {', '.join(KINDS)}")
+            raise ValueError(f"{self.name}: offsets={offsets!r} is none of {', '.join(KINDS)}")
         if searches < 1:
-            raise ValueError(f"vsgp: searches must be at least 1, got {searches}")
+            raise ValueError(f"{self.name}: searches must be at least 1, got {searches}")
         if search_rows < 8 or rows < 8:
-            raise ValueError(f"vsgp: search_rows and rows must be at least 8, got {search_rows} and {rows}")
+            raise ValueError(f"{self.name}: search_rows={search_rows}, rows={rows}: at least 8 are needed")
         self.searches, self.budget_s, self.seed = searches, budget_s, seed
-        self.offsets, self.furniture, self.look_for_edges = offsets, furniture, edges
+        self.offsets, self.clutter, self.look_for_edges = offsets, clutter, edges
         self.edges = Edges.none()
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
@@ -95,7 +95,7 @@ class VirtualSourceGP(Method):
         self.members: list[PhasedPosterior] = []
 
     # ---- learning ----
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
         started = time.monotonic()
         refuse(data.site, self.name, data.target.shape[1])
@@ -110,11 +110,11 @@ class VirtualSourceGP(Method):
         if self.offsets != "none":
             data = self._aligned(data, known)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-            notes.append(f"vsgp: {self.offsets} of every snapshot estimated; predictions have none")
-        shelf = Shelf(run_dir, self.resume, self._key(data, known), _scene_state, _scene)
+            notes.append(f"{self.name}: {self.offsets} of every snapshot estimated; predictions have none")
+        shelf = Shelf(context.run_dir, context.resume, self._key(data, known), _scene_state, _scene)
         started -= shelf.spent_s
-        budget = Budget(started, self._budget(len(known)))
-        found = self._search(data, known, self.settings, self.searches, budget, self.furniture, shelf)
+        budget = Budget(started, self._budget(len(known), context.budget_s))
+        found = self._search(data, known, self.settings, self.searches, budget, self.clutter, shelf)
         if self.look_for_edges:
             found, held = self._beside_edges(data, known, found, held, shelf, budget)
         self.weights = weights(found)
@@ -122,25 +122,26 @@ class VirtualSourceGP(Method):
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
         agree = agreed([member.left_out for member in found], self.noise_floor)
-        ended = "more would say the same" if agree else f"within {budget.seconds:.0f} s"
-        notes.append(f"vsgp: {len(found)} of {self.searches} searches ({ended}), {counts} sources")
+        ended = "more would agree" if agree else f"within {budget.seconds:.0f} s"
+        notes.append(f"{self.name}: {len(found)} of {self.searches} searches ({ended}), {counts} sources")
         scene = self.members[0].scene
         told = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
         told[SourceKind.EDGE] = len(self.edges)
-        notes.append("vsgp: the best search has " + ", ".join(f"{told[k]} {k}s" for k in SourceKind))
+        notes.append(f"{self.name}: the best search has " + ", ".join(f"{told[k]} {k}s" for k in SourceKind))
         clutter = scene.clutter
         if len(clutter):
-            notes.append(
-                f"vsgp: furniture: {len(clutter.boxes)} boxes that hide, {len(clutter.patches)} mirror ends"
-            )
+            these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
+            notes.append(f"{self.name}: clutter: {these}")
         return FitReport(time.monotonic() - started, tuple(notes))
 
     def _key(self, data: Measurements, known: np.ndarray) -> str:
         """What searches depend on; how long they may take and how many there are is not part of it."""
-        facts = (data.site.sha256, self.search_rows, self.row_limit, self.offsets, self.furniture, self.seed)
+        facts = (data.site.sha256, self.search_rows, self.row_limit, self.offsets, self.clutter, self.seed)
         return sha256(f"{facts} {self.settings} ".encode() + known.tobytes()).hexdigest()[:24]
 
-    def _budget(self, measurements: int) -> float:
+    def _budget(self, measurements: int, given_s: float | None) -> float:
+        if given_s is not None:
+            return given_s
         if self.budget_s is not None:
             return self.budget_s
         return min(max(SECONDS * measurements**1.5, LEAST_BUDGET_S), MOST_BUDGET_S)
@@ -181,7 +182,7 @@ class VirtualSourceGP(Method):
         draw = [without(part, edges, start) for part in draw]
         again = search_many(
             draw, self._start(data.site), self.settings, self.seed, self.noise_floor, budget,
-            self.furniture, shelf, "beside edges",
+            self.clutter, shelf, "beside edges",
         )  # fmt: skip
         power = float(draw[0].target.abs().square().mean())  # left-out errors are shares of it
         # the edges' own gains saw every row: only a clear gain counts
@@ -257,12 +258,13 @@ class VirtualSourceGP(Method):
             variance=variance * self.frame.scale**2,
         )
 
-    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """What `predict` sums: one path a source of every search, weighted as the searches are, and edges.
 
         Returns:
             Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
-            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from.
+            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
+            the carrier [Hz].
         """
         flat, count = self._places(tx, rx)
         start, carrier = self.members[0].scene.transmitter, self.frame.carrier_hz
@@ -282,7 +284,7 @@ class VirtualSourceGP(Method):
             towards = torch.cat([towards, met - middle[:, None]], 1)
         gain = (gain * self.frame.scale).movedim(0, -1).reshape(count, self.antennas, -1)
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
-        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True), carrier
 
     def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
         """Antennas of the moving end (B E, 3) float64 in the search's frame, and B."""
@@ -293,13 +295,33 @@ class VirtualSourceGP(Method):
             places = tx.detach().cpu().double().numpy()[:, None]
         return torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle, len(places)
 
-    def left_over(self) -> tuple[np.ndarray, Tensor]:
-        """Receivers (n,) and what all others leave unexplained of their channels (n, R), in stored units."""
+    def leave_one_out(self) -> LeftOut:
+        """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
         self._fitted()
         rows, weight = self.members[0].rows, self.weights[:, None, None]
         said = (weight * torch.stack([member.left_out() for member in self.members])).sum(0)
         loud = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
-        return rows.receiver.numpy(), (rows.target - said) * loud
+        return LeftOut(rows.receiver.numpy(), (rows.target - said) * loud, self.offsets != "none")
+
+    # ---- what it can do besides ----
+    def resume_problem(self) -> str | None:
+        """None: finished searches are kept in `last.ckpt`."""
+        return None
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        return ("searches", "keep", "confidence")
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """`contribution0`, `contribution1`, ... (K,): mean power of each search's sources at its rows."""
+        return {
+            f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
+            for i, member in enumerate(self.members)
+        }
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        return reduced(self, settings, measured)
 
     # ---- keeping ----
     def state(self) -> dict[str, Any]:
@@ -333,7 +355,7 @@ class VirtualSourceGP(Method):
 
     def _fitted(self) -> Site:
         if self.site is None or not self.members:
-            raise ValueError("vsgp: not fitted yet; call fit or restore first")
+            raise ValueError("image_source_gp: not fitted yet; call fit or restore first")
         return self.site
 
 

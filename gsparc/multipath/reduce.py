@@ -4,31 +4,19 @@ from __future__ import annotations
 
 import copy
 import math
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
-from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
 
-
-def knobs(method: VirtualSourceGP) -> tuple[str, ...]:
-    """What can be turned."""
-    return ("searches", "keep", "confidence")
-
-
-def measure(method: VirtualSourceGP, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """`contribution0`, `contribution1`, ... (K,): mean power of each search's sources at its rows."""
-    return {
-        f"contribution{i}": member.scene.log_amplitude.mul(2).exp() * member.waves.abs().square().mean(0)
-        for i, member in enumerate(method.members)
-    }
+if TYPE_CHECKING:
+    from gsparc.multipath.image_source_gp import VirtualSourceGP
 
 
 @torch.no_grad()

@@ -8,8 +8,8 @@ Gaussian process of each source's gain over places: ridge regression solves all 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,8 +18,10 @@ from torch import Tensor
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.encoding import Prior
+from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import PathResponse
+from gsparc.methods.method import FitContext
 from gsparc.multipath.gp_likelihood import Factor, steering
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.rows import Rows, gather
@@ -29,6 +31,30 @@ ROWS = 1000  # receivers times tones the gains are solved on
 LENGTHS_M = (0.5, 1.0, 2.0, 4.0)  # over which gains may vary
 CONSTANTS = (0.5, 0.8, 0.95)  # share of a gain's variance that is the same everywhere
 NOISES = (0.003, 0.03, 0.3)  # of the mean power
+
+
+class FromSources:
+    """Gaussians at image sources of a search, or as placed, gains by ridge regression; see `Initialiser`."""
+
+    def __call__(self, task: InitTask) -> Start:
+        """Search, or take the Gaussians as they will stand."""
+        assert task.transmitter is not None
+        data, rows, transmitter = task.data, task.rows, task.transmitter
+        if task.init == "backprojection":
+            found = searched(data, rows, task.snapshot, task.seed)
+            gains = likeliest(found)
+            prior = prior_of(data, rows, gains, task.anchors, task.seed)
+            if not task.closed_form:
+                return Start(prior, found.position)
+            settle = partial(solve, sources=found, gains=gains, transmitter=transmitter)
+            return Start(prior, found.position, settle)
+        prior = prior_of(data, rows, UNIFORM_GAINS, task.anchors, task.seed)
+
+        def solve_there(model: GaussianModel) -> None:
+            there = anywhere(data, rows, model.gaussians.means.detach(), task.seed)
+            solve(model, there, UNIFORM_GAINS, transmitter)
+
+        return Start(prior, None, solve_there) if task.closed_form else Start(prior)
 
 
 @dataclass(frozen=True)
@@ -51,9 +77,9 @@ class Sources:
 def searched(data: Measurements, known: np.ndarray, offsets: str, seed: int) -> Sources:
     """One search of the virtual-source process on the given rows; only fixed points become Gaussians."""
     method = VirtualSourceGP(
-        searches=1, rows=ROWS, offsets=offsets, furniture=False, edges=False, seed=seed,  # type: ignore[arg-type]
+        searches=1, rows=ROWS, offsets=offsets, clutter=False, edges=False, seed=seed,  # type: ignore[arg-type]
     )  # fmt: skip
-    method.fit(data, Fold(known, known[:0], known[:0]), Path())
+    method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
     member, frame = method.members[0], method.frame
     scene = member.scene
     return Sources(
@@ -82,6 +108,9 @@ class Gains:
     length: float
     constant: float
     noise: float
+
+
+UNIFORM_GAINS = Gains(length=2.0, constant=0.8, noise=0.1)  # where no search has told
 
 
 def likeliest(sources: Sources) -> Gains:

@@ -7,7 +7,6 @@ paths, and the decoder plays them in the other band. Sizes and training are ours
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.method import FitContext, FitReport, Prediction
 from gsparc.methods.uplink_method import UplinkMethod
 
 
@@ -71,7 +70,7 @@ class Fire(UplinkMethod):
         self.hidden, self.code, self.divergence = hidden, code, divergence
         self.steps, self.batch, self.rate, self.seed = steps, batch, rate, seed
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train on all antennas of train and val rows (no choice is made on val)."""
         started = time.perf_counter()
         self.site = self._need_uplink(data)

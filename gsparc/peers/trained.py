@@ -7,7 +7,6 @@ import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from itertools import count
-from pathlib import Path
 from typing import Any, ClassVar
 
 import lightning.pytorch as L
@@ -18,7 +17,7 @@ from torch import Tensor, nn
 from gsparc.data.datamodule import order
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.ops import Pose
 from gsparc.peers.network import Network, Scene
 
@@ -76,7 +75,7 @@ class TrainedPeer(Method):
         """What is read off the training rows (n,) before training; stored with the weights."""
         return {}
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train until the budget is spent.
 
         Raises:

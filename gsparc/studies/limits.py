@@ -69,7 +69,7 @@ LIMITS: dict[str, Limit] = {
     "seed": whole(0, 2**32 - 1),
     "threads": or_null(whole(1)),
     "eval_on": choice("train", "val", "test"),
-    "trainer.gradient_clip": or_null(number(0, open_low=True)),
+    "trainer.gradient_clip_val": or_null(number(0, open_low=True)),
     "model.warm_start": switch("auto"),
     "model.refit": switch(),
     "model.field.count": whole(0),

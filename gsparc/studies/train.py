@@ -23,10 +23,10 @@ from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
-from gsparc.methods.method import Method
+from gsparc.methods.method import Method, Resumable
 from gsparc.methods.registry import build
 from gsparc.studies import cli, limits
-from gsparc.training.fit import Training
+from gsparc.studies.context import context_of
 
 log = logging.getLogger(__name__)
 
@@ -79,10 +79,14 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         for number, fold in enumerate(split.folds):
             folder = run_dir if len(split.folds) == 1 else run_dir / f"fold{number}"
             method = build(config.model)
-            for guess in getattr(method, "guesses", ()) if number == 0 else ():
+            for guess in method.guesses if number == 0 else ():
                 log.info("guess: %s", guess)
-            _equip(method, config, config_yaml, loggers, number, len(split.folds))
-            report = method.fit(data, fold, folder)
+            resume = _resume(config, number, len(split.folds))
+            if resume is not None and not isinstance(method, Resumable):
+                raise ValueError(
+                    f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path"
+                )
+            report = method.fit(data, fold, context_of(config, folder, loggers, resume))
             for note in report.notes:
                 log.info("%s", note)
             file = folder / "model.ckpt"
@@ -128,33 +132,6 @@ def _refuse_empty(split: Split) -> None:
                 f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
                 f"rows; at least {LEAST_ROWS} and 1 are needed"
             )
-
-
-def _equip(
-    method: Method, config: DictConfig, config_yaml: str, loggers: Sequence[Logger], number: int, folds: int
-) -> None:
-    """Hand the method of fold `number` what the run brings along, and what it goes on from.
-
-    Raises:
-        ValueError: it is to go on, but trains in one piece.
-    """
-    if hasattr(method, "training"):
-        method.training = Training(
-            settings=instantiate(config.trainer),
-            seed=int(config.seed),
-            callbacks=lambda: _callbacks(config),
-            loggers=loggers,
-            resume=_resume(config, number, folds),
-            config_yaml=config_yaml,
-        )
-    elif config.ckpt_path is not None:
-        if not hasattr(method, "resume"):
-            raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
-        method.resume = _resume(config, number, folds)
-
-
-def _callbacks(config: DictConfig) -> list[Any]:
-    return [instantiate(node) for node in (config.callbacks or {}).values() if node is not None]
 
 
 def _refuse_absent(path: str | None) -> None:

@@ -7,78 +7,48 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
-from lightning.pytorch.loggers import Logger
 from lightning.pytorch.plugins.io import CheckpointIO
 
 from gsparc.data.datamodule import MeasurementsModule
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.methods.method import FitContext
 from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.time_budget import Budget, Stretched
 
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 
 
-@dataclass(frozen=True)
-class TrainerSettings:
-    """How long and how training runs.
+# What conf/trainer/cpu.yaml says, for callers from Python.
+DEFAULTS = partial(
+    L.Trainer,
+    accelerator="cpu",
+    devices=1,
+    max_steps=400,
+    val_check_interval=100,
+    num_sanity_val_steps=0,
+    enable_progress_bar=False,
+    enable_model_summary=False,
+)
 
-    Attributes:
-        max_steps: optimiser steps.
-        budget_s: seconds of training instead, over all stages; every schedule is stretched from `max_steps`
-            to end with it. Null: `max_steps` decide.
-        batch_size: samples per step.
-        val_every: steps between validations.
-        checkpoint_every: steps between `last.ckpt`.
-        gradient_clip: largest gradient norm; null never clips.
-        accelerator: Lightning's choice of device.
+
+def total_steps(context: FitContext) -> int:
+    """Steps that schedules are written for.
+
+    Raises:
+        ValueError: the Trainer is given no number of steps.
     """
-
-    max_steps: int = 3000
-    budget_s: float | None = None
-    batch_size: int = 16
-    val_every: int = 500
-    checkpoint_every: int = 500
-    gradient_clip: float | None = None
-    accelerator: str = "cpu"
-
-    def __post_init__(self) -> None:
-        for name in ("max_steps", "batch_size", "val_every", "checkpoint_every"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 1 is needed")
-        if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
-            raise ValueError(
-                f"trainer.budget_s={self.budget_s!r}: a positive number of seconds is needed, or null"
-            )
-
-
-@dataclass
-class Training:
-    """What a run brings along; the method itself only knows how to learn.
-
-    Attributes:
-        settings: length and pace.
-        seed: of initial parameters, data order and densification.
-        callbacks: makes fresh Lightning callbacks.
-        loggers: made once per run, closed by the caller.
-        resume: checkpoint to go on from, or None.
-        config_yaml: the whole configuration, stored in every checkpoint.
-    """
-
-    settings: TrainerSettings = field(default_factory=TrainerSettings)
-    seed: int = 0
-    callbacks: Callable[[], Sequence[L.Callback]] = tuple
-    loggers: Sequence[Logger] = ()
-    resume: Path | None = None
-    config_yaml: str = ""
+    steps = (context.trainer or DEFAULTS).keywords.get("max_steps", -1)
+    if type(steps) is not int or steps < 1:
+        raise ValueError(f"trainer.max_steps={steps!r}: a whole number of at least 1 is needed")
+    return steps
 
 
 class _Stopped(BaseException):
@@ -127,62 +97,56 @@ def run_stage(
     module: GaussianModule,
     data: Measurements,
     fold: Fold,
-    training: Training,
+    context: FitContext,
     checkpoints: CheckpointIO,
-    resume: Path | None,
 ) -> float:
     """Train `module` on `fold.train`, watching `fold.val`; returns the seconds spent learning [s].
 
     Raises:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
     """
-    settings, folder = training.settings, module.run_dir
-    _hush()
-    last = L.callbacks.ModelCheckpoint(
-        folder,
-        filename="last",
-        every_n_train_steps=settings.checkpoint_every,
-        save_on_train_epoch_end=False,
-        enable_version_counter=False,
-    )
+    folder, make = module.run_dir, context.trainer or DEFAULTS
+    _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
-    callbacks, pace = list(training.callbacks()), module.pace
+    callbacks, pace = list(context.callbacks()), module.pace
     if pace is not None:
         stretched = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
         callbacks = [Budget(pace), *stretched]
-    module.log_every = math.gcd(
-        LOG_EVERY, settings.val_every
-    )  # a validation sees the figures of its own step
-    per_epoch = max(1, len(fold.train) // settings.batch_size)
-    trainer = L.Trainer(
-        accelerator=settings.accelerator,
-        devices=1,
-        max_steps=settings.max_steps if pace is None else -1,
+    for callback in callbacks:
+        if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
+            callback.dirpath = str(folder)
+    every = make.keywords.get("val_check_interval")
+    every = every if type(every) is int else LOG_EVERY
+    module.log_every = math.gcd(LOG_EVERY, every)  # a validation sees the figures of its own step
+    per_epoch = max(1, len(fold.train) // context.batch_size)
+    options: dict[str, Any] = {
+        "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
+        "check_val_every_n_epoch": None,  # validations are counted in steps
+    }
+    if not len(fold.val):
+        options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
+    if pace is not None:
+        options["max_steps"] = -1
+    trainer = make(
         max_epochs=-1,
-        callbacks=[*callbacks, stop, last],
-        logger=list(training.loggers) or False,
+        callbacks=[*callbacks, stop],
+        logger=list(context.loggers) or False,
         plugins=[checkpoints],
-        gradient_clip_val=settings.gradient_clip,
-        val_check_interval=settings.val_every if len(fold.val) else None,
-        check_val_every_n_epoch=None if len(fold.val) else 1,
-        limit_val_batches=None if len(fold.val) else 0,
-        num_sanity_val_steps=0,
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        log_every_n_steps=max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         default_root_dir=folder,
+        enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
+        **options,
     )
-    batches = MeasurementsModule(data, fold, settings.batch_size, training.seed)
+    batches = MeasurementsModule(data, fold, context.batch_size, context.seed)
     try:
         with stop.listening():
-            trainer.fit(module, datamodule=batches, ckpt_path=resume, weights_only=True)
+            trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
     except (_Stopped, SystemExit):  # Lightning's answer to a KeyboardInterrupt is SystemExit
         advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     return module.train_seconds
 
 
-def _hush() -> None:
+def _quieten_lightning() -> None:
     """Lightning advertises and repeats what the progress line says; its warnings stay, but for six."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     for pointless in (

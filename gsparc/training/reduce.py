@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -18,19 +19,13 @@ from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View
 from gsparc.ops import Pose, SphereGrid, mean_weights
-from gsparc.training.splatting import LearnedField
+
+if TYPE_CHECKING:
+    from gsparc.training.splatting import LearnedField
 
 RIDGE = 1e-5  # relative to the mean footprint energy; footprints overlap
 MOST_WEIGHTS = 25_000_000  # pixels times Gaussians held at once
 MOST_ROWS = 64  # positions over which a contribution is averaged
-
-
-def knobs(method: LearnedField) -> tuple[str, ...]:
-    """What can be turned."""
-    model = method.fitted()
-    static = model.site.kind == "spectrum" and model.site.static_end == "rx"
-    known = ("keep", "cutoff", "projection", "confidence")
-    return (*known, *(() if through_array(model) else ("stride",)), *(("frozen",) if static else ()))
 
 
 def through_array(model: GaussianModel) -> bool:
@@ -39,7 +34,7 @@ def through_array(model: GaussianModel) -> bool:
 
 
 @torch.no_grad()
-def measure(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
     """`contribution` (N,): what each Gaussian adds to the predictions at training rows (n,), on average.
 
     Its weight summed over the directions of the receiver times the size of its emission. `receiver` (4, 3) is

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,14 +22,17 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
+from gsparc.field.initial import InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.pareto import Settings
 from gsparc.ops import Pose
+from gsparc.training import reduce
 from gsparc.training.auto_settings import Choices, resolve, settled
 from gsparc.training.checkpoint_io import GsparcCheckpointIO, interrupted
-from gsparc.training.fit import Training, run_stage
+from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.initialise import prepare
 from gsparc.training.lightning_module import GaussianModule, LossSettings
 from gsparc.training.optimizer import OptimizerSettings
@@ -78,7 +82,6 @@ class LearnedField(Method):
         self.warm_start = warm_start
         self.refit = refit
         self.guesses = tuple(guesses)
-        self.training = Training()
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
@@ -90,34 +93,34 @@ class LearnedField(Method):
 
     # -- learning ----------------------------------------------------------------------------------
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
 
         The second stage (`refit`) trains again on both with the confidence fixed, because the baselines
         learn from all of them.
         """
-        training = self.training
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
             self._shape = (data.target.shape[1], data.target.shape[2])
         self.choices, reasons = resolve(self.settings, self.warm_start, data.site)
         for reason in reasons:
             log.info("%s", reason)
-        resumed = None if training.resume is None else interrupted(training.resume)
+        resumed = None if context.resume is None else interrupted(context.resume)
         stage = "train" if resumed is None else str(resumed.extra.get("stage", "train"))
         seconds, confidence, self._billed_s = 0.0, None, 0.0
         if resumed is not None:
             seconds = float(resumed.extra.get("earlier_s", 0.0))
         if stage == "train":
-            seconds += self._stage("train", data, fold, run_dir, training.resume, seconds)
+            seconds += self._stage("train", data, fold, context, seconds)
             self._calibrate(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
         if self.refit and len(fold.val):
             confidence = self.fitted().confidence
             every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
-            resume = training.resume if stage == "refit" else None
-            seconds += self._stage("refit", data, every, run_dir / "refit", resume, seconds, confidence)
+            resume = context.resume if stage == "refit" else None
+            again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
+            seconds += self._stage("refit", data, every, again, seconds, confidence)
         self._frozen = None
         return FitReport(seconds)
 
@@ -126,21 +129,26 @@ class LearnedField(Method):
         stage: str,
         data: Measurements,
         fold: Fold,
-        folder: Path,
-        resume: Path | None,
+        context: FitContext,
         earlier_s: float,
         confidence: Confidence | None = None,
     ) -> float:
         """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
-        training = self.training
-        L.seed_everything(training.seed, verbose=False)
+        folder, resume = context.run_dir, context.resume
+        L.seed_everything(context.seed, verbose=False)
         started = time.perf_counter()
         assert self.choices is not None
-        if resume is None:
-            ends = self._receiver(), self._ends.get("tx_position")
+        if context.init_from is not None and resume is None and stage == "train":
+            self._start_from(data.site, context.init_from)
+            spent = 0.0
+        elif resume is None:
             start = prepare(
-                self.settings, self.choices, data, fold.train, ends, self.loss.snapshot, training.seed, folder
-            )
+                InitTask(
+                    settled(self.settings, self.choices), self.choices.init, self.choices.warm_start, data,
+                    fold.train, self._receiver(), self._ends.get("tx_position"), self.loss.snapshot,
+                    context.seed, folder,
+                )
+            )  # fmt: skip
             self._prior = start.prior
             self.model = self._new_model(data.site, start.sources)
             start.solve(self.model)
@@ -153,16 +161,36 @@ class LearnedField(Method):
         if confidence is not None:
             self.fitted().confidence = confidence.requires_grad_(False)
         prepared = time.perf_counter() - started + spent
-        steps, pace = training.settings.max_steps, None
-        if training.settings.budget_s is not None:
+        steps, pace = total_steps(context), None
+        if context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
-            end = training.settings.budget_s * (0.5 if first else 1.0)
+            end = context.budget_s * (0.5 if first else 1.0)
             pace = Pace(steps, end - earlier_s - prepared)
         module = GaussianModule(self.fitted(), self.loss, self.rates, steps, folder, pace)
         module.prepared_seconds = earlier_s + prepared
         marks = {"stage": stage, "earlier_s": earlier_s + prepared}
-        files = GsparcCheckpointIO(self, training.config_yaml, marks)
-        return prepared + run_stage(module, data, fold, training, files, resume)
+        files = GsparcCheckpointIO(self, context.config_yaml, marks)
+        return prepared + run_stage(module, data, fold, context, files)
+
+    def _start_from(self, site: Site, path: Path) -> None:
+        """Take the weights of another model of this site; what is learned anew are these rows.
+
+        Raises:
+            ValueError: it holds no Gaussian field, or one of other positions, directions or channels.
+        """
+        stored = checkpoint.read(path)
+        state = stored.state.get("inner", stored.state)
+        if "model" not in state:
+            raise ValueError(f"init_from={path}: {stored.method} holds no Gaussian field")
+        for name in ("kind", "grid", "static_end"):
+            mine, its = getattr(site, name), getattr(stored.site, name)
+            if mine != its:
+                raise ValueError(f"init_from={path}: its {name} is {its}, here it is {mine}")
+        if not np.allclose(site.origin, stored.site.origin, atol=1e-6):
+            raise ValueError(
+                f"init_from={path}: its origin is {stored.site.origin} m, here it is {site.origin} m"
+            )
+        self.restore(site, {**state, "ends": self._ends, "shape": self._shape})
 
     def _receiver(self) -> Pose | None:
         ends = self._ends
@@ -220,6 +248,36 @@ class LearnedField(Method):
         if self._frozen is None or self._frozen.version != int(model.gaussians.version):
             self._frozen = frozen_view(model, rx)
         return self._frozen
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The model's own mean, not clamped; see `Differentiable`."""
+        return self.fitted()(tx, rx).mean
+
+    # -- what it can do besides ----------------------------------------------------------------------
+
+    def resume_problem(self) -> str | None:
+        """None: every step's state is in `last.ckpt`."""
+        return None
+
+    def trainer_options(self) -> bool:
+        """See `TrainsByGradient`."""
+        return True
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`."""
+        model = self.fitted()
+        static = model.site.kind == "spectrum" and model.site.static_end == "rx"
+        known = ("keep", "cutoff", "projection", "confidence")
+        stride = () if reduce.through_array(model) else ("stride",)
+        return (*known, *stride, *(("frozen",) if static else ()))
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """See `Reducible`."""
+        return reduce.contributions(self, data, rows)
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        return reduce.reduced(self, settings, measured)
 
     # -- storing -----------------------------------------------------------------------------------
 

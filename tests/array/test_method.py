@@ -19,6 +19,7 @@ from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
@@ -95,7 +96,7 @@ def test_antennas_at_one_place_are_no_array(tmp_path):
     site = array_site(SphereGrid.hemisphere(4, 6), np.zeros((4, 3)))
     data = measure(site, walk(12), np.ones((12, 4), complex))
     with pytest.raises(ValueError, match="all antennas of the declared array are at one place"):
-        ArrayField(cache=False).fit(data, _fold(12), tmp_path)
+        ArrayField(cache=False).fit(data, _fold(12), FitContext(tmp_path))
 
 
 def test_packets_slopes():
@@ -177,10 +178,10 @@ def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
     data, _ = known_campaign
     split = _split(160)
     method = ArrayField(SMALL, cache=False)
-    report = method.fit(data, split.folds[0], tmp_path)
+    report = method.fit(data, split.folds[0], FitContext(tmp_path))
     assert report.seconds > 0 and (tmp_path / "array_recovery.csv").exists()
     nearest = method_class("nearest")()
-    nearest.fit(data, split.folds[0], tmp_path)
+    nearest.fit(data, split.folds[0], FitContext(tmp_path))
     ours, theirs = (score([m], data, split) for m in (method, nearest))
     assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
     checkpoint.save(tmp_path / "model.ckpt", method)
@@ -194,7 +195,7 @@ def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
 def test_confidence_falls_and_error_grows_with_distance(known_campaign, tmp_path):
     data, _ = known_campaign
     method = ArrayField(SMALL, cache=False)
-    method.fit(data, _fold(160), tmp_path)
+    method.fit(data, _fold(160), FitContext(tmp_path))
     batch = data.batch(np.array([40]))
     away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
     found = method.predict(batch.tx + away, batch.rx)
@@ -207,7 +208,7 @@ def test_position_errors_cost_smoothly(known_campaign, tmp_path):
     """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
     data, _ = known_campaign
     method = ArrayField(SMALL, cache=False)
-    method.fit(data, _fold(160), tmp_path)
+    method.fit(data, _fold(160), FitContext(tmp_path))
     batch = data.batch(np.arange(0, 160, 8))
     still = method.predict(batch.tx, batch.rx).mean
     moved = [method.predict(batch.tx + shift, batch.rx).mean for shift in (0.001, 0.01, 0.1)]
@@ -221,7 +222,7 @@ def test_same_seed_same_answer(known_campaign, tmp_path):
     answers = []
     for seed in (0, 0, 1):
         method = ArrayField(SMALL, cache=False, seed=seed)
-        method.fit(data, _fold(160), tmp_path)
+        method.fit(data, _fold(160), FitContext(tmp_path))
         answers.append(method.predict(batch.tx, batch.rx).mean)
     assert torch.equal(answers[0], answers[1]) and not torch.equal(answers[0], answers[2])
 
@@ -229,13 +230,13 @@ def test_same_seed_same_answer(known_campaign, tmp_path):
 def test_many_rows_are_thinned(known_campaign, tmp_path):
     data, _ = known_campaign
     method = ArrayField(SMALL, rows=40, cache=False)
-    method.fit(data, _fold(160), tmp_path)
+    method.fit(data, _fold(160), FitContext(tmp_path))
     assert method.seen == 40
 
 
 def test_refuses_what_has_no_array(campaign, tmp_path):
     with pytest.raises(ValueError, match="no antenna array"):
-        ArrayField().fit(campaign("spectrum", 12), _fold(12), tmp_path)
+        ArrayField().fit(campaign("spectrum", 12), _fold(12), FitContext(tmp_path))
     with pytest.raises(RuntimeError, match="not been trained"):
         ArrayField().predict(torch.zeros(1, 3), None)
 
@@ -244,7 +245,7 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
 def test_very_few_rows(known_campaign, tmp_path, rows):
     data, _ = known_campaign
     method = ArrayField(SMALL, cache=False)
-    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 10)), tmp_path)
+    method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 10)), FitContext(tmp_path))
     batch = data.batch(np.arange(4))
     assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
 
@@ -253,7 +254,7 @@ def test_duplicate_positions(known_campaign, tmp_path):
     data, _ = known_campaign
     data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
     method = ArrayField(SMALL, cache=False)
-    method.fit(data, _fold(160), tmp_path)
+    method.fit(data, _fold(160), FitContext(tmp_path))
     batch = data.batch(np.arange(4))
     assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
 
@@ -269,7 +270,7 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
         for kind in (ArrayField, method_class("gp")):
             methods = [kind() for _ in split.folds]
             for method, fold in zip(methods, split.folds, strict=True):
-                method.fit(data, fold, tmp_path)
+                method.fit(data, fold, FitContext(tmp_path))
             scores.append(score(methods, data, split))
         ahead[name] = [
             (scores[0].samples[k] - scores[1].samples[k]).mean() for k in ("ssim_gauss", "psnr_db")
@@ -282,7 +283,7 @@ def test_level_with_the_gp_on_random_and_ahead_on_grouped(real_rfid, tmp_path):
 def test_a_query_is_a_fraction_of_a_millisecond(real_rfid, tmp_path):
     data = load({"name": "rfid", "root": str(real_rfid)})
     method = ArrayField()
-    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path)
+    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
     batch, times = data.batch(np.array([0])), []
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

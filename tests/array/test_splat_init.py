@@ -7,6 +7,7 @@ import pytest
 from campaigns import compose
 
 from gsparc.data.splits import Fold
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.training.fit import TrainerSettings, Training
 
@@ -14,7 +15,7 @@ from gsparc.training.fit import TrainerSettings, Training
 def _trained(data, fold, folder, *overrides: str, steps: int = 10):
     method = build(compose("logger=none", *overrides).model)
     method.training = Training(TrainerSettings(max_steps=steps, batch_size=16, val_every=steps))
-    method.fit(data, fold, folder)
+    method.fit(data, fold, FitContext(folder))
     return method
 
 

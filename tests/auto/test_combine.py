@@ -17,17 +17,18 @@ from gsparc.auto.combine import Beside, Rest, Told, compared, learn_rest, search
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.methods.mean import Mean
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.multipath.directional_gp import DirectedSources
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 
 NONE = Fold(*[np.zeros(0, np.int64)] * 3)
-QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "furniture": False, "edges": False}
+QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "clutter": False, "edges": False}
 
 
 def _physics(data, fold) -> VirtualSourceGP:
     method = VirtualSourceGP(**QUICK)
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     return method
 
 
@@ -108,7 +109,7 @@ def test_an_array_of_few_spectra_answers_with_a_process_beside_it(tmp_path):
     fold = Fold(rows[rows % 2 > 0], rows[:0], rows[::2])
     settings = ["array_model.cache=false", "array_model.packets.samples=300", "effects.array=true"]
     method = build(compose(*(f"model.{s}" for s in settings), "model.effects.hybrid=true").model)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     array, beside = method.answering
     assert isinstance(beside, Beside) and 0 < beside.weight <= 1 and method.effects == "array+hybrid"
     batch = data.batch(fold.test)
@@ -120,7 +121,7 @@ def test_an_array_of_few_spectra_answers_with_a_process_beside_it(tmp_path):
     torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, found, atol=1e-5, rtol=1e-5)
 
 
-SETTINGS = ["phase_model.searches=1", "phase_model.search_rows=220", "phase_model.furniture=false"]
+SETTINGS = ["phase_model.searches=1", "phase_model.search_rows=220", "phase_model.clutter=false"]
 SETTINGS += ["phase_model.edges=false", "phase_model.margin=4", "phase_probe.margin=4"]
 
 
@@ -134,7 +135,7 @@ def test_from_few_receivers_measured_directions_answer_alone():
     rows = np.arange(80)
     fold = Fold(rows[:14], rows[14:16], rows[16:])
     method, batch = _best(), data.batch(fold.test)
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     assert method.effects == "directions" and isinstance(method.answering[0], DirectedSources)
     assert nmse(method.predict(batch.tx, batch.rx).mean.numpy(), data.target[fold.test]) < 0.05
     other = _best()
@@ -148,14 +149,14 @@ def test_an_interrupted_run_that_directions_answer_alone_goes_on(tmp_path):
     rows = np.arange(80)
     method = _best("effects.phase=false", "effects.directions=true")
     method.training = replace(method.training, resume=tmp_path / "last.ckpt")
-    method.fit(data, Fold(rows[:14], rows[14:16], rows[16:]), Path())
+    method.fit(data, Fold(rows[:14], rows[14:16], rows[16:]), FitContext(Path()))
     assert method.effects == "directions"
 
 
 def test_searched_and_directed_sources_answer_together_where_both_know_something():
     data, fold, _ = directed(150, pillar=True)
     method, batch = _best("effects.phase=true"), data.batch(fold.test)
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     searched, rest = method.answering
     assert isinstance(searched, VirtualSourceGP) and isinstance(rest, Told)
     assert method.effects.startswith("phase+directions") and 0 < rest.weight <= 1

@@ -9,6 +9,7 @@ from PIL import Image
 from gsparc.data.splits import Fold
 from gsparc.evaluation.pictures import draw_points, draw_predictions
 from gsparc.methods.mean import Mean
+from gsparc.methods.method import FitContext
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
@@ -17,7 +18,7 @@ def test_test_rows_are_drawn(campaign, tmp_path, kind):
     rows = np.arange(len(data))
     fold = Fold(rows[::2], rows[:0], rows[1::2])
     method = Mean()
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     draw_predictions(method, data, fold, "title", tmp_path / "deep" / "test.png")
     with Image.open(tmp_path / "deep" / "test.png") as image:
         assert len(np.unique(np.asarray(image.convert("L")))) > 20

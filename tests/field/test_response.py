@@ -21,6 +21,7 @@ from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import frozen_view
 from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
@@ -36,7 +37,7 @@ def trained(data, fold, folder, *overrides: str, steps: int = 30):
     method = build(compose("logger=none", *overrides).model)
     settings = TrainerSettings(max_steps=steps, batch_size=16, val_every=steps, checkpoint_every=steps)
     method.training = Training(settings, callbacks=lambda: [ContributionPruning(interval=10)])
-    return method, method.fit(data, fold, folder)
+    return method, method.fit(data, fold, FitContext(folder))
 
 
 # ---- factored channels ----
@@ -149,7 +150,7 @@ def test_weak_sources_are_pruned_by_contribution(tmp_path):
     spoiled = ContributionPruning(interval=1, least_share=0.05)
     method = build(compose("logger=none", *PHASE, "model.field.init=uniform", "model.field.count=30").model)
     method.training = Training(TrainerSettings(max_steps=4, batch_size=16), callbacks=lambda: [spoiled])
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     assert 1 <= method.size() < 30
     batch = data.batch(fold.test[:3])
     assert method.predict(batch.tx, batch.rx).mean.shape == batch.target.shape

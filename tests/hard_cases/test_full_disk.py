@@ -17,6 +17,7 @@ from crashes import Limited, run, simulation, training
 
 from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
+from gsparc.methods.method import FitContext
 
 
 @pytest.fixture
@@ -24,7 +25,7 @@ def fitted(campaign, folds, tmp_path):
     from gsparc.methods.gp import GaussianProcess
 
     method = GaussianProcess()
-    method.fit(campaign("spectrum", 30), folds(30).folds[0], tmp_path)
+    method.fit(campaign("spectrum", 30), folds(30).folds[0], FitContext(tmp_path))
     return method
 
 
@@ -56,7 +57,9 @@ def test_no_space_is_said_so(fitted, tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_training_stops_with_one_line_and_goes_on_when_there_is_room(tmp_path):
-    settings = brief(spectra(tmp_path / "own.npz"), "trainer.checkpoint_every=5", "model.refit=false")
+    settings = brief(
+        spectra(tmp_path / "own.npz"), "callbacks.checkpoint.every_n_train_steps=5", "model.refit=false"
+    )
     folder = tmp_path / "run"
     assert run(training, str(folder), settings)[0] == 0
     good, size = (folder / "last.ckpt").read_bytes(), (folder / "last.ckpt").stat().st_size

@@ -16,6 +16,7 @@ from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.data.load import load, split_for
 from gsparc.field.losses import spectrum_loss
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.training.fit import TrainerSettings, Training
 
@@ -33,7 +34,7 @@ def fitted(folder, autocast: bool) -> tuple[torch.Tensor, torch.Tensor]:
     method.training = Training(TrainerSettings(max_steps=30, batch_size=8))
     fold = split_for({"name": "random"}, data).folds[0]
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-        method.fit(data, fold, folder)
+        method.fit(data, fold, FitContext(folder))
         batch = data.batch(np.arange(8))
         mean = method.predict(batch.tx, batch.rx).mean
     assert mean.dtype == torch.float32 and mean.isfinite().all()

@@ -25,8 +25,8 @@ from gsparc.methods import checkpoint
 STEPS = 42  # a multiple of 7: the last checkpoint of a stage is its end
 SETTINGS = (
     f"trainer.max_steps={STEPS}",
-    "trainer.checkpoint_every=7",  # in the middle of an interval
-    "trainer.val_every=20",
+    "callbacks.checkpoint.every_n_train_steps=7",  # in the middle of an interval
+    "trainer.val_check_interval=20",
     "callbacks=densify",
     "callbacks.densify.start=10",
     "callbacks.densify.interval=10",

@@ -17,6 +17,7 @@ from campaigns import brief, compose, spectra
 from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops.settings import FARTHEST, WIDEST
 from gsparc.training.fit import TrainerSettings, Training
@@ -56,7 +57,7 @@ def data(tmp_path):
 def test_a_spoilt_parameter_stops_the_run_and_is_named(data, folds, tmp_path, name):
     method = field(tmp_path / "own.npz", [Spoil(7, name, 3)])
     with pytest.raises(NonFiniteLoss, match=rf"at step 7 .*Gaussian id 3, {name}"):
-        method.fit(data, folds(len(data)).folds[0], tmp_path)
+        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
     assert left["step"] == 7 and left["state_dict"][name][3].isnan().any() and len(left["index"])
     assert left["offender"] == f"Gaussian id 3, {name}" and left["sample"] in left["index"]
@@ -79,7 +80,7 @@ def test_a_poisoned_state_replaces_no_checkpoint(data, folds, tmp_path):
     """A NaN that a step itself makes is met one step later; a checkpoint must not be written in between."""
     method = field(tmp_path / "own.npz", [SpoilAfterStep(10, "log_gain", ...)])
     with pytest.raises(NonFiniteLoss, match="log_gain"):
-        method.fit(data, folds(len(data)).folds[0], tmp_path)
+        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
     assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
     assert torch.load(tmp_path / "nonfinite.pt", weights_only=True)["offender"] == "log_gain"
 
@@ -95,7 +96,7 @@ def test_a_parameter_that_would_overflow_stops_the_run_too(data, folds, tmp_path
 
     method = field(tmp_path / "own.npz", [Widen(7, "", 3)])
     with pytest.raises(NonFiniteLoss, match=r"at step 7 .*Gaussian id 3: Gaussian 3 has scales that are not"):
-        method.fit(data, folds(len(data)).folds[0], tmp_path)
+        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
     assert "Gaussian id 3" in left["offender"] and len(left["target"]) == len(left["index"])
     assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
@@ -105,7 +106,7 @@ def test_a_run_that_is_poisoned_before_a_validation_leaves_the_evidence_too(data
     method = field(tmp_path / "own.npz", [SpoilAfterStep(9, "gaussians.means", 2)])
     method.training.settings = dataclasses.replace(method.training.settings, val_every=10)
     with pytest.raises(NonFiniteLoss, match=r"Gaussian id 2, gaussians\.means"):
-        method.fit(data, folds(len(data)).folds[0], tmp_path)
+        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
     assert (tmp_path / "nonfinite.pt").exists()
 
 
@@ -124,7 +125,7 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_
     )
     method.training = Training(TrainerSettings(max_steps=20, batch_size=8))
     with pytest.raises(NonFiniteLoss, match=rf"sample {bad}; all parameters are finite"):
-        method.fit(dataclasses.replace(data, target=target), fold, tmp_path)
+        method.fit(dataclasses.replace(data, target=target), fold, FitContext(tmp_path))
     assert (tmp_path / "nonfinite.pt").exists()
 
 

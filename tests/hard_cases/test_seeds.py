@@ -18,6 +18,7 @@ from releases import REAL
 
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.load import load, split_for
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.training.fit import TrainerSettings, Training
 
@@ -54,7 +55,7 @@ def test_no_seed_breaks(tmp_path, name, seeds):
         began = time.perf_counter()
         method = build(compose(*brief(file, "model.refit=false", "model.warm_start=false")).model)
         method.training = Training(TrainerSettings(max_steps=15, batch_size=8), seed, callbacks)
-        method.fit(data, fold, tmp_path / str(seed))
+        method.fit(data, fold, FitContext(tmp_path / str(seed)))
         assert all(p.isfinite().all() for p in method.fitted().parameters())
         batch = data.batch(fold.test[:16])
         predicted = method.predict(batch.tx, batch.rx).mean

@@ -26,6 +26,7 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid
 from gsparc.training.fit import TrainerSettings, Training
@@ -182,7 +183,7 @@ def test_training_under_adversarial_gradients_ends_whole_or_stops_by_name(tmp_pa
     made = [Fire(size, 0), densify, OpacityReset(5, 30, 0.05)]
     method.training = Training(TrainerSettings(max_steps=24, batch_size=8), callbacks=lambda: made)
     try:
-        method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path)
+        method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
     except NonFiniteLoss as stopped:
         assert "first offender: " in str(stopped) and (tmp_path / "nonfinite.pt").exists()
         assert not math.isfinite(size) or size > 1e18

@@ -17,6 +17,7 @@ from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.idw import InverseDistance
+from gsparc.methods.method import FitContext
 
 CONFIG = """
 model: {_target_: gsparc.methods.idw.InverseDistance, neighbours: 3, power: 1.0}
@@ -28,7 +29,7 @@ seed: 4
 def fitted(campaign, folds, tmp_path):
     data = campaign("spectrum", 30)
     method = GaussianProcess()
-    method.fit(data, folds(30).folds[0], tmp_path)
+    method.fit(data, folds(30).folds[0], FitContext(tmp_path))
     return method, data.batch(folds(30).folds[0].test)
 
 
@@ -47,7 +48,7 @@ def test_predictions_survive_bit_for_bit(fitted, tmp_path):
 def test_the_stored_settings_are_used(campaign, folds, tmp_path):
     data = campaign("rssi", 20)
     method = InverseDistance(neighbours=3, power=1.0)
-    method.fit(data, folds(20).folds[0], tmp_path)
+    method.fit(data, folds(20).folds[0], FitContext(tmp_path))
     checkpoint.save(tmp_path / "m.ckpt", method, CONFIG)
     again, stored = checkpoint.load(tmp_path / "m.ckpt")
     assert (again.neighbours, again.power) == (3, 1.0) and stored.configuration["seed"] == 4

@@ -10,6 +10,7 @@ from gsparc.methods import checkpoint
 from gsparc.methods.confidence import Trusted, as_confidence, keep
 from gsparc.methods.confidence_scores import gather, known_positions, position_kernel
 from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.method import FitContext
 from gsparc.methods.risk_threshold import Promise
 
 
@@ -17,7 +18,7 @@ from gsparc.methods.risk_threshold import Promise
 def site(campaign, folds, tmp_path):
     data, fold = campaign("spectrum", 60), folds(60).folds[0]
     method = GaussianProcess()
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     file = tmp_path / "gp.ckpt"
     checkpoint.save(file, method)
     return data, fold, file

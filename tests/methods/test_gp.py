@@ -12,6 +12,7 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.scores import score
 from gsparc.methods.gp import GaussianProcess, Kernel, choose_kernel, leave_one_out, principal_components
+from gsparc.methods.method import FitContext
 from gsparc.ops import Pose
 
 
@@ -73,7 +74,7 @@ def test_components_are_the_principal_ones(campaign, kind):
 def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     data, fold = campaign("csi", 40), folds(40).folds[0]
     gp = GaussianProcess()
-    gp.fit(data, fold, tmp_path)
+    gp.fit(data, fold, FitContext(tmp_path))
     rows = np.concatenate([fold.train, fold.val])
     k = gp.kernel
     target = data.target[rows].reshape(len(rows), -1).view(np.float32)
@@ -93,7 +94,7 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
 def test_it_knows_what_it_does_not_know(campaign, folds, tmp_path):
     data, fold = campaign("spectrum", 120), folds(120).folds[0]
     gp = GaussianProcess()
-    gp.fit(data, fold, tmp_path)
+    gp.fit(data, fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
     near, far = gp.predict(batch.tx, batch.rx), gp.predict(batch.tx + 1000.0, batch.rx)
     assert near.confidence.min() > far.confidence.max() and far.confidence.max() < 1e-6
@@ -108,7 +109,7 @@ def test_hardly_any_samples(campaign, folds, tmp_path, rows):
     fold = folds(8).folds[0]
     few = type(fold)(fold.train[:rows], fold.val[:0], fold.test)
     gp = GaussianProcess()
-    gp.fit(data, few, tmp_path)
+    gp.fit(data, few, FitContext(tmp_path))
     prediction = gp.predict(*(lambda b: (b.tx, b.rx))(data.batch(fold.test)))
     assert torch.isfinite(prediction.mean).all() and torch.isfinite(prediction.variance).all()
 
@@ -118,7 +119,7 @@ def test_equal_samples_at_one_place(campaign, folds, tmp_path):
     data.tx[:] = data.tx[0]
     data.target[:] = data.target[0]
     gp = GaussianProcess()
-    gp.fit(data, folds(12).folds[0], tmp_path)
+    gp.fit(data, folds(12).folds[0], FitContext(tmp_path))
     found = gp.predict(torch.zeros(2, 3), Pose(torch.zeros(3), torch.eye(3))).mean
     assert torch.allclose(found, data.targets(np.array([0, 0])), atol=1e-5)
 
@@ -126,7 +127,7 @@ def test_equal_samples_at_one_place(campaign, folds, tmp_path):
 def test_few_components_say_so(campaign, folds, tmp_path):
     data, fold = campaign("spectrum", 48), folds(48).folds[0]
     gp = GaussianProcess(components=4)
-    notes = gp.fit(data, fold, tmp_path).notes
+    notes = gp.fit(data, fold, FitContext(tmp_path)).notes
     assert any("4 components" in note for note in notes) and gp.axes.shape[0] == 4
     with pytest.raises(ValueError, match="components"):
         GaussianProcess(components=0)
@@ -136,7 +137,7 @@ def test_figures_on_the_real_subset(real_rfid, tmp_path):
     data = load({"name": "rfid", "root": str(real_rfid)})
     split = split_for({"name": "random"}, data)
     gp = GaussianProcess()
-    gp.fit(data, split.folds[0], tmp_path)
+    gp.fit(data, split.folds[0], FitContext(tmp_path))
     figures = score([gp], data, split).figures()
     assert figures["ssim_gauss"] == pytest.approx(0.927, abs=0.002)
     assert figures["psnr_db"] == pytest.approx(28.9, abs=0.2)

@@ -8,6 +8,7 @@ import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.methods.idw import InverseDistance
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.methods.target_rows import from_real, to_real
 
@@ -16,7 +17,7 @@ NAMES = ("zero", "mean", "nearest", "idw", "gp")
 
 def fitted(name, data, fold, tmp_path):
     method = method_class(name)()
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     return method
 
 
@@ -69,7 +70,7 @@ def test_idw_weighs_by_inverse_squared_distance(campaign, folds, tmp_path):
     data.tx[:] = [[0, 0, 0], [3, 0, 0], [100, 0, 0]]
     fold = type(folds(8).folds[0])(np.arange(3), np.arange(0), np.arange(0))
     method = InverseDistance(neighbours=2)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     found = method.predict(torch.tensor([[1.0, 0, 0]]), data.batch(np.arange(1)).rx).mean
     decibels = 10 * np.log10(data.target[:2, 0])
     assert 10 * torch.log10(found)[0, 0] == pytest.approx((4 * decibels[0] + decibels[1]) / 5, rel=1e-4)

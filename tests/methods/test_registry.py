@@ -18,7 +18,7 @@ def test_every_name_is_a_method(name):
 
 
 def test_every_model_of_the_configuration_has_a_name():
-    """`model=directed` could be trained, but was no baseline and could not be read from a bare checkpoint."""
+    """`model=directional_gp` could be trained, but was no baseline and could not be read from a bare checkpoint."""
     files = (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")
     targets = {file.stem: yaml.safe_load(file.read_text())["_target_"] for file in files}
     assert targets == METHODS

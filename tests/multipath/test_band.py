@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rooms import nmse, shoebox
 
+from gsparc.methods.method import FitContext
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 
 QUARTERS = 4
@@ -23,8 +24,8 @@ def test_the_whole_band_from_its_lowest_quarter(tones, width_hz, tmp_path):
     _, data, fold = shoebox(450, pillar=True, frequency_hz=frequency)
     mask = np.zeros(data.target.shape, bool)
     mask[..., : tones // QUARTERS] = True
-    method = VirtualSourceGP(searches=1, furniture=False)
-    report = method.fit(replace(data, mask=mask), fold, tmp_path)
+    method = VirtualSourceGP(searches=1, clutter=False)
+    report = method.fit(replace(data, mask=mask), fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
     said, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
     parts = np.array_split(np.arange(tones), QUARTERS)

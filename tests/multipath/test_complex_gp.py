@@ -2,6 +2,7 @@ import numpy as np
 import torch
 from rooms import nmse, shoebox
 
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.multipath.complex_gp import ComplexGP
 
@@ -14,7 +15,7 @@ def _dense():
 def test_between_dense_receivers_and_back_from_disk(tmp_path):
     _, data, fold = _dense()
     method = ComplexGP()
-    report = method.fit(data, fold, tmp_path)
+    report = method.fit(data, fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
     prediction = method.predict(batch.tx, batch.rx)
     assert nmse(prediction.mean.numpy(), batch.target.numpy()) < 0.3
@@ -30,7 +31,7 @@ def test_between_dense_receivers_and_back_from_disk(tmp_path):
 def test_far_from_all_measurements_it_says_nothing(tmp_path):
     _, data, fold = _dense()
     method = ComplexGP()
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     batch = data.batch(fold.test[:1])
     far = method.predict(batch.tx, type(batch.rx)(batch.rx.position + 1000, batch.rx.rotation))
     assert far.mean.abs().max() < 1e-3

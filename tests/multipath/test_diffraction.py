@@ -9,6 +9,7 @@ from rooms import WAVELENGTH, nmse, shoebox
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
+from gsparc.methods.method import FitContext
 from gsparc.multipath.diffraction import Edges, diffracted, edge_wave
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
@@ -16,7 +17,7 @@ from gsparc.multipath.source_types import SourceKind, box_of, kinds
 EDGE = torch.tensor([[1.9, 1.3, 1.0]], dtype=torch.float64)
 UP = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
 SCATTERERS = np.array([[2.3, 0.9, 0.8], [1.1, 1.9, 1.2]])
-QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "furniture": False}
+QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "clutter": False}
 
 
 def _room(extra=None):
@@ -44,7 +45,7 @@ def _scattered(tx, rx):
 
 def _fit(data, fold, tmp_path, **more):
     method = VirtualSourceGP(**QUICK, **more)
-    report = method.fit(data, fold, tmp_path)
+    report = method.fit(data, fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
     error = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy())
     return method, report, error

@@ -13,6 +13,7 @@ from scenes import error
 
 from gsparc.data.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.methods.method import FitContext
 from gsparc.multipath.directional_gp import DirectedSources
 from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.image_source_gp import VirtualSourceGP
@@ -27,7 +28,7 @@ REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.
 def pillar():
     data, fold, sources = directed(150, pillar=True)
     method = DirectedSources()
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     return data, fold, sources, method
 
 
@@ -36,7 +37,7 @@ def test_few_receivers_are_enough_where_rays_say_where_sources_are():
     rows = np.arange(60)
     fold = Fold(rows[:12], rows[12:14], rows[14:])
     method = DirectedSources()
-    report = method.fit(data, fold, Path())
+    report = method.fit(data, fold, FitContext(Path()))
     found = method.sources + method.frame.middle
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == len(sources) == 7 and float(apart.max()) < 0.02
@@ -48,7 +49,7 @@ def test_who_is_hidden_by_a_pillar_is_learned(pillar):
     data, fold, sources, method = pillar
     assert bool((method.sightings.seen == 0).any())
     blind = DirectedSources()
-    blind.fit(replace(data, directions=towards(sources, data.rx_position)), fold, Path())
+    blind.fit(replace(data, directions=towards(sources, data.rx_position)), fold, FitContext(Path()))
     assert error(method, data, fold.test) < 0.5 * error(blind, data, fold.test)
 
 
@@ -70,8 +71,8 @@ def test_errors_are_as_large_as_expected(pillar):
 def test_left_over_is_what_a_regression_without_the_receiver_leaves():
     data, fold, _ = directed(40, pillar=True, tones=3)
     method = DirectedSources(rows=96)
-    method.fit(data, fold, Path())
-    receivers, left = method.left_over()
+    method.fit(data, fold, FitContext(Path()))
+    receivers, left = method.leave_one_out()
     assert len(receivers) == 96  # three tones each
     rows, waves, k = method.rows, method.waves, 7
     kept = torch.nonzero(method.observer != k).flatten()
@@ -119,7 +120,7 @@ def test_errors_of_directions_are_told_and_places_pinned_by_phase(degrees):
     """Directions taken as exact left NMSE 0.08, 0.45 and 0.70."""
     data, fold, sources = directed(60, pillar=True)
     method = DirectedSources()
-    report = method.fit(turned(data, degrees, seed=0), fold, Path())
+    report = method.fit(turned(data, degrees, seed=0), fold, FitContext(Path()))
     assert error(method, data, fold.test) < (0.07 if degrees < 2 else 0.25)
     told = float(report.notes[0].partition("error ")[2].partition(" degrees")[0])
     assert abs(told / degrees - 1) < 0.3
@@ -131,7 +132,7 @@ def test_errors_of_directions_are_told_and_places_pinned_by_phase(degrees):
 def test_missing_and_false_rays_make_neither_sources_nor_silence():
     data, fold, _ = directed(60, pillar=True)
     method = DirectedSources()
-    report = method.fit(turned(data, 1.0, seed=1, missing=0.1, false=0.1), fold, Path())
+    report = method.fit(turned(data, 1.0, seed=1, missing=0.1, false=0.1), fold, FitContext(Path()))
     assert method.size() == 7 and " 0 sightings" not in report.notes[0]
     assert error(method, data, fold.test) < 0.08  # rays alone: 0.17
 
@@ -176,7 +177,7 @@ def test_checkpoints_of_before_directions_had_errors_load(pillar):
 def test_what_cannot_be_followed_is_refused_in_one_line(pillar, spoil, message):
     data, fold, _, _ = pillar
     with pytest.raises(ValueError, match=message):
-        DirectedSources().fit(spoil(data), fold, Path())
+        DirectedSources().fit(spoil(data), fold, FitContext(Path()))
 
 
 def _at_a_source(data, sources):
@@ -202,7 +203,7 @@ HARD = {
 def test_rays_that_mean_nothing_are_no_sources():
     data, fold, _ = directed(60, pillar=True)
     with pytest.raises(ValueError, match="meet nowhere"):
-        DirectedSources().fit(_anyhow(data), fold, Path())
+        DirectedSources().fit(_anyhow(data), fold, FitContext(Path()))
 
 
 @pytest.mark.parametrize("case", HARD)
@@ -210,9 +211,9 @@ def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
     data, fold, sources = directed(60, pillar=True)
     data = HARD[case](data, sources)
     method = DirectedSources()
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     batch = data.batch(fold.test)
-    said, (_, left) = method.predict(batch.tx, batch.rx), method.left_over()
+    said, (_, left) = method.predict(batch.tx, batch.rx), method.leave_one_out()
     for part in (torch.view_as_real(said.mean), said.variance, said.confidence, torch.view_as_real(left)):
         assert bool(torch.isfinite(part).all())
     assert error(method, data, fold.test) < 1.1
@@ -225,9 +226,9 @@ def test_the_conference_room_from_43_receivers():
     data = load_newrf(REAL)
     fold = make_split(data.moving, SplitSettings(name="sparse")).folds[0]
     method = DirectedSources()
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     assert len(fold.train) + len(fold.val) == 43
     assert error(method, data, fold.test) < 0.08
-    searched = VirtualSourceGP(searches=1, budget_s=5, furniture=False, edges=False)
-    searched.fit(data, fold, Path())
+    searched = VirtualSourceGP(searches=1, budget_s=5, clutter=False, edges=False)
+    searched.fit(data, fold, FitContext(Path()))
     assert error(searched, data, fold.test) > 0.5

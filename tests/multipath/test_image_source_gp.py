@@ -13,6 +13,7 @@ from gsparc.auto.decide import probe_phase
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.pictures import plot_visibility
@@ -42,7 +43,7 @@ def small(tmp_path_factory):
     torch.manual_seed(0)
     told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1)
     method = VirtualSourceGP(**QUICK)
-    report = method.fit(data, fold, tmp_path_factory.mktemp("run"))
+    report = method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
     return told, data, fold, method, report
 
 
@@ -120,7 +121,7 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # two may start two searches before any time is over
     try:
-        report = method.fit(data, fold, tmp_path)
+        report = method.fit(data, fold, FitContext(tmp_path))
     finally:
         torch.set_num_threads(threads)
     assert len(method.members) == 1
@@ -130,7 +131,7 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
 def test_searches_that_agree_at_the_noise_floor_are_enough(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     method = VirtualSourceGP(searches=8, search_rows=60, margin=1.0, edges=False)
-    report = method.fit(data, fold, tmp_path)
+    report = method.fit(data, fold, FitContext(tmp_path))
     assert "of 8 searches (more would say the same)" in report.notes[0]  # not that their time was over
     # both threads may have started one more when the second ended
     assert 2 <= len(method.members) <= 2 + torch.get_num_threads()
@@ -143,13 +144,13 @@ def test_a_moving_transmitter_is_a_moving_receiver(tmp_path):
     arrays["rx_position"], arrays["tx_position"] = arrays["tx_position"], arrays["rx_position"]
     swapped = from_arrays(arrays)
     assert swapped.site.moving_end == "tx" and np.array_equal(swapped.moving, data.moving)
-    method = VirtualSourceGP(**QUICK, furniture=False, edges=False)
-    method.fit(swapped, fold, tmp_path)
+    method = VirtualSourceGP(**QUICK, clutter=False, edges=False)
+    method.fit(swapped, fold, FitContext(tmp_path))
     said = _predicted(method, swapped, fold.test).mean.numpy()
     assert nmse(said, swapped.targets(fold.test).numpy()) < 0.01
     pair = replace(swapped, target=np.repeat(swapped.target, 2, axis=1))
     with pytest.raises(ValueError, match="moves before 2 antennas"):
-        method.fit(pair, fold, tmp_path)
+        method.fit(pair, fold, FitContext(tmp_path))
 
 
 def test_known_array_elements_are_receivers_of_their_own(tmp_path):
@@ -158,7 +159,7 @@ def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     rows = gather(data, fold.train, 10_000, 0)
     assert rows.target.shape == (3 * len(fold.train), 1)
     method = VirtualSourceGP(**QUICK)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     prediction = _predicted(method, data, fold.test)
     assert prediction.mean.shape == (len(fold.test), 3, 1)
     assert nmse(prediction.mean.numpy(), data.targets(fold.test).numpy()) < 0.03
@@ -172,7 +173,7 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     known = _masked(data, mask)
     assert set(gather(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
     method = VirtualSourceGP(searches=1, search_rows=200, margin=4.0)
-    method.fit(known, fold, tmp_path)
+    method.fit(known, fold, FitContext(tmp_path))
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
 
@@ -197,13 +198,13 @@ def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
 def test_spectra_and_unknown_ends_are_refused_in_one_line(tmp_path):
     fold = Fold(np.arange(30), np.arange(30, 36), np.arange(36, 48))
     with pytest.raises(ValueError, match="needs complex channels"):
-        VirtualSourceGP().fit(invent("spectrum"), fold, tmp_path)
+        VirtualSourceGP().fit(invent("spectrum"), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match="not fitted"):
         VirtualSourceGP().state()
 
 
 def test_it_has_its_name():
-    assert method_class("vsgp") is VirtualSourceGP
+    assert method_class("image_source_gp") is VirtualSourceGP
 
 
 @pytest.mark.slow
@@ -211,7 +212,7 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
     """2.4 GHz, 450 receivers in 30 m^3, nearest neighbours about two wavelengths apart, 30 dB."""
     told, data, fold = shoebox(450)
     method = VirtualSourceGP(searches=1)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     assert found_share(method, told) >= 0.9
     assert nmse(_predicted(method, data, fold.test).mean.numpy(), data.targets(fold.test).numpy()) <= 0.01
 
@@ -220,7 +221,7 @@ def test_every_source_of_a_shoebox_is_found(tmp_path):
 def test_a_pillar_hides_sources_and_it_is_seen_which(tmp_path):
     told, data, fold = shoebox(450, pillar=True)
     method = VirtualSourceGP(searches=2)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     predicted = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(predicted, data.targets(fold.test).numpy()) <= 0.02
     learned, true, names = learned_and_true_visibility(method, told, data, fold.test)
@@ -233,7 +234,7 @@ def test_a_pillar_hides_sources_and_it_is_seen_which(tmp_path):
 def test_a_furnished_room(tmp_path):
     told, data, fold = furnished(600)
     method = VirtualSourceGP(searches=2, budget_s=400)  # of which a quiet machine needs a fraction
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     # In one of the searches the farthest wall may stay a wavelength off: a phase of its own makes up for it.
     assert found_share(method, told, within=0.5, order=1) >= 6 / 7
     assert found_share(method, told, within=1.5, order=1) == 1.0
@@ -263,6 +264,6 @@ def test_silent_training_channels_are_refused_in_words(tmp_path):
     _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
     silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
     with pytest.raises(ValueError, match="every channel to learn from is silent"):
-        VirtualSourceGP(**QUICK).fit(silent, fold, tmp_path)
+        VirtualSourceGP(**QUICK).fit(silent, fold, FitContext(tmp_path))
     decision = probe_phase(VirtualSourceGP(**QUICK), method_class("gp")(), silent, fold, 0)
     assert not decision.on and "silent" in decision.reason

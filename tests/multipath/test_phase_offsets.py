@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rooms import nmse, shoebox
 
+from gsparc.methods.method import FitContext
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.multipath.phase_offsets import estimate
 
@@ -43,7 +44,7 @@ def test_tones_not_measured_do_not_count():
 
 def _fit(data, fold, tmp_path, offsets):
     method = VirtualSourceGP(searches=1, search_rows=300, margin=4.0, offsets=offsets)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     return method
 
 

@@ -6,16 +6,17 @@ import pytest
 import torch
 from rooms import shoebox
 
+from gsparc.methods.method import FitContext
 from gsparc.multipath import ensemble
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 
-QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "furniture": False, "edges": False}
+QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "clutter": False, "edges": False}
 
 
 def _fit(data, fold, folder, resume=None, **more):
     method = VirtualSourceGP(**{**QUICK, **more})
     method.resume = resume
-    return method, method.fit(data, fold, folder)
+    return method, method.fit(data, fold, FitContext(folder))
 
 
 @pytest.fixture()

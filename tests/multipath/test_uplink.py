@@ -11,6 +11,7 @@ from cities import city, deaf, fold, folder
 
 from gsparc.data.argos import load_argos
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.ridge import Ridge
 from gsparc.multipath.uplink.error_model import unheard_noise
 from gsparc.multipath.uplink.method import UplinkField
@@ -105,7 +106,7 @@ def test_confidence_is_a_share_and_is_larger_where_errors_are_smaller(fitted) ->
 def test_peers_answer_and_keep(make, tmp_path) -> None:
     data = city()
     method = make()
-    method.fit(data, fold(), tmp_path)
+    method.fit(data, fold(), FitContext(tmp_path))
     batch = data.batch(fold().test)
     before = method.answer(batch).mean
     assert before.shape == batch.target.shape

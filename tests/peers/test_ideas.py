@@ -11,6 +11,7 @@ from scipy.special import eval_legendre
 
 from gsparc.data.rfid import planar_array
 from gsparc.methods.kriging import fit_variogram
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.peers.directions import virtual_transmitters
@@ -20,7 +21,7 @@ from gsparc.peers.radiance import fourier_legendre, terms
 def fitted(name, data, fold, tmp_path, **settings):
     torch.set_num_threads(1)
     method = method_class(name)(**settings)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     return method
 
 

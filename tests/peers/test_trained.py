@@ -12,6 +12,7 @@ import yaml
 from scenes import lobes, room
 
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.peers.trained import rate_factor
 
@@ -37,7 +38,7 @@ def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
     torch.set_num_threads(1)
     data, fold = scene(kind, tmp_path, moving)
     method = brief(name)
-    assert method.fit(data, fold, tmp_path).seconds > 0
+    assert method.fit(data, fold, FitContext(tmp_path)).seconds > 0
     batch = data.batch(fold.test)
     said = method.predict(batch.tx, batch.rx).mean
     assert said.shape == batch.target.shape and said.dtype == batch.target.dtype
@@ -49,7 +50,7 @@ def test_a_peer_predicts_and_reads_back(tmp_path, kind, name, moving):
     # Another object may choose another of the equally good summation orders.
     torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, said, rtol=1e-5, atol=1e-6)
     twin = brief(name)
-    twin.fit(data, fold, tmp_path)
+    twin.fit(data, fold, FitContext(tmp_path))
     assert torch.equal(twin.predict(batch.tx, batch.rx).mean, said), "the same steps give the same model"
 
 
@@ -64,7 +65,7 @@ def test_no_test_row_is_looked_at(tmp_path, name):
             for i in fold.test:
                 data.directions[i] = np.full_like(data.directions[i], np.nan)
         method = brief(name)
-        method.fit(data, fold, tmp_path)
+        method.fit(data, fold, FitContext(tmp_path))
         answers.append(method.predict(batch.tx, batch.rx).mean)
     assert torch.equal(*answers)
 
@@ -77,7 +78,7 @@ def test_the_budget_ends_training_and_the_schedule_reaches_its_end(tmp_path, mon
     monkeypatch.setattr("gsparc.peers.trained.time.process_time", lambda: next(ticks) * 0.05)
     torch.set_num_threads(1)
     method = brief("swiftwrf", max_steps=None, budget_s=0.5)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     assert len(set(seen)) == method.steps > 3 and 0.8 < seen[-1] < 1 and sorted(seen) == seen
     assert rate_factor(0.0) < 0.1 < rate_factor(0.05) and rate_factor(1.0) < 0.05
 
@@ -86,7 +87,7 @@ def test_budgets_are_processor_time(tmp_path):
     torch.set_num_threads(1)
     data, fold = lobes(tmp_path)
     before = time.process_time()
-    brief("swiftwrf", max_steps=None, budget_s=0.5).fit(data, fold, tmp_path)
+    brief("swiftwrf", max_steps=None, budget_s=0.5).fit(data, fold, FitContext(tmp_path))
     assert 0.4 < time.process_time() - before < 3
 
 
@@ -95,11 +96,11 @@ def test_what_cannot_be_served_is_refused_in_one_line(tmp_path, campaign, folds)
     for name, kind in (("swiftwrf", "csi"), ("gsrf", "rssi")):
         method = brief(name)
         with pytest.raises(ValueError, match=f"{name}: predicts .*holds {kind}"):
-            method.fit(campaign(kind, 30), fold, tmp_path)
+            method.fit(campaign(kind, 30), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match="newrf: needs directions of arrival"):
-        brief("newrf").fit(campaign("csi", 30, "tx"), fold, tmp_path)
+        brief("newrf").fit(campaign("csi", 30, "tx"), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match=r"ngrf: spectra need .* array"):
-        brief("ngrf").fit(campaign("spectrum", 30), fold, tmp_path)
+        brief("ngrf").fit(campaign("spectrum", 30), fold, FitContext(tmp_path))
     with pytest.raises(ValueError, match="gsrf: not fitted"):
         brief("gsrf").predict(torch.zeros(1, 3), None)
     with pytest.raises(ValueError, match="budget_s > 0"):
@@ -110,4 +111,4 @@ def test_a_loss_that_is_not_finite_stops_training(tmp_path):
     data, fold, _ = room(40)
     data.target[fold.train] = np.nan
     with pytest.raises(RuntimeError, match="NaN or infinite at step 0"):
-        brief("ngrf").fit(data, fold, tmp_path)
+        brief("ngrf").fit(data, fold, FitContext(tmp_path))

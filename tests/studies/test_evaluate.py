@@ -14,6 +14,7 @@ from omegaconf import OmegaConf
 
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.nearest import Nearest
 from gsparc.studies.cli import one_line, run
 from gsparc.studies.evaluate import aligned, evaluate_files, main
@@ -46,7 +47,7 @@ def trained(room, tmp_path):
     data = load(config["dataset"])
     split = split_for(config["split"], data)
     method = Nearest()
-    seconds = method.fit(data, split.folds[0], tmp_path).seconds
+    seconds = method.fit(data, split.folds[0], FitContext(tmp_path)).seconds
     path = tmp_path / "nearest.ckpt"
     extra = {"train_s": seconds, "fold": 0, "split_sha256": split.sha256}
     checkpoint.save(path, method, OmegaConf.to_yaml(config), extra)

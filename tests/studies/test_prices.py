@@ -11,7 +11,7 @@ from gsparc.auto.decide import decide_array
 from gsparc.data.splits import Fold
 from gsparc.methods import timing
 from gsparc.methods.mean import Mean
-from gsparc.methods.method import FitReport
+from gsparc.methods.method import FitContext, FitReport
 from gsparc.methods.nearest import Nearest
 from gsparc.methods.timing import ClockSettings
 from gsparc.studies.study.prices import measure
@@ -28,7 +28,7 @@ class Slow(Nearest):
     effects = "sleep"
 
     def fit(self, data, fold, run_dir):
-        super().fit(data, fold, run_dir)
+        super().fit(data, fold, FitContext(run_dir))
         return FitReport(3.0)
 
     def predict(self, tx, rx):
@@ -38,7 +38,7 @@ class Slow(Nearest):
 
 class Quick(Nearest):
     def fit(self, data, fold, run_dir):
-        super().fit(data, fold, run_dir)
+        super().fit(data, fold, FitContext(run_dir))
         return FitReport(1.0)
 
     def predict(self, tx, rx):

@@ -91,7 +91,9 @@ def test_the_simulated_stand_in_says_so(tmp_path):
 
 def test_loss_decreases_and_the_field_beats_the_mean_on_simulated_channels(tmp_path):
     file = channels(tmp_path / "own.npz", rows=150)
-    config = compose(*brief(file, "trainer.max_steps=150", "trainer.val_every=25", "model.field.count=80"))
+    config = compose(
+        *brief(file, "trainer.max_steps=150", "trainer.val_check_interval=25", "model.field.count=80")
+    )
     facts, _ = train(config, tmp_path / "run")
     rows = (tmp_path / "run" / "learning_curve.csv").read_text().splitlines()
     column = rows[0].split(",").index("train/task_loss")
@@ -171,9 +173,9 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(tmp_path):
     file = spectra(tmp_path / "own.npz")
     more = (
         "trainer.max_steps=100000",
-        "trainer.checkpoint_every=10",
+        "callbacks.checkpoint.every_n_train_steps=10",
         "model.refit=false",
-        "trainer.val_every=50000",
+        "trainer.val_check_interval=50000",
     )
     run = start(file, tmp_path / "run", *more)
     last = tmp_path / "run" / "last.ckpt"
@@ -188,7 +190,7 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(tmp_path):
         f"trainer.max_steps={reached + 5}",
         f"ckpt_path={last}",
         "model.refit=false",
-        "trainer.val_every=50000",
+        "trainer.val_check_interval=50000",
     )
     facts, _ = train(compose(*brief(file, *more)), tmp_path / "on")
     assert np.isfinite(facts["test/psnr_db"])

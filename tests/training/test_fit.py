@@ -9,6 +9,7 @@ from campaigns import brief, compose, spectra
 
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.training.fit import TrainerSettings, Training
 
@@ -31,7 +32,7 @@ def run(tmp_path, *callbacks, resume=None, steps: int = 20):
     settings = TrainerSettings(max_steps=steps, batch_size=8, checkpoint_every=5)
     method.training = Training(settings, callbacks=lambda: list(callbacks), resume=resume)
     data = load({"name": "own", "file": str(file)})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path / "run")
+    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path / "run"))
     return method.fitted().state_dict()
 
 
@@ -102,7 +103,7 @@ def test_a_learning_curve_has_the_loss_of_its_own_step(tmp_path, val_every):
     settings = TrainerSettings(max_steps=21, batch_size=8, val_every=val_every)
     method.training = Training(settings, callbacks=lambda: [watching])
     data = load({"name": "own", "file": str(tmp_path / "own.npz")})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], tmp_path / "run")
+    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path / "run"))
     assert set(watching.logged) == set(range(val_every, 22, val_every))
     for step, loss in watching.logged.items():
         assert loss == pytest.approx(watching.steps[step], rel=1e-6)

@@ -12,6 +12,7 @@ from gsparc import load
 from gsparc.data.load import load as load_data
 from gsparc.data.load import split_for
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops import Pose
 from gsparc.training.fit import TrainerSettings, Training
@@ -29,7 +30,7 @@ def fitted(file, run_dir, *more: str, steps: int = 15):
     data = load_data({"name": "own", "file": str(file)})
     fold = split_for({"name": "random"}, data).folds[0]
     method = learned(file, *more, steps=steps)
-    method.fit(data, fold, run_dir)
+    method.fit(data, fold, FitContext(run_dir))
     return method, data, fold
 
 
@@ -142,7 +143,7 @@ def test_the_test_rows_are_never_looked_at(tmp_path):
     states = []
     for target in (data.target, poisoned):
         method = learned(file)
-        method.fit(dataclasses.replace(data, target=target), fold, tmp_path)
+        method.fit(dataclasses.replace(data, target=target), fold, FitContext(tmp_path))
         states.append(method.fitted().state_dict())
     assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
 

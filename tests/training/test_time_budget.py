@@ -86,13 +86,13 @@ def test_validation_is_not_billed_and_a_resumed_run_has_the_rest(monkeypatch):
 
 @pytest.mark.parametrize("wrong", [0, -3, float("inf")])
 def test_a_budget_that_is_none_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"trainer.budget_s.*positive number of seconds"):
+    with pytest.raises(ValueError, match=r"budget_s.*positive number of seconds"):
         TrainerSettings(budget_s=wrong)
 
 
 def test_a_run_ends_with_its_budget_in_both_stages(tmp_path):
     file = spectra(tmp_path / "own.npz")
-    config = compose(*brief(file, "trainer.budget_s=2.0", "trainer.max_steps=100000"))
+    config = compose(*brief(file, "budget_s=2.0", "trainer.max_steps=100000"))
     facts, objects = train(config, tmp_path / "run")
     assert 1.9 < facts["time/train_s"] < 3.5  # the step in progress is finished
     last = (tmp_path / "run" / "learning_curve.csv").read_text().splitlines()[-1].split(",")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,15 +19,16 @@ from torch import Tensor
 from gsparc.array.moving.compress import components
 from gsparc.array.moving.error_model import Doubt, Looks, learn_doubt
 from gsparc.array.moving.power_gp import Trend, TrendSettings, learn_trend
+from gsparc.array.moving.reduce import reduced
 from gsparc.array.moving.triangulate import SearchSettings, bearings, find_sources, mixed, powers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import Kernel, choose_kernel
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
+from gsparc.methods.pareto import Settings
 from gsparc.methods.target_rows import to_real
 from gsparc.physics.lags import BLOCK, Lags
-from gsparc.training.fit import Training
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ PATIENCE = 3
 LAST = 0.8  # share of a budget after which no search may end
 
 
-class BearingField(Interpolator):
+class BearingField(Interpolator, PredictsVariance):
     """Sources seen through the receiver's array.
 
     With `trainer.budget_s` it searches while that is not spent and helps.
@@ -54,7 +54,7 @@ class BearingField(Interpolator):
         name: as it appears in tables.
     """
 
-    effects = "bearings"
+    effects = "moving_array"
 
     def __init__(
         self,
@@ -64,7 +64,7 @@ class BearingField(Interpolator):
         rest_rows: int = 1500,
         components: int = 512,
         seed: int = 0,
-        name: str = "bearings",
+        name: str = "moving_array",
     ) -> None:
         super().__init__()
         if searches < 1 or rest_rows < 3:
@@ -74,10 +74,10 @@ class BearingField(Interpolator):
         self.search, self.trend = search or SearchSettings(), trend or TrendSettings()
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name = seed, name
-        self.training = Training()
         self.trends: list[Trend] = []
+        self._budget_s: float | None = None
 
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Find sources, learn their powers and what they leave.
 
         Raises:
@@ -86,16 +86,32 @@ class BearingField(Interpolator):
         problem = site_problem(data)
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
-        if self.training.resume is not None:
-            raise ValueError(f"ckpt_path: {self.name} trains in one piece; start again without ckpt_path")
-        return super().fit(data, fold, run_dir)
+        self._budget_s = context.budget_s
+        return super().fit(data, fold, context)
+
+    def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
+        """See `Explains`."""
+        return explained_by_lags(data, rows)
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`; searches where there are several."""
+        own = ("keep", "stride", "confidence")
+        return ("searches", *own) if len(self.trends) > 1 else own
+
+    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Nothing: what a component contributes stands in the process."""
+        return {}
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        return reduced(self, settings)
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         begin = time.perf_counter()
         space = self.lags()
         self.positions = positions
         self.exponent, lags = self._lags(space, targets)
-        budget_s, longest = self.training.settings.budget_s, 0.0
+        budget_s, longest = self._budget_s, 0.0
         drawn = np.zeros((len(targets), *space.image), dtype=np.float32)  # sum over searches, each row unseen
         self.trends, errors = [], []
         while True:
@@ -305,6 +321,17 @@ class BearingField(Interpolator):
         self.positions, self.doubt = state["positions"].numpy(), Doubt.from_state(state["doubt"])
         self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
         self._factor = cho_factor(self.rest.gram(self.positions), lower=True)
+
+
+def explained_by_lags(data: Measurements, rows: np.ndarray) -> tuple[bool, str]:
+    """Whether the moving array can have measured the images of rows (n,), by the energy it cannot."""
+    problem, site = site_problem(data), data.site
+    if problem is not None:
+        return False, problem
+    assert site.array is not None and site.grid is not None and site.wavelength is not None
+    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
+    _, left = beyond(Lags(site.array, site.grid, site.wavelength), images)
+    return left <= POOR, f"{left:.1%} of the energy of {len(rows)} probed images is beyond the moving array"
 
 
 def beyond(space: Lags, images: Tensor) -> tuple[int, float]:

@@ -7,15 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.moving.method import BearingField
 from gsparc.array.moving.power_gp import Trend
 from gsparc.array.moving.triangulate import bearings, mixed
-from gsparc.data.schema import Measurements
 from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Settings
@@ -24,20 +22,12 @@ from gsparc.methods.target_rows import from_real
 from gsparc.ops import Pose
 from gsparc.physics.lags import Lags
 
-
-def knobs(method: BearingField) -> tuple[str, ...]:
-    """What can be turned; searches where there are several."""
-    own = ("keep", "stride", "confidence")
-    return ("searches", *own) if len(method.trends) > 1 else own
-
-
-def measure(method: BearingField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-    """Nothing: what a component contributes stands in the process."""
-    return {}
+if TYPE_CHECKING:
+    from gsparc.array.moving.method import BearingField
 
 
 @torch.no_grad()
-def reduced(method: BearingField, settings: Settings, measured: dict[str, Tensor]) -> Method:
+def reduced(method: BearingField, settings: Settings) -> Method:
     """The mean of the first `searches` with the strongest components of what sources leave (`keep`, a share).
 
     On fewer pixels (`stride`) and without its variance, most of a query where many receivers were learned.

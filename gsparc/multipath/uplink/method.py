@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitReport, Prediction
+from gsparc.methods.method import FitContext, FitReport, Prediction
 from gsparc.methods.uplink_method import UplinkMethod
 from gsparc.multipath.uplink.error_model import Heard, Trust, learn, signs, unheard_noise
 from gsparc.multipath.uplink.posterior import Sources
@@ -56,7 +55,7 @@ class UplinkField(UplinkMethod):
         self.trust: Trust | None = None
 
     # ---- learning ----
-    def fit(self, data: Measurements, fold: Fold, run_dir: Path) -> FitReport:
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the leakage on validation rows, learn the confidence on training rows."""
         started = time.perf_counter()
         self.site = self._need_uplink(data)

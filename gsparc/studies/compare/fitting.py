@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.load import load, split_for
@@ -27,7 +26,7 @@ from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
 from gsparc.methods.timing import machine_facts
 from gsparc.studies.compare.cells import Cell, Contender, key
-from gsparc.training.fit import Training
+from gsparc.studies.context import context_of
 
 log = logging.getLogger(__name__)
 
@@ -179,8 +178,7 @@ def prepare(
     """Compose a cell's configuration and name the folder of its result."""
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
     model = _plain(config.model)
-    by_trainer = hasattr(build(config.model), "training")
-    trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks")} if by_trainer else {}
+    trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks", "budget_s")}
     name = key(model, trainer, *room.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, config, folder, not contender.timed_only)
@@ -197,15 +195,9 @@ def fill(prepared: Prepared, room: Room) -> Filled:
     methods, seconds, processor, notes = [], [], [], []
     for number, fold in enumerate(room.folds.folds[: None if prepared.scored else 1]):
         method = build(config.model)
-        if hasattr(method, "training"):
-            method.training = Training(
-                settings=instantiate(config.trainer),
-                seed=int(config.seed),
-                callbacks=lambda: [instantiate(node) for node in config.callbacks.values() if node],
-                config_yaml=OmegaConf.to_yaml(config, resolve=True),
-            )
+        context = context_of(config, folder / f"fold{number}")
         before = time.process_time()
-        report = method.fit(room.data, fold, folder / f"fold{number}")
+        report = method.fit(room.data, fold, context)
         processor.append(time.process_time() - before)
         seconds.append(report.seconds)
         notes += [note for note in report.notes if number == 0]
@@ -222,7 +214,7 @@ def fill(prepared: Prepared, room: Room) -> Filled:
         "time/score_s": time.perf_counter() - started,
         "model/name": prepared.cell.method,
         "model/num_gaussians": methods[0].size(),
-        "model/effects": getattr(methods[0], "effects", None),
+        "model/effects": methods[0].effects,
         "model/notes": "; ".join(notes),
         "seed": prepared.cell.seed,
         "budget_s": prepared.cell.budget_s,

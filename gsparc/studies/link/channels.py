@@ -14,8 +14,8 @@ from gsparc.data.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.resource_grid import interpolated
+from gsparc.methods.uplink_method import SeparatesPaths
 from gsparc.multipath.phase_offsets import estimate
-from gsparc.multipath.uplink.method import UplinkField
 
 if TYPE_CHECKING:
     from gsparc.simulate.argos_sim import World
@@ -65,7 +65,7 @@ def channels(
     predicted, variance, confidence = [], [], []
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
-        if isinstance(method, UplinkField) and batch.uplink is not None:
+        if isinstance(method, SeparatesPaths) and batch.uplink is not None:
             wanted = torch.from_numpy(frequency_hz)
             found = method.listen_at(batch.uplink, wanted, batch.noise_variance, antennas)
         else:

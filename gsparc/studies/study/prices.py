@@ -5,8 +5,7 @@ from __future__ import annotations
 import csv
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
-from pathlib import Path
+from dataclasses import asdict, dataclass, fields, replace
 
 import numpy as np
 from omegaconf import DictConfig
@@ -18,7 +17,7 @@ from gsparc.evaluation.evaluate import dataset_facts
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods.method import Method
+from gsparc.methods.method import FitContext, Method
 from gsparc.methods.timing import ClockSettings, interleaved, machine_facts
 from gsparc.studies import cli
 from gsparc.studies.study.variants import setting
@@ -57,7 +56,7 @@ def measure(
     makers: Mapping[str, Callable[[], Method]],
     data: Measurements,
     fold: Fold,
-    run_dir: Path,
+    context: FitContext,
     *,
     plain: str,
     rounds: int,
@@ -68,7 +67,7 @@ def measure(
     Args:
         makers: unfitted methods by name.
         data, fold: trained on `fold.train` and `fold.val`, judged on `fold.test`.
-        run_dir: a folder per variant.
+        context: of every fit; each has a folder of its own.
         plain: name of the variant that others are compared with.
         rounds: trainings of each.
         clock: of the queries.
@@ -86,7 +85,7 @@ def measure(
                 continue
             method = make()
             try:
-                report = method.fit(data, fold, run_dir / name / str(turn))
+                report = method.fit(data, fold, replace(context, run_dir=context.run_dir / name / str(turn)))
             except ValueError as refused:
                 if name == plain or "not possible" not in str(refused):
                     raise
@@ -108,7 +107,7 @@ def measure(
         assert value is not None
         found.append(
             Price(
-                name, str(getattr(method, "effects", "none")), value,
+                name, str(method.effects or "none"), value,
                 float(np.median(seconds[name])),
                 float(np.median(np.array(seconds[name]) / np.array(seconds[plain]))),
                 float(np.median(times[name])),
@@ -124,7 +123,7 @@ def task(config: DictConfig) -> list[Price]:
     where = setting(config)
     clock = ClockSettings(rounds=int(config.queries), budget_s=float(config.query_s))
     found = measure(
-        where.makers, where.data, where.fold, where.run_dir,
+        where.makers, where.data, where.fold, where.context,
         plain=str(config.plain), rounds=int(config.rounds), clock=clock,
     )  # fmt: skip
     figure = DECIDING[where.data.site.kind]

@@ -21,7 +21,7 @@ from gsparc.evaluation.evaluate import dataset_facts
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.methods.method import Method
+from gsparc.methods.method import FitContext, Method
 from gsparc.methods.timing import machine_facts
 from gsparc.studies import cli
 from gsparc.studies.study.variants import setting
@@ -94,7 +94,7 @@ def sweep(
     data: Measurements,
     fold: Fold,
     errors_m: list[float],
-    run_dir: Path,
+    context: FitContext,
     *,
     train_errors: bool,
     seed: int,
@@ -104,23 +104,25 @@ def sweep(
     figure = DECIDING[data.site.kind]
     learned = np.concatenate([fold.train, fold.val])
     for name, make in contenders.items():
-        method, seconds = _fitted(make, data, fold, run_dir / name)
+        method, seconds = _fitted(make, data, fold, context, name)
         yield Row(name, "none", 0.0, figure, _value(method, data, fold, figure), seconds)
         for error in errors_m:
             there = displaced(data, fold.test, error, seed)
             yield Row(name, "query", error, figure, _value(method, there, fold, figure), seconds)
         for error in errors_m if train_errors else ():
             there = displaced(data, learned, error, seed)
-            method, seconds = _fitted(make, there, fold, run_dir / f"{name}-{error:g}")
+            method, seconds = _fitted(make, there, fold, context, f"{name}-{error:g}")
             yield Row(name, "train", error, figure, _value(method, data, fold, figure), seconds)
         for error in errors_deg or ():
-            method, seconds = _fitted(make, turned(data, error, seed), fold, run_dir / f"{name}-{error:g}deg")
+            method, seconds = _fitted(make, turned(data, error, seed), fold, context, f"{name}-{error:g}deg")
             yield Row(name, "directions", error, figure, _value(method, data, fold, figure), seconds)
 
 
-def _fitted(make: Callable[[], Method], data: Measurements, fold: Fold, folder: Path) -> tuple[Method, float]:
+def _fitted(
+    make: Callable[[], Method], data: Measurements, fold: Fold, context: FitContext, name: str
+) -> tuple[Method, float]:
     method = make()
-    return method, method.fit(data, fold, folder).seconds
+    return method, method.fit(data, fold, replace(context, run_dir=context.run_dir / name)).seconds
 
 
 def _value(method: Method, data: Measurements, fold: Fold, figure: str) -> float:
@@ -166,7 +168,7 @@ def task(config: DictConfig) -> list[Row]:
     rows: list[Row] = []
     started = time.monotonic()
     found = sweep(
-        where.makers, data, where.fold, [float(e) for e in config.errors_m], run_dir,
+        where.makers, data, where.fold, [float(e) for e in config.errors_m], where.context,
         train_errors=bool(config.train_errors), seed=int(config.seed),
         errors_deg=[float(e) for e in config.errors_deg],
     )  # fmt: skip

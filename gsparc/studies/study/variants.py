@@ -9,16 +9,15 @@ from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.method import Method
+from gsparc.methods.method import FitContext, Method
 from gsparc.methods.registry import build, method_class
 from gsparc.studies import limits
-from gsparc.training.fit import Training
+from gsparc.studies.context import context_of
 
 
 @dataclass(frozen=True)
@@ -30,12 +29,14 @@ class Setting:
         fold: the first of the split.
         run_dir: where everything goes.
         makers: unfitted methods by the name they get in the table.
+        context: of every fit, but for its folder.
     """
 
     data: Measurements
     fold: Fold
     run_dir: Path
     makers: dict[str, Callable[[], Method]]
+    context: FitContext
 
 
 def setting(config: DictConfig) -> Setting:
@@ -51,13 +52,11 @@ def setting(config: DictConfig) -> Setting:
 
     def maker(overrides: Any) -> Callable[[], Method]:
         def make() -> Method:
-            method = build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
-            if hasattr(method, "training"):
-                method.training = Training(instantiate(config.trainer), int(config.seed))
-            return method
+            return build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
 
         return make
 
     makers: dict[str, Callable[[], Method]] = {str(k): maker(v) for k, v in config.variants.items()}
     makers |= {name: method_class(name) for name in config.rivals}
-    return Setting(data, fold, Path(HydraConfig.get().runtime.output_dir), makers)
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    return Setting(data, fold, run_dir, makers, context_of(config, run_dir))

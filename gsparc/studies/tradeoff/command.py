@@ -14,7 +14,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc.auto.reduce import combinations, measure, reduced
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baseline_cache import baseline, platform_cache
@@ -26,6 +25,7 @@ from gsparc.methods import checkpoint, stored_front
 from gsparc.methods.interleaved_timing import Pace
 from gsparc.methods.method import Method
 from gsparc.methods.pareto import Point, cost_of_halving, front
+from gsparc.methods.reduced import combinations, contributions, reduced
 from gsparc.methods.timing import COPY, machine_facts, peak_memory, reference_copy
 from gsparc.studies import cli
 from gsparc.studies.evaluate import Opened, open_files
@@ -42,7 +42,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
     rows = rows_of(fold, config.eval_on)
     learned = np.sort(np.concatenate([fold.train, fold.val]))
-    measured = measure(method, data, learned)
+    measured = contributions(method, data, learned)
     settings = list(combinations(method, _plain(config.grid), _plain(config.singles)))
     threads = _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))

@@ -13,6 +13,7 @@ from gsparc.array.moving.triangulate import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
 from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.method import FitContext
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 from gsparc.simulate.shoebox import images
@@ -34,7 +35,7 @@ def fold(data):
 @pytest.fixture(scope="module")
 def fitted(data, fold, tmp_path_factory):
     method = BearingField(search=SEARCH, components=64)
-    assert method.fit(data, fold, tmp_path_factory.mktemp("run")).seconds > 0
+    assert method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run"))).seconds > 0
     return method
 
 
@@ -53,7 +54,7 @@ def test_the_strong_images_are_found(data):
 
 def test_it_sees_better_than_a_process_on_images(data, fold, fitted, tmp_path):
     rival = GaussianProcess()
-    rival.fit(data, fold, tmp_path)
+    rival.fit(data, fold, FitContext(tmp_path))
     split = make_split(data.moving, SplitSettings(test_fraction=0.3))
     ours, theirs = (score((m,), data, split, "test").figures() for m in (fitted, rival))
     assert ours["psnr_db"] > theirs["psnr_db"] + 0.5 and fitted.size() > 5
@@ -79,7 +80,7 @@ def test_a_stored_field_says_the_same(data, fold, fitted, tmp_path):
 
 def test_several_searches_answer_together(data, fold, fitted, tmp_path):
     twice = BearingField(search=SEARCH, components=64, searches=2)
-    notes = twice.fit(data, fold, tmp_path).notes
+    notes = twice.fit(data, fold, FitContext(tmp_path)).notes
     assert "2 searches" in notes[0] and twice.size() > fitted.size() and len(twice.trends) == 2
     assert not torch.equal(twice.trends[0].sources, twice.trends[1].sources)
     torch.testing.assert_close(twice.trends[0].sources, fitted.trends[0].sources)
@@ -92,14 +93,14 @@ def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
     quick = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
     method = BearingField(search=quick, components=16)
     method.training = Training(TrainerSettings(budget_s=1e-3))
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     assert len(method.trends) == 1
     method.training = Training(TrainerSettings(budget_s=600.0))
-    seconds = method.fit(data, fold, tmp_path).seconds
+    seconds = method.fit(data, fold, FitContext(tmp_path)).seconds
     assert len(method.trends) > 1 and seconds < 300
     method.training = Training(resume=tmp_path / "last.ckpt")
     with pytest.raises(ValueError, match="ckpt_path"):
-        method.fit(data, fold, tmp_path)
+        method.fit(data, fold, FitContext(tmp_path))
 
 
 def test_powers_are_the_best_that_are_not_negative():
@@ -120,7 +121,7 @@ def test_the_variance_is_about_the_error(data, fold, fitted):
 
 def test_power_spectra_are_recognised(fold, tmp_path):
     method = BearingField(search=dataclasses.replace(SEARCH, sources=9, steps=0), components=0)
-    method.fit(room_of_spectra(scale="power"), fold, tmp_path)
+    method.fit(room_of_spectra(scale="power"), fold, FitContext(tmp_path))
     assert method.exponent == 1 and method.axes.shape[0] == 0
 
 
@@ -128,18 +129,18 @@ def test_what_it_cannot_do_is_said(data, fold, tmp_path):
     def refused(words, **changes):
         site = dataclasses.replace(data.site, **changes)
         with pytest.raises(ValueError, match=words):
-            BearingField().fit(dataclasses.replace(data, site=site), fold, tmp_path)
+            BearingField().fit(dataclasses.replace(data, site=site), fold, FitContext(tmp_path))
 
     refused("moving receiver", static_end="rx")
     refused("which array", array=None)
     turned = data.rx_rotation.copy()
     turned[3] = np.diag([-1.0, -1.0, 1.0])
     with pytest.raises(ValueError, match="one orientation"):
-        BearingField().fit(dataclasses.replace(data, rx_rotation=turned), fold, tmp_path)
+        BearingField().fit(dataclasses.replace(data, rx_rotation=turned), fold, FitContext(tmp_path))
     rng = np.random.default_rng(0)
     noise = dataclasses.replace(data, target=rng.integers(0, 255, data.target.shape).astype(np.uint8))
     with pytest.raises(ValueError, match="cannot have measured"):
-        BearingField(search=SEARCH).fit(noise, fold, tmp_path)
+        BearingField(search=SEARCH).fit(noise, fold, FitContext(tmp_path))
 
 
 def test_grid_is_the_sites_own():

@@ -172,4 +172,4 @@ def test_labels_keep_the_value_that_tells_settings_apart():
     """Cut at 40 letters, `attenuation.inverse_distance=True` and `=False` read the same."""
     said = [_short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
     assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
-    assert _short("gsparc trainer.budget_s=0.5") == "gsparc budget_s=0.5" and _short("gp") == "gp"
+    assert _short("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and _short("gp") == "gp"

@@ -28,6 +28,7 @@ import gsparc
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.studies.evaluate import main as evaluate
 from gsparc.studies.train import main as train
@@ -70,7 +71,7 @@ def sound(tmp_path_factory) -> tuple[Path, Path]:
     data = load({"name": "own", "file": str(file)})
     config = "model: {_target_: gsparc.methods.idw.InverseDistance}\n"
     method = build({"_target_": "gsparc.methods.idw.InverseDistance"})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], folder)
+    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(folder))
     checkpoint.save(folder / "m.ckpt", method, config)
     return folder / "m.ckpt", file
 

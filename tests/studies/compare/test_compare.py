@@ -64,17 +64,17 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     )
 
 
-@pytest.mark.parametrize("model", ["gsparc", "bearings"])
+@pytest.mark.parametrize("model", ["gsparc", "moving_array"])
 def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
     """A model was trained as if there were no budget: one of 5 s was found again as one of 60 s."""
     room = Remembered("own", "random", "spectrum", ("d", "s"))
-    contender = Contender(model, (f"model={model}",), ("trainer.budget_s={budget_s}",))
+    contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         short, long = (
             prepare(Cell("own", "random", model, budget_s, 0), contender, {"file": "x"}, room, tmp_path)
             for budget_s in (5.0, 60.0)
         )
-    assert short.config.trainer.budget_s == 5 and short.folder != long.folder
+    assert short.config.budget_s == 5 and short.folder != long.folder
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
+from gsparc.methods.method import FitContext
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 from gsparc.studies.train import train
 from gsparc.training import reduce as field_reduce
@@ -94,7 +95,7 @@ def packets(tmp_path_factory):
     method = ArrayField(PacketSettings(count=96, samples=500), cache=False)
     rows = np.arange(48)
     fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
-    method.fit(data, fold, tmp_path_factory.mktemp("run"))
+    method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
     return method, data, fold
 
 
@@ -115,7 +116,7 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     rows = np.arange(60)
     fold = Fold(rows[rows % 3 > 0], rows[:0], rows[::3])
     method = VirtualSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
-    method.fit(data, fold, tmp_path)
+    method.fit(data, fold, FitContext(tmp_path))
     measured = reduce.measure(method, data, fold.train)
     silent = reduce.reduced(method, {"confidence": False}, measured)
     assert away(method, silent, data, fold.test) < 1e-9 and answer(silent, data, fold.test).variance is None
@@ -128,7 +129,7 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
 def test_a_gaussian_process_spares_components_pixels_and_its_variance(field):
     data, fold = field.data, field.split.folds[0]
     method = GaussianProcess()
-    method.fit(data, fold, Path())
+    method.fit(data, fold, FitContext(Path()))
     whole = reduce.reduced(method, {"confidence": False}, {})
     assert away(method, whole, data, fold.test) < 1e-8 and answer(whole, data, fold.test).variance is None
     assert reduce.reduced(method, {"confidence": True}, {}) is method
@@ -144,7 +145,7 @@ def crossings(tmp_path_factory):
     method = BearingField(
         SearchSettings(sources=17, rows=40, candidates=2000, steps=20), components=64, seed=0
     )
-    method.fit(data, fold, tmp_path_factory.mktemp("run"))
+    method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
     return method, data, fold
 
 
@@ -179,7 +180,7 @@ def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings
 def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
     """The command's own default strides ended it on grids of 7 x 13."""
     method = GaussianProcess()
-    method.fit(field.data, field.split.folds[0], Path())
+    method.fit(field.data, field.split.folds[0], FitContext(Path()))
     columns = field.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
     assert list(reduce.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
@@ -188,7 +189,7 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
-    method.fit(field.data, field.split.folds[0], Path())
+    method.fit(field.data, field.split.folds[0], FitContext(Path()))
     assert list(reduce.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
     assert reduce.reduced(method, {"keep": 0.5}, {}) is method
 

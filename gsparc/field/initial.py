@@ -1,0 +1,84 @@
+"""Where the training of a field starts: what an initialiser is given, and what it returns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.field.encoding import Prior
+from gsparc.field.losses import Snapshot
+from gsparc.field.model import GaussianModel, ModelSettings
+from gsparc.ops import Pose
+
+
+@dataclass(frozen=True)
+class InitTask:
+    """What initial values are wanted for.
+
+    Attributes:
+        settings: of the model.
+        init: where Gaussians stand, settled: `sphere`, `uniform` or `backprojection`.
+        closed_form: whether the emission's read-out is solved before training.
+        data: all measurements.
+        rows: (n,) to learn from.
+        receiver: the static one's pose; None where it moves.
+        transmitter: (3,) [m], the static one's; None where it moves.
+        snapshot: what every snapshot has of its own.
+        seed: of every random choice.
+        run_dir: where reports go.
+    """
+
+    settings: ModelSettings
+    init: str
+    closed_form: bool
+    data: Measurements
+    rows: np.ndarray
+    receiver: Pose | None
+    transmitter: Tensor | None
+    snapshot: Snapshot
+    seed: int
+    run_dir: Path
+
+    @property
+    def anchors(self) -> int:
+        """Largest number of places that kernel features are anchored at."""
+        return self.settings.emission.encoding.anchors
+
+
+def unchanged(model: GaussianModel) -> None:
+    """Random weights stay."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where training begins.
+
+    Attributes:
+        prior: features of the encodings, or None.
+        sources: (N, 3) places of the Gaussians [m], or None to place them by `init`.
+        solve: sets the parameters of a fresh model.
+        billed_s, waited_s: seconds of reusable work: as it was first measured, and this time.
+    """
+
+    prior: Prior | None
+    sources: Tensor | None = None
+    solve: Callable[[GaussianModel], None] = unchanged
+    billed_s: float = 0.0
+    waited_s: float = 0.0
+
+
+class Initialiser(Protocol):
+    """Finds initial values from training rows."""
+
+    def __call__(self, task: InitTask) -> Start:
+        """The start.
+
+        Raises:
+            ValueError: what the task asks for, its data do not allow.
+        """

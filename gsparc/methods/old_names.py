@@ -1,0 +1,50 @@
+"""Names that checkpoints of earlier versions hold, and what they are called now."""
+
+from __future__ import annotations
+
+from typing import Any
+
+OLD_NAMES: dict[str, str] = {  # classes, by import path
+    "gsparc.array.field.ArrayField": "gsparc.array.method.ArrayField",
+    "gsparc.array.packets.PacketSettings": "gsparc.array.wave_packets.PacketSettings",
+    "gsparc.bearings.field.BearingField": "gsparc.array.moving.method.BearingField",
+    "gsparc.bearings.field.TrendSettings": "gsparc.array.moving.method.TrendSettings",
+    "gsparc.bearings.sources.SearchSettings": "gsparc.array.moving.triangulate.SearchSettings",
+    "gsparc.best.Gsparc": "gsparc.auto.method.Gsparc",
+    "gsparc.coherent.complex_gp.ComplexGP": "gsparc.multipath.complex_gp.ComplexGP",
+    "gsparc.coherent.directed.DirectedSources": "gsparc.multipath.directional_gp.DirectedSources",
+    "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.multipath.image_source_gp.VirtualSourceGP",
+    "gsparc.confidence.ConfidenceSettings": "gsparc.field.confidence.ConfidenceSettings",
+    "gsparc.effects.EffectSettings": "gsparc.auto.decide.EffectSettings",
+    "gsparc.emission.EmissionSettings": "gsparc.field.emission.EmissionSettings",
+    "gsparc.encoding.EncodingSettings": "gsparc.field.encoding.EncodingSettings",
+    "gsparc.field.FieldSettings": "gsparc.field.gaussians.FieldSettings",
+    "gsparc.model.AttenuationSettings": "gsparc.field.model.AttenuationSettings",
+    "gsparc.model.RasterSettings": "gsparc.field.model.RasterSettings",
+    "gsparc.module.LossSettings": "gsparc.training.lightning_module.LossSettings",
+    "gsparc.peers.gp.GaussianProcess": "gsparc.methods.gp.GaussianProcess",
+    "gsparc.peers.idw.InverseDistance": "gsparc.methods.idw.InverseDistance",
+    "gsparc.peers.kriging.Kriging": "gsparc.methods.kriging.Kriging",
+    "gsparc.peers.mean.Mean": "gsparc.methods.mean.Mean",
+    "gsparc.peers.nearest.Nearest": "gsparc.methods.nearest.Nearest",
+    "gsparc.peers.ridge.Ridge": "gsparc.methods.ridge.Ridge",
+    "gsparc.peers.zero.Zero": "gsparc.methods.zero.Zero",
+    "gsparc.response.ResponseSettings": "gsparc.field.response.ResponseSettings",
+    "gsparc.schedule.OptimizerSettings": "gsparc.training.optimizer.OptimizerSettings",
+    "gsparc.uplink.method.UplinkField": "gsparc.multipath.uplink.method.UplinkField",
+    "gsparc.uplink.search.SearchSettings": "gsparc.multipath.uplink.search.SearchSettings",
+}
+OLD_KEYS = {  # settings of models
+    "directed_model": "directional_model",
+    "bearing_model": "moving_array_model",
+    "furniture": "clutter",
+}
+
+
+def renamed(node: Any) -> Any:
+    """A configuration (plain containers) of an earlier version in today's names."""
+    if isinstance(node, dict):
+        return {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [renamed(value) for value in node]
+    return OLD_NAMES.get(node, node) if isinstance(node, str) else node
