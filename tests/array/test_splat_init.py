@@ -5,17 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from campaigns import compose
+from contexts import short
 
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
-from gsparc.training.fit import TrainerSettings, Training
 
 
 def _trained(data, fold, folder, *overrides: str, steps: int = 10):
     method = build(compose("logger=none", *overrides).model)
-    method.training = Training(TrainerSettings(max_steps=steps, batch_size=16, val_every=steps))
-    method.fit(data, fold, FitContext(folder))
+    method.fit(data, fold, short(folder, steps, 16, validate_every=steps))
     return method
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +12,21 @@ from invented import invent
 from rooms import directed, nmse, rough, shoebox
 
 from gsparc.array.cross_validation import LeftOut
-from gsparc.auto.combine import Beside, Rest, Told, compared, learn_rest, searched_beyond, weight_of
+from gsparc.array.image_gp import compared
+from gsparc.auto.combine import (
+    DirectionalEnsemble,
+    ImageEnsemble,
+    held_out_ratio,
+    learn_companion,
+    restored,
+    weight_of,
+)
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
 from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitContext
+from gsparc.methods.method import LeftOut as LeaveOneOutResidual
 from gsparc.methods.registry import build
-from gsparc.multipath.directional_gp import DirectedSources
 from gsparc.multipath.image_source_gp import VirtualSourceGP
 
 NONE = Fold(*[np.zeros(0, np.int64)] * 3)
@@ -39,8 +46,8 @@ class Known(VirtualSourceGP):
         super().__init__()
         self.left = left
 
-    def left_over(self):
-        return np.arange(len(self.left)), self.left
+    def leave_one_out(self):
+        return LeaveOneOutResidual(np.arange(len(self.left)), self.left)
 
 
 @pytest.mark.parametrize("diffuse", [True, False])
@@ -50,11 +57,11 @@ def test_a_rest_of_waves_is_learned_and_one_of_noise_is_not(diffuse):
     rng = np.random.default_rng(1)
     noise = torch.from_numpy(rng.normal(size=(120, 2))).float()
     left = torch.from_numpy(data.target[:, 0]) if diffuse else torch.view_as_complex(noise)[:, None]
-    decision, rest = learn_rest("auto", Known(left), data, NONE)
+    decision, rest = learn_companion("auto", Known(left), data, NONE)
     assert decision.on == diffuse
     if rest is not None:
         assert rest.gain > 0.8 and 0.5 < rest.weight <= 1
-        assert Rest.restore(data.site, rest.state()).gain == rest.gain
+        assert restored(data.site, rest.state()).gain == rest.gain
 
 
 @pytest.mark.slow
@@ -62,32 +69,32 @@ def test_diffuse_paths_are_left_to_a_process_and_it_is_stored(tmp_path):
     """Receivers .4 wavelengths apart, a third of the power from rough walls."""
     data, fold = rough(260)
     physics = _physics(data, fold)
-    decision, rest = learn_rest("auto", physics, data, fold)
-    assert decision.on and "leave over" in decision.reason and 0.03 < rest.gain < 1
+    decision, rest = learn_companion("auto", physics, data, fold)
+    assert decision.on and "residual" in decision.reason and 0.03 < rest.gain < 1
     batch = data.batch(fold.test)
     said, true = physics.predict(batch.tx, batch.rx).mean, batch.target.numpy()
-    alone, together = (nmse(p.numpy(), true) for p in (said, said + rest.at(batch.rx.position)))
+    added = rest.weight * rest.process.mean_at(batch.tx, batch.rx)
+    alone, together = (nmse(p.numpy(), true) for p in (said, said + added))
     assert together < 0.85 * alone
     method = build(compose("model.effects.phase=true", "model.effects.array=false").model)
-    method.site, method._chosen, method._models["phase"], method._rest = data.site, "phase", physics, rest
+    method.site, method._chosen, method._companion = data.site, "phase", rest
+    method._models["phase"] = physics
     assert method.effects == "phase+hybrid"
     again = build(compose().model)
     again.restore(data.site, method.state())
-    torch.testing.assert_close(
-        again.predict(batch.tx, batch.rx).mean, said + rest.at(batch.rx.position), atol=1e-4, rtol=1e-4
-    )
+    torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, said + added, atol=1e-4, rtol=1e-4)
 
 
 def test_where_sources_explain_everything_there_is_no_rest():
     _, data, fold = shoebox(150, size=(3.0, 2.5, 2.2), max_order=1)
-    decision, rest = learn_rest("auto", _physics(data, fold), data, fold)
+    decision, rest = learn_companion("auto", _physics(data, fold), data, fold)
     assert not decision.on and rest is None
 
 
 def test_it_is_for_sources_with_carrier_phase():
     data = invent("csi")
     for switch, word in (("auto", "only sources"), (False, "as configured")):
-        decision, rest = learn_rest(switch, Mean(), data, NONE)
+        decision, rest = learn_companion(switch, Mean(), data, NONE)
         assert rest is None and not decision.on and word in decision.reason
 
 
@@ -110,8 +117,8 @@ def test_an_array_of_few_spectra_answers_with_a_process_beside_it(tmp_path):
     settings = ["array_model.cache=false", "array_model.packets.samples=300", "effects.array=true"]
     method = build(compose(*(f"model.{s}" for s in settings), "model.effects.hybrid=true").model)
     method.fit(data, fold, FitContext(tmp_path))
-    array, beside = method.answering
-    assert isinstance(beside, Beside) and 0 < beside.weight <= 1 and method.effects == "array+hybrid"
+    array, beside = method._models["array"], method._companion
+    assert isinstance(beside, ImageEnsemble) and 0 < beside.weight <= 1 and method.effects == "array+hybrid"
     batch = data.batch(fold.test)
     found = method.predict(batch.tx, batch.rx).mean
     parts = [m.predict(batch.tx, batch.rx).mean for m in (array, beside.process)]
@@ -136,7 +143,7 @@ def test_from_few_receivers_measured_directions_answer_alone():
     fold = Fold(rows[:14], rows[14:16], rows[16:])
     method, batch = _best(), data.batch(fold.test)
     method.fit(data, fold, FitContext(Path()))
-    assert method.effects == "directions" and isinstance(method.answering[0], DirectedSources)
+    assert method.effects == "directions" and method._chosen == "directions"
     assert nmse(method.predict(batch.tx, batch.rx).mean.numpy(), data.target[fold.test]) < 0.05
     other = _best()
     other.restore(data.site, method.state())
@@ -148,8 +155,8 @@ def test_an_interrupted_run_that_directions_answer_alone_goes_on(tmp_path):
     data, _, _ = directed(80)
     rows = np.arange(80)
     method = _best("effects.phase=false", "effects.directions=true")
-    method.training = replace(method.training, resume=tmp_path / "last.ckpt")
-    method.fit(data, Fold(rows[:14], rows[14:16], rows[16:]), FitContext(Path()))
+    context = FitContext(tmp_path, resume=tmp_path / "last.ckpt")
+    method.fit(data, Fold(rows[:14], rows[14:16], rows[16:]), context)
     assert method.effects == "directions"
 
 
@@ -157,8 +164,8 @@ def test_searched_and_directed_sources_answer_together_where_both_know_something
     data, fold, _ = directed(150, pillar=True)
     method, batch = _best("effects.phase=true"), data.batch(fold.test)
     method.fit(data, fold, FitContext(Path()))
-    searched, rest = method.answering
-    assert isinstance(searched, VirtualSourceGP) and isinstance(rest, Told)
+    searched, rest = method._models["phase"], method._companion
+    assert isinstance(rest, DirectionalEnsemble)
     assert method.effects.startswith("phase+directions") and 0 < rest.weight <= 1
     both = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), data.target[fold.test])
     alone = [
@@ -176,7 +183,7 @@ def test_directions_are_not_used_where_they_are_not_wanted(settings):
     data, fold, _ = directed(40)
     method = _best(*settings, "phase_probe.budget_s=1")
     method.site = data.site
-    decided = {d.effect: d for d in method._decide(data, fold)}
+    decided = {d.effect: d for d in method._decide(data, fold, 0)}
     assert not decided["directions"].on
 
 
@@ -192,12 +199,12 @@ def test_searches_of_few_rows_promise_too_much():
     data, fold, _ = directed(150)
     few = fold.train[:10]
     probe = _best()._probe
-    error, optimism = searched_beyond(probe, data, few, 0)
-    better, honest = searched_beyond(probe, data, fold.train, 0)
+    error, optimism = held_out_ratio(probe, data, few, 0)
+    better, honest = held_out_ratio(probe, data, fold.train, 0)
     assert optimism > 2 and optimism > honest and error > 3 * better
 
 
 def test_a_checkpoint_of_before_there_were_directions_still_loads():
     config = compose(*(f"model.{s}" for s in SETTINGS)).model
-    del config.directed_model, config.effects.directions
+    del config.directional_model, config.effects.directions
     assert build(config).switches.directions == "auto"

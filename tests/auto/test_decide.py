@@ -11,6 +11,7 @@ from known_arrays import array_site, measure, room_vectors
 from rooms import directed
 
 from gsparc.array.method import ArrayField
+from gsparc.array.moving.method import BearingField
 from gsparc.auto.decide import (
     contest_array,
     decide_array,
@@ -89,14 +90,14 @@ def test_an_ablation_of_the_networks_is_not_answered_by_another_model(spectra) -
 def test_probe_accepts_the_array_that_measured_and_refuses_another(spectra) -> None:
     rows = np.arange(30)
     fold = Fold(rows, rows[:0], np.arange(30, 40))
-    assert probe_array(spectra, fold, seed=0).on
+    assert probe_array(ArrayField(), spectra, fold, seed=0).on
     stretched = replace(spectra, site=replace(spectra.site, array=spectra.site.array * 0.6))
-    assert not probe_array(stretched, fold, seed=0).on
+    assert not probe_array(ArrayField(), stretched, fold, seed=0).on
     blanked = spectra.target.copy()
     blanked[30:] = 0  # test rows may hold anything: the probe must not look
     assert (
-        probe_array(replace(spectra, target=blanked), fold, seed=0).reason
-        == probe_array(spectra, fold, seed=0).reason
+        probe_array(ArrayField(), replace(spectra, target=blanked), fold, seed=0).reason
+        == probe_array(ArrayField(), spectra, fold, seed=0).reason
     )
 
 
@@ -107,7 +108,7 @@ def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images(tmp_pat
     data = measure(site, apart, room_vectors(apart, 1, site.array)[0], sha256="apart")
     fold = Fold(np.arange(36), np.arange(0), np.arange(36, 40))
     trial = ArrayField(cache=False)
-    assert probe_array(data, fold, seed=0).on  # it explains them all the same
+    assert probe_array(trial, data, fold, seed=0).on  # it explains them all the same
     monkeypatch.chdir(tmp_path)
     decision = contest_array(trial, GaussianProcess(), data, fold, seed=0)
     assert not decision.on and "wavelengths apart" in decision.reason
@@ -127,11 +128,11 @@ def test_a_moving_array_is_answered_by_bearings() -> None:
     assert decide_array("auto", data.site, None).on
     with pytest.raises(ValueError, match="splat then A"):
         decide_array("splat", data.site, None)
-    rows = np.arange(len(data))
+    rows, moving = np.arange(len(data)), BearingField()
     fold = Fold(rows[:-8], rows[:0], rows[-8:])
-    assert probe_array(data, fold, seed=0).on
+    assert probe_array(moving, data, fold, seed=0).on
     turned = replace(data, rx_rotation=data.rx_rotation.copy())
     turned.rx_rotation[0] = np.diag([-1.0, -1.0, 1.0])
-    assert not probe_array(turned, fold, seed=0).on
+    assert not probe_array(moving, turned, fold, seed=0).on
     noise = np.random.default_rng(0).integers(0, 255, data.target.shape).astype(data.target.dtype)
-    assert not probe_array(replace(data, target=noise), fold, seed=0).on
+    assert not probe_array(moving, replace(data, target=noise), fold, seed=0).on

@@ -14,7 +14,7 @@ from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import write_samples, write_summary
 from gsparc.methods.idw import InverseDistance
 from gsparc.methods.mean import Mean
-from gsparc.methods.method import Method, Prediction
+from gsparc.methods.method import FitContext, Method, Prediction
 from gsparc.methods.timing import ClockSettings
 
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)
@@ -23,7 +23,8 @@ QUICK = ClockSettings(rounds=3, least=2, warmup=1)
 def fit_all(make, data, split, path):
     methods = [make() for _ in split.folds]
     return methods, [
-        method.fit(data, fold, path).seconds for method, fold in zip(methods, split.folds, strict=True)
+        method.fit(data, fold, FitContext(path)).seconds
+        for method, fold in zip(methods, split.folds, strict=True)
     ]
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from campaigns import channels as channel_file
 from campaigns import compose
+from contexts import short
 from invented import invent
 from known_arrays import array_site
 from rooms import nmse, shoebox
@@ -21,13 +22,11 @@ from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import frozen_view
 from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
 from gsparc.physics.bartlett import spectra
 from gsparc.simulate.shoebox import LIGHT
-from gsparc.training.fit import TrainerSettings, Training
 
 GRID = SphereGrid.hemisphere(8, 16)
 
@@ -35,9 +34,8 @@ GRID = SphereGrid.hemisphere(8, 16)
 def trained(data, fold, folder, *overrides: str, steps: int = 30):
     """`model=gsparc` with overrides, trained for a moment."""
     method = build(compose("logger=none", *overrides).model)
-    settings = TrainerSettings(max_steps=steps, batch_size=16, val_every=steps, checkpoint_every=steps)
-    method.training = Training(settings, callbacks=lambda: [ContributionPruning(interval=10)])
-    return method, method.fit(data, fold, FitContext(folder))
+    context = short(folder, steps, 16, lambda: [ContributionPruning(interval=10)], validate_every=steps)
+    return method, method.fit(data, fold, context)
 
 
 # ---- factored channels ----
@@ -149,8 +147,7 @@ def test_weak_sources_are_pruned_by_contribution(tmp_path):
     _, data, fold = _small(60)
     spoiled = ContributionPruning(interval=1, least_share=0.05)
     method = build(compose("logger=none", *PHASE, "model.field.init=uniform", "model.field.count=30").model)
-    method.training = Training(TrainerSettings(max_steps=4, batch_size=16), callbacks=lambda: [spoiled])
-    method.fit(data, fold, FitContext(tmp_path))
+    method.fit(data, fold, short(tmp_path, 4, 16, lambda: [spoiled]))
     assert 1 <= method.size() < 30
     batch = data.batch(fold.test[:3])
     assert method.predict(batch.tx, batch.rx).mean.shape == batch.target.shape

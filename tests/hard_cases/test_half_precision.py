@@ -12,13 +12,12 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, compose, spectra
+from contexts import short
 from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.data.load import load, split_for
 from gsparc.field.losses import spectrum_loss
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
-from gsparc.training.fit import TrainerSettings, Training
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
@@ -31,10 +30,9 @@ def fitted(folder, autocast: bool) -> tuple[torch.Tensor, torch.Tensor]:
     file = spectra(folder / "own.npz")
     data = load({"name": "own", "file": str(file)})
     method = build(compose(*brief(file, "model.refit=false")).model)
-    method.training = Training(TrainerSettings(max_steps=30, batch_size=8))
     fold = split_for({"name": "random"}, data).folds[0]
     with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
-        method.fit(data, fold, FitContext(folder))
+        method.fit(data, fold, short(folder, 30))
         batch = data.batch(np.arange(8))
         mean = method.predict(batch.tx, batch.rx).mean
     assert mean.dtype == torch.float32 and mean.isfinite().all()

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, channels, compose, powers, spectra
+from contexts import short
 
 from gsparc.data.load import load, split_for
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.studies.train import train
-from gsparc.training.fit import TrainerSettings, Training
 
 PRUNE = (
     "callbacks=densify",
@@ -57,9 +56,10 @@ def test_nobody_is_seen(tmp_path):
 
     file = spectra(tmp_path / "own.npz")
     method = build(compose(*brief(file, "model.warm_start=false", "model.refit=false")).model)
-    method.training = Training(TrainerSettings(max_steps=10, batch_size=8), callbacks=lambda: [Sink()])
     data = load({"name": "own", "file": str(file)})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
+    method.fit(
+        data, split_for({"name": "random"}, data).folds[0], short(tmp_path, 10, callbacks=lambda: [Sink()])
+    )
     batch = data.batch(np.arange(4))
     assert (method.predict(batch.tx, batch.rx).mean == 0).all()
     assert all(p.isfinite().all() for p in method.fitted().parameters())

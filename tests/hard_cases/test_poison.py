@@ -14,15 +14,13 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, compose, spectra
+from contexts import short
 from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops.settings import FARTHEST, WIDEST
-from gsparc.training.fit import TrainerSettings, Training
 from gsparc.training.lightning_module import NonFiniteLoss
-from gsparc.training.splatting import LearnedField
 
 
 class Spoil(L.Callback):
@@ -37,11 +35,9 @@ class Spoil(L.Callback):
                 dict(module.model.named_parameters())[self.name][self.row] = float("nan")
 
 
-def field(file, callbacks=()) -> LearnedField:
+def fit(data, fold, file, callbacks, **more) -> None:
     method = build(compose(*brief(file, "model.refit=false")).model)
-    settings = TrainerSettings(max_steps=20, batch_size=8, checkpoint_every=5)
-    method.training = Training(settings, callbacks=lambda: list(callbacks))
-    return method
+    method.fit(data, fold, short(file.parent, 20, callbacks=lambda: list(callbacks), every=5, **more))
 
 
 @pytest.fixture
@@ -55,9 +51,8 @@ def data(tmp_path):
     "name", ["gaussians.means", "gaussians.opacity_logits", "emission.weight2", "emission.bias2"]
 )
 def test_a_spoilt_parameter_stops_the_run_and_is_named(data, folds, tmp_path, name):
-    method = field(tmp_path / "own.npz", [Spoil(7, name, 3)])
     with pytest.raises(NonFiniteLoss, match=rf"at step 7 .*Gaussian id 3, {name}"):
-        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
+        fit(data, folds(len(data)).folds[0], tmp_path / "own.npz", [Spoil(7, name, 3)])
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
     assert left["step"] == 7 and left["state_dict"][name][3].isnan().any() and len(left["index"])
     assert left["offender"] == f"Gaussian id 3, {name}" and left["sample"] in left["index"]
@@ -78,9 +73,8 @@ class SpoilAfterStep(Spoil):
 
 def test_a_poisoned_state_replaces_no_checkpoint(data, folds, tmp_path):
     """A NaN that a step itself makes is met one step later; a checkpoint must not be written in between."""
-    method = field(tmp_path / "own.npz", [SpoilAfterStep(10, "log_gain", ...)])
     with pytest.raises(NonFiniteLoss, match="log_gain"):
-        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
+        fit(data, folds(len(data)).folds[0], tmp_path / "own.npz", [SpoilAfterStep(10, "log_gain", ...)])
     assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
     assert torch.load(tmp_path / "nonfinite.pt", weights_only=True)["offender"] == "log_gain"
 
@@ -94,19 +88,22 @@ def test_a_parameter_that_would_overflow_stops_the_run_too(data, folds, tmp_path
                 with torch.no_grad():
                     module.model.gaussians.log_scales[self.row] = 70.0
 
-    method = field(tmp_path / "own.npz", [Widen(7, "", 3)])
     with pytest.raises(NonFiniteLoss, match=r"at step 7 .*Gaussian id 3: Gaussian 3 has scales that are not"):
-        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
+        fit(data, folds(len(data)).folds[0], tmp_path / "own.npz", [Widen(7, "", 3)])
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
     assert "Gaussian id 3" in left["offender"] and len(left["target"]) == len(left["index"])
     assert checkpoint.read(tmp_path / "last.ckpt").extra["trainer"]["global_step"] == 5
 
 
 def test_a_run_that_is_poisoned_before_a_validation_leaves_the_evidence_too(data, folds, tmp_path):
-    method = field(tmp_path / "own.npz", [SpoilAfterStep(9, "gaussians.means", 2)])
-    method.training.settings = dataclasses.replace(method.training.settings, val_every=10)
     with pytest.raises(NonFiniteLoss, match=r"Gaussian id 2, gaussians\.means"):
-        method.fit(data, folds(len(data)).folds[0], FitContext(tmp_path))
+        fit(
+            data,
+            folds(len(data)).folds[0],
+            tmp_path / "own.npz",
+            [SpoilAfterStep(9, "gaussians.means", 2)],
+            validate_every=10,
+        )
     assert (tmp_path / "nonfinite.pt").exists()
 
 
@@ -123,9 +120,8 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_
             encoding=dataclasses.replace(method.settings.emission.encoding, kind="raw"),
         ),
     )
-    method.training = Training(TrainerSettings(max_steps=20, batch_size=8))
     with pytest.raises(NonFiniteLoss, match=rf"sample {bad}; all parameters are finite"):
-        method.fit(dataclasses.replace(data, target=target), fold, FitContext(tmp_path))
+        method.fit(dataclasses.replace(data, target=target), fold, short(tmp_path, 20))
     assert (tmp_path / "nonfinite.pt").exists()
 
 

@@ -13,14 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from campaigns import brief, channels, compose, spectra
+from contexts import short
 from ledger import LEDGER
 from releases import REAL
 
 from gsparc.callbacks import Densify, OpacityReset
 from gsparc.data.load import load, split_for
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
-from gsparc.training.fit import TrainerSettings, Training
 
 
 def dataset(name: str, folder: Path) -> tuple[str, dict]:
@@ -54,8 +53,7 @@ def test_no_seed_breaks(tmp_path, name, seeds):
     for seed in seeds:
         began = time.perf_counter()
         method = build(compose(*brief(file, "model.refit=false", "model.warm_start=false")).model)
-        method.training = Training(TrainerSettings(max_steps=15, batch_size=8), seed, callbacks)
-        method.fit(data, fold, FitContext(tmp_path / str(seed)))
+        method.fit(data, fold, short(tmp_path / str(seed), 15, callbacks=callbacks, seed=seed))
         assert all(p.isfinite().all() for p in method.fitted().parameters())
         batch = data.batch(fold.test[:16])
         predicted = method.predict(batch.tx, batch.rx).mean

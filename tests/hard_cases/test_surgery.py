@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, compose, spectra
+from contexts import short
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ledger import LEDGER
@@ -26,10 +27,8 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import GaussianModel, ModelSettings
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid
-from gsparc.training.fit import TrainerSettings, Training
 from gsparc.training.lightning_module import NonFiniteLoss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 
@@ -181,9 +180,10 @@ def test_training_under_adversarial_gradients_ends_whole_or_stops_by_name(tmp_pa
     method = build(compose(*brief(file, "model.refit=false", "model.warm_start=false")).model)
     densify = Densify(2, 30, 3, 0.0, 0.05, max_gaussians=80, min_gaussians=4, max_radius=50.0)
     made = [Fire(size, 0), densify, OpacityReset(5, 30, 0.05)]
-    method.training = Training(TrainerSettings(max_steps=24, batch_size=8), callbacks=lambda: made)
     try:
-        method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path))
+        method.fit(
+            data, split_for({"name": "random"}, data).folds[0], short(tmp_path, 24, callbacks=lambda: made)
+        )
     except NonFiniteLoss as stopped:
         assert "first offender: " in str(stopped) and (tmp_path / "nonfinite.pt").exists()
         assert not math.isfinite(size) or size > 1e18

@@ -14,12 +14,13 @@ import gsparc
 from gsparc.methods import checkpoint
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 
 
 def loaded(data, fold, path, name="gp"):
     method = method_class(name)()
-    method.fit(data, fold, path)
+    method.fit(data, fold, FitContext(path))
     checkpoint.save(path / f"{name}.ckpt", method)
     return gsparc.load(path / f"{name}.ckpt")
 

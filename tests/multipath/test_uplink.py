@@ -60,7 +60,7 @@ def test_noise_is_read_off_empty_delays() -> None:
 def fitted():
     data = city("all")
     method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
-    method.fit(data, fold(), None)
+    method.fit(data, fold(), FitContext())
     return method, data
 
 
@@ -73,7 +73,7 @@ def _share(method, data, rows) -> float:
 def test_beats_ridge_by_more_than_three_decibels(fitted) -> None:
     method, data = fitted
     ridge = Ridge()
-    ridge.fit(data, fold(), None)
+    ridge.fit(data, fold(), FitContext())
     assert _share(method, data, fold().test) < 0.5 * _share(ridge, data, fold().test)
 
 
@@ -122,7 +122,7 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     uplink = data.uplink.copy()
     uplink[:, 0] = 0
     method = Ridge(inputs)
-    method.fit(replace(data, uplink=uplink), fold(), None)
+    method.fit(replace(data, uplink=uplink), fold(), FitContext())
     said = method.listen(torch.from_numpy(uplink[fold().test])).mean
     assert torch.isfinite(torch.view_as_real(said)).all() and said[:, 1:].abs().min() > 0
     assert inputs == "all" or (said[:, 0] == 0).all()
@@ -139,7 +139,7 @@ def test_kept_and_restored(fitted, tmp_path) -> None:
 def test_deaf_data_and_bare_positions_are_refused(fitted) -> None:
     method, data = fitted
     with pytest.raises(ValueError, match="has none"):
-        Ridge().fit(deaf(data), fold(), None)
+        Ridge().fit(deaf(data), fold(), FitContext())
     batch = data.batch(fold().test[:2])
     with pytest.raises(ValueError, match="not positions"):
         method.predict(batch.tx, batch.rx)
@@ -157,7 +157,7 @@ def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None
     data = load_argos(tmp_path, lambda uplink, rows: np.abs(uplink[:, 0, :3]).astype(float))
     assert data.noise_variance is None and data.uplink.shape[1] == 8
     method = UplinkField(SearchSettings(rounds=3, picks=4, final=2), teachers=60)
-    method.fit(data, fold(), None)
+    method.fit(data, fold(), FitContext())
     assert method.search.shape[1] == 1
     assert _share(method, data, fold().test) < 0.3
 

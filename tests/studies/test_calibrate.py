@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from gsparc.methods.confidence_scores import Evidence, gather, joined
+from gsparc.methods.method import FitContext
 from gsparc.methods.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
 from gsparc.studies.calibrate.command import figures, tables
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
@@ -115,7 +116,7 @@ def test_evidence_of_a_method(campaign, folds) -> None:
     for make, kinds in ((GaussianProcess, {"learned", "expected", "distance", "gp_variance"}),
                         (Mean, {"distance", "gp_variance"})):  # fmt: skip
         method = make()
-        method.fit(data, fold, None)
+        method.fit(data, fold, FitContext())
         found = gather(method, data, fold, fold.test)
         assert set(found.scores) == kinds and (found.scores["distance"] <= 0).all()
     assert len(joined([found, found])) == 2 * len(fold.test)

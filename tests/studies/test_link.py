@@ -12,6 +12,7 @@ from cities import city, fold
 
 from gsparc import load
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
 from gsparc.methods.resource_grid import centred, interpolated, resource_grid
 from gsparc.methods.risk_threshold import binomial_interval
 from gsparc.multipath.uplink.method import UplinkField
@@ -29,7 +30,7 @@ needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra
 def trained(tmp_path_factory):
     data = city("all")
     method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
-    method.fit(data, fold(), None)
+    method.fit(data, fold(), FitContext())
     file = tmp_path_factory.mktemp("link") / "model.ckpt"
     checkpoint.save(file, method)
     return data, file

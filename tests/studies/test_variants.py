@@ -23,6 +23,5 @@ def test_every_method_that_takes_a_budget_gets_it(model, tmp_path, monkeypatch):
         "~variants", "+variants={as_it_is: {}}", "rivals=[mean]", config="prices",
     )  # fmt: skip
     found = setting(config)
-    method = found.makers["as_it_is"]()
-    assert method.training.settings.budget_s == 7 and method.training.seed == 5
+    assert found.context.budget_s == 7 and found.context.seed == 5
     assert set(found.makers) == {"as_it_is", "mean"} and len(found.data) == 20

@@ -6,12 +6,11 @@ import lightning.pytorch as L
 import pytest
 import torch
 from campaigns import brief, compose, spectra
+from contexts import short
 
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
-from gsparc.training.fit import TrainerSettings, Training
 
 
 class Interrupt(L.Callback):
@@ -29,10 +28,9 @@ class Interrupt(L.Callback):
 def run(tmp_path, *callbacks, resume=None, steps: int = 20):
     file = spectra(tmp_path / "own.npz")
     method = build(compose(*brief(file, "model.refit=false")).model)
-    settings = TrainerSettings(max_steps=steps, batch_size=8, checkpoint_every=5)
-    method.training = Training(settings, callbacks=lambda: list(callbacks), resume=resume)
+    context = short(tmp_path / "run", steps, callbacks=lambda: list(callbacks), every=5, resume=resume)
     data = load({"name": "own", "file": str(file)})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path / "run"))
+    method.fit(data, split_for({"name": "random"}, data).folds[0], context)
     return method.fitted().state_dict()
 
 
@@ -100,10 +98,9 @@ class Watching(L.Callback):
 def test_a_learning_curve_has_the_loss_of_its_own_step(tmp_path, val_every):
     watching = Watching()
     method = build(compose(*brief(spectra(tmp_path / "own.npz"), "model.refit=false")).model)
-    settings = TrainerSettings(max_steps=21, batch_size=8, val_every=val_every)
-    method.training = Training(settings, callbacks=lambda: [watching])
+    context = short(tmp_path / "run", 21, callbacks=lambda: [watching], validate_every=val_every)
     data = load({"name": "own", "file": str(tmp_path / "own.npz")})
-    method.fit(data, split_for({"name": "random"}, data).folds[0], FitContext(tmp_path / "run"))
+    method.fit(data, split_for({"name": "random"}, data).folds[0], context)
     assert set(watching.logged) == set(range(val_every, 22, val_every))
     for step, loss in watching.logged.items():
         assert loss == pytest.approx(watching.steps[step], rel=1e-6)

@@ -6,31 +6,27 @@ import numpy as np
 import pytest
 import torch
 from campaigns import brief, channels, compose, powers, spectra
+from contexts import short
 from omegaconf import OmegaConf
 
 from gsparc import load
 from gsparc.data.load import load as load_data
 from gsparc.data.load import split_for
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
 from gsparc.ops import Pose
-from gsparc.training.fit import TrainerSettings, Training
 from gsparc.training.splatting import QUERY_CHUNK, LearnedField
 
 
-def learned(file, *more: str, steps: int = 15) -> LearnedField:
-    method = build(compose(*brief(file, *more)).model)
-    settings = TrainerSettings(max_steps=steps, batch_size=8, val_every=10, checkpoint_every=5)
-    method.training = Training(settings, config_yaml="")
-    return method
+def learned(file, *more: str) -> LearnedField:
+    return build(compose(*brief(file, *more)).model)
 
 
 def fitted(file, run_dir, *more: str, steps: int = 15):
     data = load_data({"name": "own", "file": str(file)})
     fold = split_for({"name": "random"}, data).folds[0]
-    method = learned(file, *more, steps=steps)
-    method.fit(data, fold, FitContext(run_dir))
+    method = learned(file, *more)
+    method.fit(data, fold, short(run_dir, steps, every=5, validate_every=10))
     return method, data, fold
 
 
@@ -143,7 +139,7 @@ def test_the_test_rows_are_never_looked_at(tmp_path):
     states = []
     for target in (data.target, poisoned):
         method = learned(file)
-        method.fit(dataclasses.replace(data, target=target), fold, FitContext(tmp_path))
+        method.fit(dataclasses.replace(data, target=target), fold, short(tmp_path, 15))
         states.append(method.fitted().state_dict())
     assert all(torch.equal(states[0][key], states[1][key]) for key in states[0])
 
@@ -154,8 +150,7 @@ def test_seeds_repeat_and_differ(tmp_path):
     fold = split_for({"name": "random"}, data).folds[0]
     for seed in (0, 0, 1):
         method = learned(file)
-        method.training.seed = seed
-        method.fit(data, fold, tmp_path / str(len(found)))
+        method.fit(data, fold, short(tmp_path / str(len(found)), 15, seed=seed))
         found.append(method.fitted().gaussians.means)
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 

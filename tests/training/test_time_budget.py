@@ -8,9 +8,9 @@ import pytest
 from campaigns import brief, compose, spectra
 from torch import nn
 
+from gsparc.methods.method import FitContext
 from gsparc.studies.train import train
 from gsparc.training import time_budget
-from gsparc.training.fit import TrainerSettings
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.time_budget import Budget, Pace, Stretched
 
@@ -87,7 +87,7 @@ def test_validation_is_not_billed_and_a_resumed_run_has_the_rest(monkeypatch):
 @pytest.mark.parametrize("wrong", [0, -3, float("inf")])
 def test_a_budget_that_is_none_is_refused(wrong):
     with pytest.raises(ValueError, match=r"budget_s.*positive number of seconds"):
-        TrainerSettings(budget_s=wrong)
+        FitContext(budget_s=wrong)
 
 
 def test_a_run_ends_with_its_budget_in_both_stages(tmp_path):

@@ -13,11 +13,10 @@ from gsparc.array.moving.triangulate import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
 from gsparc.methods.gp import GaussianProcess
-from gsparc.methods.method import FitContext
+from gsparc.methods.method import FitContext, Resumable
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 from gsparc.simulate.shoebox import images
-from gsparc.training.fit import TrainerSettings, Training
 
 SEARCH = SearchSettings(sources=17, rows=50, candidates=4000, steps=80)
 
@@ -92,15 +91,11 @@ def test_several_searches_answer_together(data, fold, fitted, tmp_path):
 def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
     quick = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
     method = BearingField(search=quick, components=16)
-    method.training = Training(TrainerSettings(budget_s=1e-3))
-    method.fit(data, fold, FitContext(tmp_path))
+    method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3))
     assert len(method.trends) == 1
-    method.training = Training(TrainerSettings(budget_s=600.0))
-    seconds = method.fit(data, fold, FitContext(tmp_path)).seconds
+    seconds = method.fit(data, fold, FitContext(tmp_path, budget_s=600.0)).seconds
     assert len(method.trends) > 1 and seconds < 300
-    method.training = Training(resume=tmp_path / "last.ckpt")
-    with pytest.raises(ValueError, match="ckpt_path"):
-        method.fit(data, fold, FitContext(tmp_path))
+    assert not isinstance(method, Resumable)
 
 
 def test_powers_are_the_best_that_are_not_negative():

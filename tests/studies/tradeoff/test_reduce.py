@@ -16,9 +16,9 @@ from gsparc.array.method import ArrayField
 from gsparc.array.moving.method import BearingField
 from gsparc.array.moving.triangulate import SearchSettings
 from gsparc.array.wave_packets import PacketSettings
-from gsparc.auto import reduce
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
+from gsparc.methods import reduced
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitContext
@@ -41,10 +41,10 @@ def away(method, other, data, rows) -> float:
 def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(field):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
     before = answer(method, data, fold.test).mean.clone()
-    measured = reduce.measure(method, data, fold.train)
+    measured = reduced.contributions(method, data, fold.train)
     assert measured["contribution"].shape == (40,) and (measured["contribution"] >= 0).all()
-    assert away(method, reduce.reduced(method, {"keep": 1.0}, measured), data, fold.test) < 1e-3
-    half, few = (reduce.reduced(method, {"keep": share}, measured) for share in (0.5, 0.1))
+    assert away(method, reduced.reduced(method, {"keep": 1.0}, measured), data, fold.test) < 1e-3
+    half, few = (reduced.reduced(method, {"keep": share}, measured) for share in (0.5, 0.1))
     assert half.size() == 20 and few.size() == 4 and method.size() == 40
     assert away(method, half, data, fold.test) < 0.2 < away(method, few, data, fold.test)
     assert torch.equal(answer(method, data, fold.test).mean, before)
@@ -52,7 +52,7 @@ def test_a_splatted_field_with_fewer_gaussians_is_taught_and_left_as_it_was(fiel
 
 def test_the_order_of_keeping_is_spread_over_the_sky(field):
     method, fold = field.methods[0], field.split.folds[0]
-    measured = reduce.measure(method, field.data, fold.train)
+    measured = reduced.contributions(method, field.data, fold.train)
     order = field_reduce.spread(method.fitted(), measured)
     assert sorted(order.tolist()) == list(range(40)) and order[0] == measured["contribution"].argmax()
     seen = torch.nn.functional.normalize(method.fitted().gaussians.means - measured["receiver"][0], dim=1)
@@ -75,7 +75,7 @@ def test_the_order_of_keeping_is_spread_over_the_sky(field):
 )
 def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    reduced = reduce.reduced(method, settings, reduce.measure(method, data, fold.train))
+    reduced = reduced.reduced(method, settings, reduced.contributions(method, data, fold.train))
     found = answer(reduced, data, fold.test).mean
     assert found.shape == data.batch(fold.test).target.shape
     assert away(method, reduced, data, fold.test) < near
@@ -83,7 +83,7 @@ def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
 
 def test_confidence_that_is_spared_is_not_computed(field):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    reduced = reduce.reduced(method, {"confidence": False}, reduce.measure(method, data, fold.train))
+    reduced = reduced.reduced(method, {"confidence": False}, reduced.contributions(method, data, fold.train))
     assert answer(reduced, data, fold.test).confidence is None
     assert answer(method, data, fold.test).confidence is not None
     assert away(method, reduced, data, fold.test) == 0
@@ -101,13 +101,13 @@ def packets(tmp_path_factory):
 
 def test_fewer_packets_say_what_all_of_them_said(packets):
     method, data, fold = packets
-    measured = reduce.measure(method, data, fold.train)
-    half = reduce.reduced(method, {"keep": 0.5}, measured)
-    few = reduce.reduced(method, {"keep": 0.05}, measured)
+    measured = reduced.contributions(method, data, fold.train)
+    half = reduced.reduced(method, {"keep": 0.5}, measured)
+    few = reduced.reduced(method, {"keep": 0.05}, measured)
     assert half.size() == 48 and few.size() == 5 and method.size() == 96
     error = [away(method, way, data, fold.test) for way in (half, few)]
     assert error[0] < 0.01 and error[0] < error[1]
-    coarse = reduce.reduced(method, {"stride": 3, "confidence": False}, measured)
+    coarse = reduced.reduced(method, {"stride": 3, "confidence": False}, measured)
     assert away(method, coarse, data, fold.test) < 0.05 and answer(coarse, data, fold.test).confidence is None
 
 
@@ -117,12 +117,12 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     fold = Fold(rows[rows % 3 > 0], rows[:0], rows[::3])
     method = VirtualSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
     method.fit(data, fold, FitContext(tmp_path))
-    measured = reduce.measure(method, data, fold.train)
-    silent = reduce.reduced(method, {"confidence": False}, measured)
+    measured = reduced.contributions(method, data, fold.train)
+    silent = reduced.reduced(method, {"confidence": False}, measured)
     assert away(method, silent, data, fold.test) < 1e-9 and answer(silent, data, fold.test).variance is None
-    one = reduce.reduced(method, {"searches": 1}, measured)
+    one = reduced.reduced(method, {"searches": 1}, measured)
     assert len(one.members) == 1 and answer(one, data, fold.test).variance is not None
-    few = reduce.reduced(method, {"keep": 0.3}, measured)
+    few = reduced.reduced(method, {"keep": 0.3}, measured)
     assert 1 <= few.size() <= method.size() and torch.isfinite(answer(few, data, fold.test).mean).all()
 
 
@@ -130,10 +130,10 @@ def test_a_gaussian_process_spares_components_pixels_and_its_variance(field):
     data, fold = field.data, field.split.folds[0]
     method = GaussianProcess()
     method.fit(data, fold, FitContext(Path()))
-    whole = reduce.reduced(method, {"confidence": False}, {})
+    whole = reduced.reduced(method, {"confidence": False}, {})
     assert away(method, whole, data, fold.test) < 1e-8 and answer(whole, data, fold.test).variance is None
-    assert reduce.reduced(method, {"confidence": True}, {}) is method
-    few = reduce.reduced(method, {"keep": 0.2, "stride": 2}, {})
+    assert reduced.reduced(method, {"confidence": True}, {}) is method
+    few = reduced.reduced(method, {"keep": 0.2, "stride": 2}, {})
     assert few.size() < len(method.axes) and 0 < away(method, few, data, fold.test) < 0.3
 
 
@@ -151,28 +151,28 @@ def crossings(tmp_path_factory):
 
 def test_one_search_is_not_swept_as_two(crossings):
     method, trends = crossings[0], crossings[0].trends
-    assert ("searches" in reduce.knobs(method)) == (len(trends) > 1)
+    assert ("searches" in reduced.knobs(method)) == (len(trends) > 1)
     try:
         method.trends = trends[:1] * 2
-        assert "searches" in reduce.knobs(method)
+        assert "searches" in reduced.knobs(method)
         method.trends = trends[:1]
-        assert "searches" not in reduce.knobs(method)
+        assert "searches" not in reduced.knobs(method)
     finally:
         method.trends = trends
 
 
 def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
     method, data, fold = crossings
-    measured = reduce.measure(method, data, fold.train)
-    assert reduce.reduced(method, {"confidence": True}, measured) is method
-    silent = reduce.reduced(method, {"confidence": False}, measured)
+    measured = reduced.contributions(method, data, fold.train)
+    assert reduced.reduced(method, {"confidence": True}, measured) is method
+    silent = reduced.reduced(method, {"confidence": False}, measured)
     assert away(method, silent, data, fold.test) < 1e-8 and answer(silent, data, fold.test).variance is None
     error = [
-        away(method, reduce.reduced(method, settings, measured), data, fold.test)
+        away(method, reduced.reduced(method, settings, measured), data, fold.test)
         for settings in ({"keep": 0.5}, {"keep": 0.05})
     ]
     assert 0 < error[0] < error[1] < 0.3
-    coarse = reduce.reduced(method, {"stride": 2}, measured)
+    coarse = reduced.reduced(method, {"stride": 2}, measured)
     assert answer(coarse, data, fold.test).mean.shape == data.batch(fold.test).target.shape
     assert 0 < away(method, coarse, data, fold.test) < 0.05
 
@@ -183,38 +183,38 @@ def test_strides_that_do_not_divide_the_columns_are_left_out(field, caplog):
     method.fit(field.data, field.split.folds[0], FitContext(Path()))
     columns = field.data.site.grid.width
     assert columns % 2 == 0 and columns % 3
-    assert list(reduce.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
+    assert list(reduced.combinations(method, {"stride": [1, 2, 3]}, {})) == [{}, {"stride": 2}]
     assert f"stride=3: does not divide the {columns} columns" in caplog.text
 
 
 def test_a_method_without_knobs_has_one_point(field):
     method = Mean()
     method.fit(field.data, field.split.folds[0], FitContext(Path()))
-    assert list(reduce.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
-    assert reduce.reduced(method, {"keep": 0.5}, {}) is method
+    assert list(reduced.combinations(method, {"keep": [1.0, 0.5]}, {"frozen": [False]})) == [{}]
+    assert reduced.reduced(method, {"keep": 0.5}, {}) is method
 
 
 def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
     found = train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1]
     method, data, fold = found.methods[0], found.data, found.split.folds[0]
-    measured = reduce.measure(method, data, fold.train)
-    assert "frozen" not in reduce.knobs(method)
-    strongest = reduce.reduced(method, {"keep": 0.5}, measured)
-    weakest = reduce.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
+    measured = reduced.contributions(method, data, fold.train)
+    assert "frozen" not in reduced.knobs(method)
+    strongest = reduced.reduced(method, {"keep": 0.5}, measured)
+    weakest = reduced.reduced(method, {"keep": 0.5}, {"contribution": -measured["contribution"]})
     assert strongest.size() == weakest.size() == 20
     assert away(method, strongest, data, fold.test) < away(method, weakest, data, fold.test)
-    assert away(method, reduce.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
+    assert away(method, reduced.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
 
 
 def test_what_a_hybrid_adds_stays_unless_it_is_spared(field):
     data, fold = field.data, field.split.folds[0]
     method = copy.copy(field.methods[0])
-    measured = reduce.measure(method, data, fold.train)
-    assert "hybrid" not in reduce.knobs(method)
-    method._rest = SimpleNamespace(completed=lambda mean, tx, rx: mean + 1.0)
-    assert "hybrid" in reduce.knobs(method)
+    measured = reduced.contributions(method, data, fold.train)
+    assert "hybrid" not in reduced.knobs(method)
+    method._companion = SimpleNamespace(completed=lambda mean, tx, rx: mean + 1.0)
+    assert "hybrid" in reduced.knobs(method)
     plain, added = (
-        answer(reduce.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
+        answer(reduced.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
         for on in (False, True)
     )
     assert torch.equal(plain + 1, added)

@@ -1,0 +1,35 @@
+"""Contexts of short trainings: few steps, small batches, the callbacks a test wants."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+
+from gsparc.methods.method import FitContext
+from gsparc.training.fit import DEFAULTS
+
+
+def short(
+    run_dir: Path,
+    steps: int,
+    batch_size: int = 8,
+    callbacks: Callable[[], Sequence[Any]] = tuple,
+    every: int | None = None,
+    validate_every: int = 500,
+    **more: Any,
+) -> FitContext:
+    """`steps` optimiser steps; `last.ckpt` after each `every` of them."""
+
+    def made() -> list[Any]:
+        last = L.callbacks.ModelCheckpoint(
+            filename="last", every_n_train_steps=every, save_on_train_epoch_end=False,
+            enable_version_counter=False,
+        )  # fmt: skip
+        return [*callbacks(), *([last] if every else [])]
+
+    trainer = partial(DEFAULTS, max_steps=steps, val_check_interval=validate_every)
+    return FitContext(run_dir, batch_size=batch_size, trainer=trainer, callbacks=made, **more)
