@@ -43,6 +43,13 @@ def test_links_and_paths_lead_somewhere(page):
 
 
 @PER_PAGE
+def test_tests_that_are_named_exist(page):
+    for file, name in re.findall(r"`([\w/]*test_\w+\.py)::(\w+)`", page.read_text(encoding="utf-8")):
+        found = [path for path in (ROOT / "tests").rglob(Path(file).name) if path.as_posix().endswith(file)]
+        assert any(f"def {name}(" in path.read_text(encoding="utf-8") for path in found), f"{file}::{name}"
+
+
+@PER_PAGE
 def test_headings_that_are_linked_exist(page):
     def anchors(path: Path) -> set[str]:
         titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
