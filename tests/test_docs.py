@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_module
 
 from gsparc.methods.registry import METHODS
 from gsparc.studies.commands import COMMANDS
@@ -60,28 +62,60 @@ def test_headings_that_are_linked_exist(page):
             assert anchor in anchors(page.parent / link if link else page), f"{link}#{anchor}"
 
 
-@TODAY
-def test_commands_are_there(page):
+def said(page: Path) -> list[str]:
+    """Lines of code blocks without a language, and inline code."""
     text = page.read_text(encoding="utf-8")
-    code = re.findall(r"```\n.*?```|`[^`\n]+`", text, flags=re.DOTALL)
-    said = re.findall(r"(?:^|[`\s])(?:python -m )?gsparc ([a-z]+)", "\n".join(code), flags=re.MULTILINE)
-    assert not set(said) - COMMANDS.keys()
-    assert not re.search(r"python -m gsparc\.|gsparc\.studies", text), "say `gsparc COMMAND`"
+    blocks = re.findall(r"^ *```\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`([^`]+)`", re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE))
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return lines + [code.replace("\n", " ") for code in inline]
+
+
+COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
+STUDIES = {"kind=effects": "prices", "kind=positions": "sensitivity"}  # configurations of `gsparc study`
+
+
+def commands() -> dict[tuple[str, ...], str]:
+    """Configuration and overrides of every command in the documents, and the line it stands in."""
+    found = {}
+    for line in dict.fromkeys(line.strip() for page in PRESENT for line in said(page)):
+        match = COMMAND.match(line)
+        if match is None:
+            continue
+        name = match["name"] or "train"
+        assert name in COMMANDS, line
+        words = shlex.split(match["rest"], comments=True)
+        name = next((STUDIES[word] for word in words if word in STUDIES), name)
+        given = [word for word in words if "=" in word or word.startswith("~")]
+        given = [word for word in given if word not in STUDIES and not word.endswith(("=NAME", "=..."))]
+        # Of the values of a sweep the first.
+        found[name, *(word if "[" in word else word.partition(",")[0] for word in given)] = line
+    return {key: line for key, line in found.items() if (ROOT / "conf" / f"{key[0]}.yaml").exists()}
+
+
+def test_commands_compose():
+    """Commands, settings and choices that the documents name exist."""
+    given = commands()
+    assert len(given) > 30
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        for (name, *overrides), line in given.items():
+            assert compose(name, overrides), line
 
 
 @TODAY
-def test_models_and_datasets_are_there(page):
-    text = page.read_text(encoding="utf-8")
-    for group, word in (("model", r"\bmodel"), ("dataset", r"\bdataset"), ("experiment", r"\bexperiment")):
-        chosen = {name for found in re.findall(rf"{word}=([\w,/]+)", text) for name in found.split(",")}
-        files = [ROOT / "conf" / group / f"{name}.yaml" for name in chosen if name.islower()]
-        assert not [file.name for file in files if not file.exists()]
+@pytest.mark.parametrize(
+    "group", ["model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"]
+)
+def test_choices_are_there(page, group):
+    chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", "\n".join(said(page)))
+    assert not [name for name in chosen if not (ROOT / "conf" / group / f"{name}.yaml").exists()]
 
 
 @TODAY
 def test_names_that_are_gone_are_not_used(page):
-    code = re.findall(r"```\n.*?```|`[^`\n]+`", page.read_text(encoding="utf-8"), flags=re.DOTALL)
-    assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", "\n".join(code))]
+    code = "\n".join(said(page))
+    assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
+    assert "python -m gsparc." not in code and "gsparc.studies" not in code, "name the command"
 
 
 def test_the_readme_is_short():
