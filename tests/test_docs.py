@@ -1,41 +1,128 @@
-"""The map shows every room, and the documents name files that exist."""
+"""The map shows every package, and the documents name files, commands and choices that exist."""
 
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+from hydra import compose, initialize_config_module
+
+from gsparc.methods.registry import METHODS
+from gsparc.studies.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", ROOT / "ARCHITECTURE.md", *sorted((ROOT / "docs").glob("*.md"))]
+TOP = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG")]
+PAGES = [*TOP, *sorted((ROOT / "docs").glob("*.md"))]
+PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also speaks of names that are gone
+PER_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+TODAY = pytest.mark.parametrize("page", PRESENT, ids=lambda page: page.name)
+README_LINES = 150
+GONE = ("vsgp", "directed", "bearings", "committee", "trainer.budget_s", "trainer.val_every")
 
 
-def test_every_module_and_folder_is_on_the_map():
-    """Half of the modules were not: whoever looks for one finds its row and its reason."""
-    rows = [line.split("|")[1] for line in MAP.splitlines() if line.startswith("| `")]
-    named = set(re.findall(r"[\w.]+", " ".join(rows)))
-    modules = {file.stem for file in (ROOT / "gsparc").glob("*.py")} - {"__init__"}
-    folders = {file.parent.name for file in (ROOT / "gsparc").glob("*/__init__.py")}
-    assert not (modules | folders) - named
+def test_every_package_is_on_the_map():
+    named = set(re.findall(r"^\| `([\w./]+)`", MAP, flags=re.MULTILINE))
+    packages = {f"gsparc/{file.parent.name}" for file in (ROOT / "gsparc").glob("*/__init__.py")}
+    packages |= {f"{folder}/" for folder in ("conf", "callbacks", "ops", "bench", "tests")}
+    assert not packages - named
+    assert not {name for name in named if not (ROOT / name).exists()}
     groups = {folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()} - {"__pycache__"}
     assert not groups - set(re.findall(r"(\w+)/", MAP))
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@PER_PAGE
 def test_links_and_paths_lead_somewhere(page):
     text = page.read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)#\s]+)", text) if "://" not in link]
     missing = [link for link in links if not (page.parent / link).exists()]
     rooms = r"(?:gsparc|ops|callbacks|conf|bench|tests|docs)"
-    paths = re.findall(rf"`({rooms}/[\w./-]+\.\w+)`", text)
-    missing += [path for path in paths if not (ROOT / path).exists()]
+    paths = re.findall(rf"`({rooms}/[\w./-]+(?:\.\w+|/))`", text)
+    missing += [path for path in paths if "NAME" not in path and not (ROOT / path).exists()]
     assert not missing
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_commands_are_there(page):
-    modules = set(re.findall(r"python -m gsparc\.([a-z_]+)", page.read_text(encoding="utf-8")))
-    here = ROOT / "gsparc"
-    assert all((here / f"{m}.py").exists() or (here / m / "__main__.py").exists() for m in modules)
+@PER_PAGE
+def test_tests_that_are_named_exist(page):
+    for file, name in re.findall(r"`([\w/]*test_\w+\.py)::(\w+)`", page.read_text(encoding="utf-8")):
+        found = [path for path in (ROOT / "tests").rglob(Path(file).name) if path.as_posix().endswith(file)]
+        assert any(f"def {name}(" in path.read_text(encoding="utf-8") for path in found), f"{file}::{name}"
+
+
+@PER_PAGE
+def test_headings_that_are_linked_exist(page):
+    def anchors(path: Path) -> set[str]:
+        titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+        return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+    for link, anchor in re.findall(r"\]\(([^)#\s]*)#([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if "://" not in link:
+            assert anchor in anchors(page.parent / link if link else page), f"{link}#{anchor}"
+
+
+def said(page: Path) -> list[str]:
+    """Lines of code blocks without a language, and inline code."""
+    text = page.read_text(encoding="utf-8")
+    blocks = re.findall(r"^ *```\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
+    inline = re.findall(r"`([^`]+)`", re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE))
+    lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return lines + [code.replace("\n", " ") for code in inline]
+
+
+COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
+STUDIES = {"kind=effects": "prices", "kind=positions": "sensitivity"}  # configurations of `gsparc study`
+
+
+def commands() -> dict[tuple[str, ...], str]:
+    """Configuration and overrides of every command in the documents, and the line it stands in."""
+    found = {}
+    for line in dict.fromkeys(line.strip() for page in PRESENT for line in said(page)):
+        match = COMMAND.match(line)
+        if match is None:
+            continue
+        name = match["name"] or "train"
+        assert name in COMMANDS, line
+        words = shlex.split(match["rest"], comments=True)
+        name = next((STUDIES[word] for word in words if word in STUDIES), name)
+        given = [word for word in words if "=" in word or word.startswith("~")]
+        given = [word for word in given if word not in STUDIES and not word.endswith(("=NAME", "=..."))]
+        # Of the values of a sweep the first.
+        found[name, *(word if "[" in word else word.partition(",")[0] for word in given)] = line
+    return {key: line for key, line in found.items() if (ROOT / "conf" / f"{key[0]}.yaml").exists()}
+
+
+def test_commands_compose():
+    """Commands, settings and choices that the documents name exist."""
+    given = commands()
+    assert len(given) > 30
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        for (name, *overrides), line in given.items():
+            assert compose(name, overrides), line
+
+
+@TODAY
+@pytest.mark.parametrize(
+    "group", ["model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"]
+)
+def test_choices_are_there(page, group):
+    chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", "\n".join(said(page)))
+    assert not [name for name in chosen if not (ROOT / "conf" / group / f"{name}.yaml").exists()]
+
+
+@TODAY
+def test_names_that_are_gone_are_not_used(page):
+    code = "\n".join(said(page))
+    assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
+    assert "python -m gsparc." not in code and "gsparc.studies" not in code, "name the command"
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= README_LINES
+
+
+def test_every_method_is_listed():
+    """Each name of the registry is a row or an entry of the page of methods, or of the page of commands."""
+    text = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("peers.md", "commands.md"))
+    assert not {name for name in METHODS if f"`{name}`" not in text}
