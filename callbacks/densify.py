@@ -85,9 +85,9 @@ class Densify(L.Callback):
         with torch.no_grad():
             # Draws are a pure function of (seed, step): a resumed run makes the same children.
             draws = torch.Generator().manual_seed(torch.initial_seed() + step)
-            edit = self.plan(model, draws)
+            planned = self.plan(model, draws)
             before = len(model.gaussians)
-            edit.apply(edit, model, model.gaussians, trainer.optimizers[0])
+            edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
         log.debug("step %d: %d -> %d Gaussians", step, before, len(model.gaussians))
 

@@ -45,7 +45,7 @@ def test_what_was_never_stored_is_said(site) -> None:
     world = data.tx[fold.test[:2]] + data.site.origin
     with pytest.raises(ValueError, match="no threshold is stored"):
         gsparc.load(file).accepts(tx=world)
-    with pytest.raises(ValueError, match=r"gsparc\.calibration ckpt=FILE stores it"):
+    with pytest.raises(ValueError, match=r"gsparc calibrate ckpt=FILE stores it"):
         gsparc.load(file, confidence="distance")
     with pytest.raises(ValueError, match="expected one of learned"):
         gsparc.load(file, confidence="hope")

@@ -18,7 +18,7 @@ def test_every_name_is_a_method(name):
 
 
 def test_every_model_of_the_configuration_has_a_name():
-    """`model=directional_gp` could be trained, but was no baseline and could not be read from a bare checkpoint."""
+    """`model=directional_gp` could be trained, but was no baseline, nor read from a bare checkpoint."""
     files = (Path(__file__).parents[2] / "conf" / "model").glob("*.yaml")
     targets = {file.stem: yaml.safe_load(file.read_text())["_target_"] for file in files}
     assert targets == METHODS
@@ -34,7 +34,7 @@ def test_a_typo_gets_the_nearest_name():
 def test_a_config_becomes_a_method():
     method = build({"_target_": "gsparc.methods.gp.GaussianProcess", "components": 7})
     assert isinstance(method, GaussianProcess) and method.limit == 7
-    with pytest.raises(ValueError, match=r"not a gsparc\.method\.Method"):
+    with pytest.raises(ValueError, match=r"not a gsparc\.methods\.method\.Method"):
         build({"_target_": "pathlib.Path"})
     with pytest.raises(ValueError, match="_target_"):
         build({"components": 7})

@@ -75,18 +75,18 @@ def test_the_order_of_keeping_is_spread_over_the_sky(field):
 )
 def test_what_a_splatted_field_spares_stays_near_it(field, settings, near):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    reduced = reduced.reduced(method, settings, reduced.contributions(method, data, fold.train))
-    found = answer(reduced, data, fold.test).mean
+    lean = reduced.reduced(method, settings, reduced.contributions(method, data, fold.train))
+    found = answer(lean, data, fold.test).mean
     assert found.shape == data.batch(fold.test).target.shape
-    assert away(method, reduced, data, fold.test) < near
+    assert away(method, lean, data, fold.test) < near
 
 
 def test_confidence_that_is_spared_is_not_computed(field):
     method, data, fold = field.methods[0], field.data, field.split.folds[0]
-    reduced = reduced.reduced(method, {"confidence": False}, reduced.contributions(method, data, fold.train))
-    assert answer(reduced, data, fold.test).confidence is None
+    lean = reduced.reduced(method, {"confidence": False}, reduced.contributions(method, data, fold.train))
+    assert answer(lean, data, fold.test).confidence is None
     assert answer(method, data, fold.test).confidence is not None
-    assert away(method, reduced, data, fold.test) == 0
+    assert away(method, lean, data, fold.test) == 0
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,162 @@
+"""Checkpoints of before the modules were sorted anew still load, and answer what they answered then."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import gsparc
+from gsparc.data.schema import Batch
+from gsparc.methods.checkpoint import load
+from gsparc.methods.reduced import reduced
+from gsparc.methods.stored_front import kept
+from gsparc.ops import Pose
+
+HERE = Path(__file__).resolve().parent
+FIXTURES = HERE / "old_checkpoints"
+NAMES = sorted(path.stem for path in FIXTURES.glob("*.ckpt"))
+KINDS = ("learned", "expected", "distance", "gp_variance")  # of confidence
+RTOL, ATOL = 2e-4, 1e-5  # the second in units of the largest value
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Sums in the order in which they were then."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@cache
+def everything() -> dict[str, dict[str, np.ndarray]]:
+    """Questions and answers by checkpoint."""
+    found: dict[str, dict[str, np.ndarray]] = {}
+    with np.load(FIXTURES / "expected.npz") as stored:
+        for key in stored.files:
+            name, _, part = key.partition("/")
+            found.setdefault(name, {})[part] = stored[key]
+    return found
+
+
+def holding(part: str) -> list[str]:
+    """Checkpoints with an answer of that kind."""
+    return [name for name, known in sorted(everything().items()) if part in known]
+
+
+def same(found: Any, expected: np.ndarray, what: str) -> None:
+    found = found.detach().numpy() if isinstance(found, torch.Tensor) else np.asarray(found)
+    assert found.shape == expected.shape and found.dtype == expected.dtype, what
+    scale = float(np.abs(expected).max()) if expected.size else 0.0
+    np.testing.assert_allclose(found, expected, rtol=RTOL, atol=ATOL * max(scale, 1e-30), err_msg=what)
+
+
+def said(prediction: Any, known: dict[str, np.ndarray], prefix: str = "") -> None:
+    for part in ("mean", "confidence", "variance"):
+        value = getattr(prediction, part)
+        assert (value is None) == (prefix + part not in known), prefix + part
+        if value is not None:
+            same(value, known[prefix + part], prefix + part)
+
+
+def asked(known: dict[str, np.ndarray]) -> Batch:
+    """The three positions, or snapshots, in local coordinates."""
+    told = {part: torch.from_numpy(value) for part, value in known.items() if value.dtype.kind in "fc"}
+    return Batch(
+        index=torch.arange(3),
+        tx=told["tx"],
+        rx=Pose(told["rx_position"], told["rx_rotation"]),
+        target=torch.zeros_like(told["mean"]),
+        noise_variance=told.get("noise_variance"),
+        uplink=told.get("uplink"),
+    )
+
+
+def in_the_world(predictor: Any, known: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The same question to `gsparc.load`: world coordinates, physical units."""
+    if "uplink" in known:
+        return {"uplink": known["uplink"] * np.float32(predictor.site.target_scale)}
+    return {predictor.site.moving_end: known["asked_at"]}
+
+
+def test_nothing_is_missing():
+    assert sorted(everything()) == NAMES and len(NAMES) > 40
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_answers_as_it_did(name):
+    known = everything()[name]
+    method, _ = load(FIXTURES / f"{name}.ckpt")
+    batch = asked(known)
+    with torch.no_grad():
+        said(method.answer(batch), known)
+        if "uplink" not in known:
+            said(method.predict(batch.tx, batch.rx), known)
+
+
+@pytest.mark.parametrize("name", sorted({*holding("asked_at"), *holding("asked")}))
+def test_it_answers_in_world_coordinates(name):
+    """What is not stored apart is what the method says, in physical units."""
+    known = everything()[name]
+    predictor = gsparc.load(FIXTURES / f"{name}.ckpt")
+    question = in_the_world(predictor, known)
+    expected = known.get("asked", known["mean"] * np.float32(predictor.site.target_scale))
+    same(getattr(predictor, predictor.site.kind)(**question), expected, "asked")
+    if "confidence" in known:
+        same(predictor.confidence(**question), known.get("sure", known["confidence"]), "sure")
+
+
+@pytest.mark.parametrize("name", holding("paths_gain"))
+def test_it_is_made_of_the_same_paths(name):
+    known = everything()[name]
+    predictor = gsparc.load(FIXTURES / f"{name}.ckpt")
+    found = predictor.paths(**in_the_world(predictor, known))
+    for part, value in (
+        ("paths_gain", found.gain),
+        ("paths_delay", found.delay_s),
+        ("paths_direction", found.direction),
+        ("paths_cosines", found.cosines),
+    ):
+        assert (value is None) == (part not in known), part
+        if value is not None:
+            same(value, known[part], part)
+
+
+@pytest.mark.parametrize("name", holding("unknown_noise/mean"))
+def test_it_hears_an_uplink_of_unknown_noise(name):
+    known = everything()[name]
+    method, _ = load(FIXTURES / f"{name}.ckpt")
+    said(method.listen(torch.from_numpy(known["uplink"])), known, "unknown_noise/")
+
+
+@pytest.mark.parametrize("name", holding("accepts"))
+def test_it_trusts_and_accepts_as_it_did(name):
+    known = everything()[name]
+    path = FIXTURES / f"{name}.ckpt"
+    predictor = gsparc.load(path)
+    question = in_the_world(predictor, known)
+    assert predictor.trusted.promise is not None
+    np.testing.assert_array_equal(predictor.accepts(**question), known["accepts"])
+    for kind in KINDS:
+        if f"sure_{kind}" in known:
+            other = gsparc.load(path, confidence=kind)
+            same(other.confidence(**question), known[f"sure_{kind}"], kind)
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("traded")])
+def test_what_was_traded_away_stays_so(name):
+    known = everything()[name]
+    method, stored = load(FIXTURES / f"{name}.ckpt")
+    points, measured = kept(stored.extra)
+    batch, spared = asked(known), 0
+    for number, point in enumerate(points):
+        if point.settings:
+            view = reduced(method, point.settings, measured)
+            said(view.predict(batch.tx, batch.rx), known, f"point{number}/")
+            spared += 1
+    assert spared == len([part for part in known if part.endswith("/mean") and part.startswith("point")]) > 0
