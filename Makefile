@@ -5,6 +5,8 @@ VENV ?= .venv
 RUN := $(VENV)/bin/python
 # Torch's threads would otherwise spin for one another beside a busy process.
 export OMP_WAIT_POLICY ?= passive
+# A process per core, each with one thread; whoever is done takes tests from the others.
+PYTEST = OMP_NUM_THREADS=1 $(RUN) -m pytest -n auto --dist worksteal --durations=10
 SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
@@ -38,8 +40,8 @@ $(VENV)/.sionna: $(VENV)/.installed
 demo: setup ## train on a small simulated site, print the table, draw the spectra (about two minutes)
 	$(RUN) train.py experiment=demo hydra.run.dir=demo
 
-test: setup ## fast tests (under 10 minutes on two cores)
-	$(RUN) -m pytest -m "not slow" --durations=10
+test: setup ## fast tests (under 5 minutes on two idle cores)
+	$(PYTEST) -m "not slow"
 
 browser: ## Debian's chromium for the test of the report, where packages can be reached
 	@command -v chromium >/dev/null && command -v chromedriver >/dev/null || (apt-get update -qq && apt-get install -y -qq chromium chromium-driver) >/dev/null 2>&1 || echo "no chromium here: the test of the report in a browser is skipped"
@@ -49,7 +51,7 @@ results: setup ## README's results table, measured anew (RFID=folder of the rele
 	$(RUN) -m gsparc report outputs/results readme=README.md
 
 test-slow: setup sionna browser ## slow tests: whole training runs, kills, sanitizers, ray tracing
-	$(RUN) -m pytest -m slow --durations=10
+	$(PYTEST) -m slow
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md
