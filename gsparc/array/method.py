@@ -17,14 +17,14 @@ from gsparc.array.reduce import reduced
 from gsparc.array.vector_cache import recovered, report
 from gsparc.array.vector_gp import learn_process, mirror_elements
 from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
+from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
 from gsparc.methods.pareto import Settings
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
-from gsparc.physics.array_response import site_problem, steering
+from gsparc.physics.array_response import steering
 from gsparc.physics.bartlett import SpectrumRenderer
 
 log = logging.getLogger(__name__)
@@ -74,9 +74,8 @@ class ArrayField(PredictsVariance):
         Raises:
             ValueError: the site's spectra have no array to go through, or there is nothing to learn from.
         """
-        problem = site_problem(data.site)
-        if problem is not None:
-            raise ValueError(f"{self.name}: {problem}")
+        if data.site.array_problem is not None:
+            raise ValueError(f"{self.name}: {data.site.array_problem}")
         rows = np.sort(np.concatenate([fold.train, fold.val])) if self.refit else fold.train
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
@@ -112,7 +111,7 @@ class ArrayField(PredictsVariance):
         self.left_out = tuned.left_out
         self.field = distil(teacher, self.packets, site.wavelength, self.seed).requires_grad_(False)
         self.background = torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width)
-        self.renderer = SpectrumRenderer(site, self.background)
+        self.renderer = SpectrumRenderer(*site.array_geometry(), self.background)
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
@@ -191,7 +190,7 @@ class ArrayField(PredictsVariance):
         self.field.load_state_dict(stored)
         self.site, self.background, self.seen = site, state["background"], int(state["seen"])
         self.error = (float(state["error"][0]), float(state["error"][1]))
-        self.renderer = SpectrumRenderer(site, self.background)
+        self.renderer = SpectrumRenderer(*site.array_geometry(), self.background)
 
     def size(self) -> int:
         """Number of packets."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -33,10 +32,10 @@ def reduced(method: ArrayField, settings: Settings, measured: dict[str, Tensor])
     site, stride = method.site, int(settings.get("stride", 1))
     found: Method = twin
     if stride > 1:
-        assert site.grid is not None
-        coarse = replace(site, grid=coarser(site.grid, stride))
-        twin.renderer = SpectrumRenderer(coarse, method.background[::stride, ::stride])
-        found = Filled(twin, site.grid, stride)
+        array, grid, wavelength = site.array_geometry()
+        background = method.background[::stride, ::stride]
+        twin.renderer = SpectrumRenderer(array, coarser(grid, stride), wavelength, background)
+        found = Filled(twin, grid, stride)
     return found if settings.get("confidence", True) else MeanOnly(found)
 
 

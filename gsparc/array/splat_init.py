@@ -17,8 +17,8 @@ import torch
 from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered, report
 from gsparc.array.vector_gp import learn_process, mirror_elements
+from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
-from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import seen_by_array
 from gsparc.field.initial import InitTask, Start

@@ -9,6 +9,12 @@ from contextlib import contextmanager
 from pathlib import Path
 
 
+def platform_cache() -> Path:
+    """Where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
+    root = os.environ.get("XDG_CACHE_HOME")
+    return (Path(root) if root else Path.home() / ".cache") / "gsparc"
+
+
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[Path]:
     """A path beside `path` to write a file to; its folder is made.

@@ -72,6 +72,34 @@ class Site:
         """Carrier wavelength [m]; None when the carrier is unknown."""
         return None if self.carrier_hz is None else LIGHT / self.carrier_hz
 
+    @property
+    def array_problem(self) -> str | None:
+        """Why these spectra cannot be modelled through the receive array; None when they can."""
+        if self.kind != "spectrum" or self.grid is None:
+            return f"targets are {self.kind}, not spectra on a grid"
+        if self.static_end != "rx":
+            return "the receiver moves; its array must be static"
+        if self.array is None or len(self.array) < 2:
+            return "the dataset declares no antenna array"
+        if not np.ptp(self.array, axis=0).any():
+            return "all antennas of the declared array are at one place"
+        if self.wavelength is None:
+            return "the carrier is unknown"
+        return None
+
+    def array_geometry(self) -> tuple[np.ndarray, SphereGrid, float]:
+        """Array (M, 3) [m], grid and wavelength [m] of spectra whose `array_problem` is None."""
+        assert self.array is not None and self.grid is not None and self.wavelength is not None
+        return self.array, self.grid, self.wavelength
+
+    def tones(self) -> np.ndarray:
+        """Frequencies (K,) float64 [Hz] of the channel; `ValueError` when nothing names them."""
+        if self.subcarriers_hz is not None:
+            return np.asarray(self.subcarriers_hz, dtype=np.float64)
+        if self.carrier_hz is None:
+            raise ValueError(f"{self.name}: neither subcarriers_hz nor carrier_hz is known; phase needs them")
+        return np.array([self.carrier_hz], dtype=np.float64)
+
 
 @dataclass(frozen=True)
 class Batch:

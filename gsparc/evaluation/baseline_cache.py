@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import logging
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -40,12 +39,6 @@ class Fitted:
     methods: tuple[Method, ...]
     scores: Scores
     train_s: tuple[float, ...]
-
-
-def platform_cache() -> Path:
-    """Where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
-    root = os.environ.get("XDG_CACHE_HOME")
-    return (Path(root) if root else Path.home() / ".cache") / "gsparc"
 
 
 def baseline(

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Site
-from gsparc.multipath.rows import tones_of
 from gsparc.ops import Pose
 from gsparc.ops.channels import channels
-from gsparc.physics.array_response import array_output, element_pattern, normalised, site_problem, steering
+from gsparc.physics.array_response import array_output, element_pattern, normalised, steering
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.waves import LIGHT, ranges, wave_over_band
 
@@ -105,7 +104,7 @@ class PathResponse(nn.Module):
         known = site.array is not None and antennas > 1
         array = torch.as_tensor(site.array).double() if known else torch.zeros(1, 3, dtype=torch.float64)
         self.register_buffer("array", array, persistent=False)
-        self.register_buffer("tones", torch.from_numpy(tones_of(site)), persistent=False)
+        self.register_buffer("tones", torch.from_numpy(site.tones()), persistent=False)
         own = 1 if known else antennas
         self.steering = nn.Parameter(torch.tensor([1.0, 0.0]).repeat(count, own, 1), requires_grad=own > 1)
         self.carrier_hz = float(site.carrier_hz or self.tones.mean())
@@ -133,7 +132,7 @@ class PathResponse(nn.Module):
 
 
 class ArrayResponse(nn.Module):
-    """Splat, then A: what a static array makes of arriving waves, and the spectrum it reports.
+    """Composited directional fields through a static array to the spectrum it reports.
 
     Args:
         site: spectra of a static array.
@@ -148,17 +147,16 @@ class ArrayResponse(nn.Module):
 
     def __init__(self, site: Site, pattern: float) -> None:
         super().__init__()
-        problem = site_problem(site)
-        if problem is not None:
-            raise ValueError(f"model.response.array=true is not possible: {problem}")
-        assert site.grid is not None and site.array is not None and site.wavelength is not None
-        self.grid, self.how = site.grid, site.normalisation
-        matrix = steering(site.array, site.grid, site.wavelength).to(torch.complex64)
+        if site.array_problem is not None:
+            raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
+        array, self.grid, wavelength = site.array_geometry()
+        self.normalisation = site.normalisation
+        matrix = steering(array, self.grid, wavelength).to(torch.complex64)
         self.register_buffer("matrix", matrix, persistent=False)
-        elements = element_pattern(site.grid, pattern) if pattern else None
+        elements = element_pattern(self.grid, pattern) if pattern else None
         self.register_buffer("pattern", elements, persistent=False)
-        silence = torch.zeros(site.grid.height, site.grid.width)
-        self.renderer = SpectrumRenderer(site, silence)
+        no_background = torch.zeros(self.grid.height, self.grid.width)
+        self.renderer = SpectrumRenderer(array, self.grid, wavelength, no_background)
 
     def measured(self, image: Tensor) -> Tensor:
         """Array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
@@ -168,10 +166,10 @@ class ArrayResponse(nn.Module):
     def spectra(self, vectors: Tensor) -> Tensor:
         """Published spectra (B, H, W) of array vectors (B, M)."""
         known = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # nothing else is added
-        if self.how != "none":  # the renderer keeps slopes finite below a fixed amplitude: scale first
+        if self.normalisation != "none":  # scaled first: the slope is cut off below a fixed amplitude
             known = known / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
         image = self.renderer(known).flatten(1)
-        return normalised(image, self.how).unflatten(1, (self.grid.height, self.grid.width))
+        return normalised(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
 
     def forward(self, image: Tensor) -> Tensor:
         """Composited fields (B, 2, H, W) -> spectra (B, H, W)."""

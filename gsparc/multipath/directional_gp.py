@@ -27,7 +27,7 @@ from gsparc.multipath.frame import Frame, frame_of, refuse
 from gsparc.multipath.gp_likelihood import JITTER, Factor, steering
 from gsparc.multipath.position_refine import Pinning
 from gsparc.multipath.position_uncertainty import Open, coherence
-from gsparc.multipath.rows import Rows, gather, query_elements, tones_of
+from gsparc.multipath.rows import Rows, gather, query_elements
 from gsparc.multipath.triangulation import Rays, meet
 from gsparc.multipath.visibility_gp import Sightings
 from gsparc.multipath.visibility_kernel import matern32
@@ -262,7 +262,7 @@ class DirectedSources(PredictsVariance):
 
     def _sum(self, query: Query) -> Tensor:
         """Of the waves that a query's places receive, as channels of its receivers."""
-        tones = torch.from_numpy(tones_of(self._fitted()))
+        tones = torch.from_numpy(self._fitted().tones())
         gains = query.likely[:, :, None] * self._gains(query)
         mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(query.away, tones))
         loudness = (self.frame.carrier_hz / tones).float()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.multipath.rows import Rows, tones_of
+from gsparc.multipath.rows import Rows
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def frame_of(site: Site, rows: Rows) -> Frame:
     Raises:
         ValueError: every channel is silent.
     """
-    frequency = tones_of(site)
+    frequency = site.tones()
     carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
     power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
     if not power > 0:

@@ -26,7 +26,7 @@ from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
 from gsparc.multipath.reduce import reduced
-from gsparc.multipath.rows import Rows, elements, gather, query_elements, tones_of
+from gsparc.multipath.rows import Rows, elements, gather, query_elements
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Shelf
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
@@ -215,7 +215,7 @@ class VirtualSourceGP(PredictsVariance):
 
     def _against(self, data: Measurements, known: np.ndarray, sources: Tensor, gains: Tensor) -> Measurements:
         """Targets of the known rows without the offsets they have against sources of constant gains."""
-        frequency = tones_of(data.site)
+        frequency = data.site.tones()
         places = elements(data.site, data.moving[known], data.rx_rotation[known], self.antennas)
         flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
         waves = wave_over_band(ranges(flat, sources), torch.from_numpy(frequency))
@@ -242,7 +242,7 @@ class VirtualSourceGP(PredictsVariance):
         site = self._fitted()
         flat, count = self._places(tx, rx)
         per = len(flat) // count
-        tones = torch.from_numpy(tones_of(site))
+        tones = torch.from_numpy(site.tones())
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         if len(self.edges):

@@ -44,15 +44,6 @@ class Rows:
         return Rows(self.position, self.frequency, self.target * factor, self.receiver)
 
 
-def tones_of(site: Site) -> np.ndarray:
-    """Frequencies (K,) float64 [Hz] of a site's channel; `ValueError` when nothing names them."""
-    if site.subcarriers_hz is not None:
-        return np.asarray(site.subcarriers_hz, dtype=np.float64)
-    if site.carrier_hz is None:
-        raise ValueError(f"{site.name}: neither subcarriers_hz nor carrier_hz is known; phase needs them")
-    return np.array([site.carrier_hz], dtype=np.float64)
-
-
 def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
     """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""
     if site.array is None or antennas == 1:
@@ -83,7 +74,7 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     rng = np.random.default_rng(seed)
     index = np.asarray(index)
     antennas, tones = data.target.shape[1:]
-    frequency = tones_of(data.site)
+    frequency = data.site.tones()
     places = elements(data.site, data.moving[index], data.rx_rotation[index], antennas)
     per = places.shape[1]
     if len(index) * per > limit:

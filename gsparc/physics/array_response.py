@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
 
 SAME_LAG = 1e-4  # two element differences closer than this many wavelengths are one lag
@@ -158,18 +157,3 @@ def lags(array: np.ndarray, wavelength: float) -> Lags:
         [difference.reshape(-1, 3)[(which == i) & (sign >= 0)].mean(0) for i in range(len(unique))]
     )
     return Lags(kept, torch.from_numpy(real), torch.from_numpy(imag), m)
-
-
-def site_problem(site: Site) -> str | None:
-    """Why a site's spectra cannot be modelled through its array; None when they can."""
-    if site.kind != "spectrum" or site.grid is None:
-        return f"targets are {site.kind}, not spectra on a grid"
-    if site.static_end != "rx":
-        return "the receiver moves; its array must be static"
-    if site.array is None or len(site.array) < 2:
-        return "the dataset declares no antenna array"
-    if not np.ptp(site.array, axis=0).any():
-        return "all antennas of the declared array are at one place"
-    if site.wavelength is None:
-        return "the carrier is unknown"
-    return None

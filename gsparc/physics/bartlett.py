@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Site
-from gsparc.physics.array_response import lags, steering
+from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import lags
 
 TINY = 1e-9  # of a squared spectrum: keeps the slope of the square root finite
 SILENT = 1e-9  # harmonics this much weaker than the strongest are none: float32 would not see them
@@ -23,23 +23,24 @@ class SpectrumRenderer(nn.Module):
     itself would read 8.3 MB; nothing is approximated.
 
     Args:
-        site: array, wavelength and grid.
+        array: (M, 3) [m] element positions, receiver frame.
+        grid: directions of the pixels.
+        wavelength: [m].
         background: (H, W) amplitude.
     """
 
     pairs: Tensor
     square: Tensor
 
-    def __init__(self, site: Site, background: Tensor) -> None:
+    def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float, background: Tensor) -> None:
         super().__init__()
-        assert site.array is not None and site.grid is not None and site.wavelength is not None
-        grid, known = site.grid, lags(site.array, site.wavelength)
-        planar = float(np.ptp(site.array[:, 2])) < 1e-6 * site.wavelength
+        known = lags(array, wavelength)
+        planar = float(np.ptp(array[:, 2])) < 1e-6 * wavelength
         self.half_turn = planar and grid.periodic and grid.width % 2 == 0
         pairs = torch.stack([known.real_pairs, known.imag_pairs], 1).flatten(0, 1)
         self.register_buffer("pairs", pairs.float())
         self.register_buffer("square", background.float().square())
-        basis = known.basis(grid, site.wavelength).view(grid.height, grid.width, -1)
+        basis = known.basis(grid, wavelength).view(grid.height, grid.width, -1)
         count = len(known.difference)
         self.spans = [slice(0, count), slice(count, None)] if self.half_turn else [slice(None)]
         columns = grid.width // 2 if self.half_turn else grid.width
@@ -98,10 +99,3 @@ def _harmonics(basis: Tensor, columns: int, periodic: bool) -> tuple[Tensor, Ten
     waves = torch.stack([twice[:, None] * turn.cos(), -twice[:, None] * turn.sin()], 1).flatten(0, 1)
     table = torch.view_as_real(spectrum[:, kept]).permute(2, 0, 1, 3).reshape(numbers, -1)
     return table, waves
-
-
-def spectra(site: Site, vectors: Tensor) -> Tensor:
-    """`|A^H h|` (B, H, W) without shortcuts: what `SpectrumRenderer` must equal where nothing is unknown."""
-    assert site.array is not None and site.grid is not None and site.wavelength is not None
-    matrix = steering(site.array, site.grid, site.wavelength).to(vectors.dtype)
-    return (vectors @ matrix.conj()).abs().view(-1, site.grid.height, site.grid.width)

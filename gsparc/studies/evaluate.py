@@ -13,10 +13,10 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.files import platform_cache
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split, write_split
-from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint

@@ -15,10 +15,10 @@ from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.files import platform_cache
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
-from gsparc.evaluation.baseline_cache import platform_cache
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_arrays import array_site, measure, walk
+from known_arrays import array_site, measure, spectra, walk
 
 from gsparc.array.cross_validation import tune
 from gsparc.array.method import ArrayField
@@ -23,7 +23,7 @@ from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
-from gsparc.physics.bartlett import SpectrumRenderer, spectra
+from gsparc.physics.bartlett import SpectrumRenderer
 
 SMALL = PacketSettings(count=300, samples=1500)
 
@@ -50,7 +50,7 @@ def test_renderer_equals_the_plain_beamformer(grid, height):
     h = torch.from_numpy(rng.normal(size=(3, 16)) + 1j * rng.normal(size=(3, 16))) / 30
     share = torch.tensor([[0.0], [0.5], [1.0]], dtype=torch.float64)
     expected = (spectra(site, h).square() + share[:, :, None].square() * background.square()).sqrt()
-    renderer = SpectrumRenderer(site, background)
+    renderer = SpectrumRenderer(*site.array_geometry(), background)
     extended = torch.cat([h, share.to(h.dtype)], 1).to(torch.complex64)
     assert renderer.half_turn == (grid.width == 10 and height == 0)
     torch.testing.assert_close(renderer(extended).double(), expected, atol=2e-4, rtol=1e-4)
@@ -61,7 +61,7 @@ def test_renderer_equals_the_plain_beamformer(grid, height):
 
 def test_renderer_slopes():
     site = array_site(SphereGrid.hemisphere(4, 6), planar_array(2, 2))
-    renderer = SpectrumRenderer(site, torch.rand(4, 6)).double()
+    renderer = SpectrumRenderer(*site.array_geometry(), torch.rand(4, 6)).double()
     h = torch.randn(2, 5, dtype=torch.complex128)
     real = torch.view_as_real(h).clone().requires_grad_()
     assert torch.autograd.gradcheck(lambda v: renderer(torch.view_as_complex(v)), [real])

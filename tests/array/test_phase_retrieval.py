@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_arrays import array_site, measure, room_vectors, walk
+from known_arrays import array_site, measure, room_vectors, spectra, walk
 
 from gsparc.array import vector_cache
 from gsparc.array.phase_retrieval import recover
@@ -15,7 +15,6 @@ from gsparc.array.vector_gp import align, mirror_elements, twin
 from gsparc.data.load import load
 from gsparc.data.rfid import planar_array
 from gsparc.ops import SphereGrid
-from gsparc.physics.bartlett import spectra
 
 
 def _agreement(found, truth, partner):

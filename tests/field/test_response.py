@@ -12,7 +12,7 @@ from campaigns import channels as channel_file
 from campaigns import compose
 from contexts import short
 from invented import invent
-from known_arrays import array_site
+from known_arrays import array_site, spectra
 from rooms import nmse, shoebox
 from torch import Tensor
 
@@ -25,7 +25,6 @@ from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse
 from gsparc.methods.registry import build
 from gsparc.ops import Pose, SphereGrid, StalePlan
 from gsparc.physics.array_response import normalised
-from gsparc.physics.bartlett import spectra
 from gsparc.simulate.shoebox import LIGHT
 
 GRID = SphereGrid.hemisphere(8, 16)

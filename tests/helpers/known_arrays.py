@@ -9,7 +9,7 @@ import torch
 
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.ops import SphereGrid
-from gsparc.physics.bartlett import spectra
+from gsparc.physics.array_response import steering
 from gsparc.simulate.shoebox import Room, trace
 
 WAVELENGTH = 0.3259
@@ -26,6 +26,13 @@ def array_site(grid: SphereGrid, array: np.ndarray, **changes) -> Site:
         sha256="known", normalisation="max", static_position=RECEIVER, rx_rotation=TURN,
     )  # fmt: skip
     return replace(site, **changes)
+
+
+def spectra(site: Site, vectors: torch.Tensor) -> torch.Tensor:
+    """`|A^H h|` (B, H, W) without shortcuts: what `SpectrumRenderer` must equal where nothing is unknown."""
+    array, grid, wavelength = site.array_geometry()
+    matrix = steering(array, grid, wavelength).to(vectors.dtype)
+    return (vectors @ matrix.conj()).abs().view(-1, grid.height, grid.width)
 
 
 def measure(

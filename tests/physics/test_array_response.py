@@ -83,6 +83,6 @@ def test_normalised_silence_is_finite():
 
 
 def test_sites_without_an_array_are_named(campaign):
-    assert "no antenna array" in array_response.site_problem(campaign("spectrum", 4).site)
-    assert "csi" in array_response.site_problem(campaign("csi", 4).site)
-    assert "receiver moves" in array_response.site_problem(campaign("spectrum", 4, "tx").site)
+    assert "no antenna array" in campaign("spectrum", 4).site.array_problem
+    assert "csi" in campaign("csi", 4).site.array_problem
+    assert "receiver moves" in campaign("spectrum", 4, "tx").site.array_problem

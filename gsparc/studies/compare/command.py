@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.markdown import Markdown
 
-from gsparc.evaluation.baseline_cache import platform_cache
+from gsparc.data.files import platform_cache
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.studies import cli
 from gsparc.studies.compare import figure, table

@@ -14,9 +14,10 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
+from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.baseline_cache import baseline, platform_cache
+from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.metrics import DECIDING, score_of
 from gsparc.evaluation.scores import rows_of, score
