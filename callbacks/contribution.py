@@ -1,4 +1,4 @@
-"""Sources with carrier phase are pruned by what they contribute, not by opacity: they hide nobody."""
+"""Sources with carrier phase are pruned by their share of power: they do not occlude."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ContributionPruning(L.Callback):
     """Drop sources whose share of the power at the training rows is small; only where there is carrier phase.
 
     Args:
-        interval: steps between looks.
+        interval: steps between prunings.
         least_share: of the power; the strongest source always stays.
     """
 
@@ -41,4 +41,4 @@ class ContributionPruning(L.Callback):
                 return
             none = torch.empty(0, dtype=torch.long)
             edit.apply(edit.Edit(keep, none), model, model.gaussians, trainer.optimizers[0])
-        log.info("step %d: %d sources of %d stay", trainer.global_step, int(keep.sum()), len(keep))
+        log.info("step %d: kept %d of %d sources", trainer.global_step, int(keep.sum()), len(keep))

@@ -95,19 +95,19 @@ class Densify(L.Callback):
         """Decide what to clone, split and prune from the statistics gathered so far."""
         field = model.gaussians
         mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
-        wanting = mean_gradient >= self.grad_threshold
+        under_reconstructed = mean_gradient >= self.grad_threshold
         size = field.scales.amax(1)
-        radius_of_scene = float((torch.as_tensor(model.site.box[1] - model.site.box[0])).norm() / 2)
-        large = size > self.size_share * radius_of_scene
+        scene_radius = float((torch.as_tensor(model.site.box[1] - model.site.box[0])).norm() / 2)
+        large = size > self.size_share * scene_radius
 
         prune = field.opacities < self.min_opacity
         if self.max_radius is not None:
             prune |= self.statistics["radius"] > self.max_radius
-        prune = self._respect_floor(prune, field.opacities)
+        prune = self._keep_at_least(prune, field.opacities)
 
         room = max(self.max_gaussians - int((~prune).sum()), 0)
         cost = torch.where(large, self.children - 1, 1)
-        chosen = self._strongest(wanting & ~prune, mean_gradient, cost, room)
+        chosen = self._strongest(under_reconstructed & ~prune, mean_gradient, cost, room)
         clone, split = chosen & ~large, chosen & large
         clones = clone.nonzero().squeeze(1)
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
@@ -126,7 +126,7 @@ class Densify(L.Callback):
             replace={"gaussians.means": means, "gaussians.log_scales": scales},
         )
 
-    def _respect_floor(self, prune: Tensor, opacities: Tensor) -> Tensor:
+    def _keep_at_least(self, prune: Tensor, opacities: Tensor) -> Tensor:
         short = min(self.min_gaussians, len(prune)) - int((~prune).sum())
         if short > 0:
             candidates = torch.where(prune, opacities, -torch.ones_like(opacities))
@@ -135,13 +135,13 @@ class Densify(L.Callback):
         return prune
 
     @staticmethod
-    def _strongest(wanting: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
-        order = torch.where(wanting, gradient, -torch.ones_like(gradient)).argsort(
+    def _strongest(under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
+        order = torch.where(under_reconstructed, gradient, -torch.ones_like(gradient)).argsort(
             descending=True, stable=True
         )
-        spent = torch.where(wanting, cost, 0)[order].cumsum(0)
-        chosen = torch.zeros_like(wanting)
-        chosen[order] = wanting[order] & (spent <= room)
+        spent = torch.where(under_reconstructed, cost, 0)[order].cumsum(0)
+        chosen = torch.zeros_like(under_reconstructed)
+        chosen[order] = under_reconstructed[order] & (spent <= room)
         return chosen
 
     def state_dict(self) -> dict[str, Any]:

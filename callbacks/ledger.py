@@ -75,7 +75,7 @@ class CostLedger(L.Callback):
         self._stop()
 
     def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Validation is shown, not billed."""
+        """Validation does not count as training time."""
         self._stop()
         module.train_seconds = self.seconds
 
@@ -105,7 +105,7 @@ class CostLedger(L.Callback):
             writer.writerow(row)
 
     def state_dict(self) -> dict[str, Any]:
-        """The bill so far, so that a resumed run keeps counting."""
+        """The time so far, so that a resumed run keeps counting."""
         return {"seconds": self.elapsed()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

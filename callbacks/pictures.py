@@ -1,4 +1,4 @@
-"""Predicted against true spectra of validation rows, drawn now and then while the field learns."""
+"""Predicted against true spectra of validation rows, drawn every few steps of training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One line of progress over all steps: what is left, how good it is, how large the field is."""
+"""A progress bar over optimiser steps: time left, loss and metrics, number of Gaussians."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class StepProgress(L.Callback):
         self._bar.add_task(stage, total=total, completed=done, figures="")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
-        """Advance; figures are read now and then, not at every step."""
+        """Advance; metrics are read every 20 steps: reading waits for the device."""
         if self._bar is None:
             return
         task = self._bar.task_ids[0]
@@ -51,7 +51,7 @@ class StepProgress(L.Callback):
         self._close()
 
     def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
-        """Give the terminal back."""
+        """Remove the bar."""
         self._close()
 
     def _close(self) -> None:

@@ -37,7 +37,7 @@ class Site:
         convergence_error: NMSE between two solver seeds for simulated data; else None.
         static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown.
         rx_rotation: (3, 3) float64, how the first row's receiver is turned; None when unknown.
-        uplink_array: (U, 3) float64 [m] antennas that hear a snapshot's uplink; None where there is none.
+        uplink_array: (U, 3) float64 [m] antennas that receive a snapshot's uplink; None where there is none.
         uplink_hz: (L,) absolute frequencies of the uplink [Hz].
         antennas: (A,) rows of `uplink_array` that the target's antennas are.
     """
@@ -66,6 +66,10 @@ class Site:
     def moving_end(self) -> Literal["rx", "tx"]:
         """The end whose position is the query."""
         return "tx" if self.static_end == "rx" else "rx"
+
+    def moving(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Positions (B, 3) [m] of the moving end: tx (B, 3) [m], or of one or B receiver poses."""
+        return tx if self.moving_end == "tx" else rx.position.reshape(-1, 3)
 
     @property
     def wavelength(self) -> float | None:
@@ -112,7 +116,7 @@ class Batch:
         target: (B, H, W) float32, or (B, antennas, subcarriers) complex64, or (B, 1) float32.
         mask: like target, bool, True where measured; None when everything was.
         noise_variance: (B,) float32 in target units; None when unknown.
-        uplink: (B, U, L) complex64 heard at the same moment, in target units; None where there is none.
+        uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
     """
 
     index: Tensor
@@ -122,11 +126,6 @@ class Batch:
     mask: Tensor | None = None
     noise_variance: Tensor | None = None
     uplink: Tensor | None = None
-
-    @property
-    def shared_pose(self) -> bool:
-        """Whether all samples see the field from the same pose (one plan serves them all)."""
-        return not self.rx.batched
 
     def __len__(self) -> int:
         return self.index.shape[0]
@@ -153,10 +152,10 @@ class Measurements:
         mask: bool like target, or None.
         noise_variance: (S,) float32, or None.
         directions: list of (paths, 3) unit vectors per sample, receiver frame, or None.
-        row_names: what a user calls each row (file name, CSV line), for messages.
+        row_names: name of each row for messages (file name, CSV line).
         release_split: (train, test) int64 rows that the data themselves name, or None.
         provenance: where the data came from, as their makers wrote it down.
-        uplink: (S, U, L) complex64 heard at the same moment as the target, in its units, or None.
+        uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or None.
     """
 
     site: Site

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,15 @@ from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline, mean_s
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods.method import Method
-from gsparc.methods.timing import COPY, ClockSettings, interleaved, machine_facts, peak_memory, reference_copy
+from gsparc.methods.timing import (
+    COPY,
+    ClockSettings,
+    cycling,
+    interleaved,
+    machine_facts,
+    peak_memory,
+    reference_copy,
+)
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
@@ -123,11 +131,11 @@ def latencies(
     A method that marches rays for seconds a query has no batch figure: it would be timed for many minutes.
     """
     clock = clock or ClockSettings()
-    singles = _calls(methods, _queries(data, rows, 1))
+    singles = cycling(methods, _queries(data, rows, 1))
     one = interleaved({**singles, COPY: reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
-    many = interleaved(_calls(quick, _queries(data, rows, BATCH)), fewer)
+    many = interleaved(cycling(quick, _queries(data, rows, BATCH)), fewer)
     copy_ms = float(np.median(one[COPY]))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {
@@ -175,13 +183,6 @@ def _queries(data: Measurements, rows: np.ndarray, size: int) -> list[Batch]:
     picks = [np.take(rows, np.arange(turn, turn + size), mode="wrap") for turn in range(min(len(rows), 64))]
     where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
     return [where.batch(pick) for pick in picks]
-
-
-def _calls(methods: Mapping[str, Method], queries: Sequence[Batch]) -> dict[str, Callable[[int], object]]:
-    def call(method: Method) -> Callable[[int], object]:
-        return lambda turn: method.answer(queries[turn % len(queries)])
-
-    return {name: call(method) for name, method in methods.items()}
 
 
 def _skill(scores: Scores, others: Mapping[str, Fitted]) -> float | None:

@@ -1,4 +1,4 @@
-"""How sure the field is of a position: C = 1 + exp(g(x)) (paper, eq. 7; DUSt3R's form)."""
+"""Confidence of a prediction by position: C = 1 + exp(g(x)) (paper, eq. 7; DUSt3R's form)."""
 
 from __future__ import annotations
 
@@ -67,10 +67,6 @@ class Confidence(nn.Module):
         """Confidence in [0, 1] (B,): C between the least and the largest C of the calibration data."""
         low, high, g = self.low.exp(), self.high.exp(), self.exponent(position).exp()
         return ((g - low) / (high - low)).clamp(0, 1)
-
-    def error_level(self, position: Tensor) -> Tensor:
-        """The task loss this confidence expects, alpha / C (B,)."""
-        return self.settings.alpha / (1 + self.exponent(position).exp())
 
 
 def weighted(loss: Tensor, exponent: Tensor, alpha: float) -> Tensor:

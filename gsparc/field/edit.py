@@ -1,4 +1,4 @@
-"""The one place that adds and removes Gaussians: parameters, Adam moments, statistics and ids together."""
+"""The one place that adds and removes Gaussians: parameters, Adam moments and ids together."""
 
 from __future__ import annotations
 
@@ -44,22 +44,16 @@ def apply(
     root: nn.Module,
     gaussians: GaussianField,
     optimizer: Optimizer | None = None,
-    statistics: Mapping[str, Tensor] | None = None,
-) -> dict[str, Tensor]:
+) -> None:
     """Edit all per-Gaussian state at once.
 
-    Appended rows start with zero Adam moments and zero statistics and get fresh ids; kept rows stay
-    bit-identical in everything.
+    Appended rows start with zero Adam moments and get fresh ids; kept rows stay bit-identical.
 
     Args:
         edit: what to keep and what to append.
         root: module that holds the field and every other per-Gaussian parameter.
         gaussians: the field inside `root`.
         optimizer: one parameter tensor per group.
-        statistics: (N, ...) tensors kept per Gaussian.
-
-    Returns:
-        The edited statistics.
     """
     rows = row_parameters(root, len(gaussians))
     groups = {} if optimizer is None else {id(g["params"][0]): g for g in optimizer.param_groups}
@@ -81,10 +75,6 @@ def apply(
     gaussians.ids = torch.cat([gaussians.ids[edit.keep], fresh])
     gaussians.next_id += len(edit.parents)
     gaussians.version += 1
-    return {
-        key: torch.cat([value[edit.keep], value.new_zeros(len(edit.parents), *value.shape[1:])])
-        for key, value in (statistics or {}).items()
-    }
 
 
 def resize(root: nn.Module, gaussians: GaussianField, count: int) -> None:

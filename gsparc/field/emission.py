@@ -1,4 +1,4 @@
-"""What each Gaussian sends towards the receiver: one small network per Gaussian, evaluated together."""
+"""Emission of each Gaussian towards the receiver: one small network per Gaussian, evaluated together."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Emission(nn.Module):
         encoding: encoder shared by all Gaussians.
     """
 
-    per_gaussian = True  # every weight has one row per Gaussian; surgery edits them together
+    per_gaussian = True  # every weight has one row per Gaussian; edits keep them together
 
     def __init__(
         self, settings: EmissionSettings, count: int, channels: int, encoding: PositionEncoding

@@ -1,4 +1,4 @@
-"""The view of a static receiver, frozen: emissions in, spectra out, nothing projected or sorted again."""
+"""Spectra at a static receiver from emissions alone: projection and depth order are computed once."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan
 
-AT_ONCE = 128  # single Gaussians whose views are in memory on the way to a small matrix
+BLOCK = 128  # Gaussians whose images are in memory at once
 
 
 @dataclass(frozen=True)
@@ -23,13 +23,13 @@ class FrozenView:
     Attributes:
         version: the field's counter at the time.
         plan: pixels by Gaussians.
-        seen: the model with those Gaussians alone that the receiver sees, in the plan's order: nobody else
-            needs to emit.
+        visible: the model reduced to the Gaussians that the receiver sees, in the plan's order: only their
+            emissions are computed.
     """
 
     version: int
     plan: FrozenPlan
-    seen: GaussianModel
+    visible: GaussianModel
 
     @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
@@ -38,13 +38,13 @@ class FrozenView:
         Raises:
             StalePlan: the field has changed since.
         """
-        _still(self.version, model)
-        return self.plan.compose(self.seen.features(tx, rx)).squeeze(1)
+        _check_version(self.version, model)
+        return self.plan.compose(self.visible.features(tx, rx)).squeeze(1)
 
 
 @dataclass(frozen=True)
 class FrozenArray:
-    """The same through an array: A times the view, and times the read-out where emissions are linear.
+    """The same through an array: A times the view, and times the emission weights where those are linear.
 
     Attributes:
         version: the field's counter at the time.
@@ -59,12 +59,12 @@ class FrozenArray:
     @torch.no_grad()
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
         """See `FrozenView.render`."""
-        _still(self.version, model)
+        _check_version(self.version, model)
         assert isinstance(model.response, ArrayResponse)
         if self.offset is None:
             emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
             return model.response.spectra(emitted @ self.matrix)
-        encoded = model.emission.encoding(model.moving(tx, rx))
+        encoded = model.emission.encoding(model.site.moving(tx, rx))
         return model.response.spectra(torch.addmm(self.offset, encoded.to(self.matrix.dtype), self.matrix))
 
 
@@ -74,7 +74,7 @@ def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
     version = int(model.gaussians.version)
     if not isinstance(model.response, ArrayResponse):
         plan = model.freeze(rx)
-        return FrozenView(version, plan, _only(plan.order, model))
+        return FrozenView(version, plan, _subset(plan.order, model))
     matrix, emission = seen_by_array(model, rx), model.emission
     if emission.settings.hidden or model.settings.attenuation.inverse_distance:
         return FrozenArray(version, matrix, None)
@@ -82,27 +82,27 @@ def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
     return FrozenArray(version, weight.T @ matrix, bias @ matrix)
 
 
-def _still(version: int, model: GaussianModel) -> None:
+def _check_version(version: int, model: GaussianModel) -> None:
     now = int(model.gaussians.version)
     if now != version:
         raise StalePlan(f"this view was frozen at version {version}, the field is at {now}: freeze again")
 
 
-def _only(rows: Tensor, model: GaussianModel) -> GaussianModel:
+def _subset(rows: Tensor, model: GaussianModel) -> GaussianModel:
     """A copy with these Gaussians alone, in this order."""
     copy = deepcopy(model)
-    nobody = torch.zeros(len(model.gaussians), dtype=torch.bool, device=rows.device)
-    edit.apply(edit.Edit(nobody, rows), copy, copy.gaussians)
+    none = torch.zeros(len(model.gaussians), dtype=torch.bool, device=rows.device)
+    edit.apply(edit.Edit(none, rows), copy, copy.gaussians)
     return copy
 
 
 @torch.no_grad()
 def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
-    """A times the frozen view (N, M) complex64: what each Gaussian's unit emission does to the elements."""
+    """A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission."""
     plan, version, response = model.freeze(rx), int(model.gaussians.version), model.response
     assert isinstance(response, ArrayResponse)
     parts = []
-    for units in torch.eye(len(model.gaussians)).split(AT_ONCE, 1):
+    for units in torch.eye(len(model.gaussians)).split(BLOCK, 1):
         seen = plan.render(units, version)
         parts.append(response.measured(torch.stack([seen, torch.zeros_like(seen)], 1)))
     return torch.cat(parts)

@@ -70,6 +70,10 @@ class GaussianField(nn.Module):
     def __len__(self) -> int:
         return len(self.means)
 
+    def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Means, quaternions, scales and opacities, as the rasterizer takes them."""
+        return self.means, self.quats, self.scales, self.opacities
+
     @property
     def scales(self) -> Tensor:
         """Standard deviations (N, 3) [m]."""

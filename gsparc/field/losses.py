@@ -15,9 +15,9 @@ from gsparc.ops.similarity import served, similarity_op
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
 Snapshot = Literal["none", "phase", "phase_timing"]
-"""What every snapshot has of its own: nothing, a phase, or a phase and a delay."""
+"""Unknown offset of each snapshot: none, a phase, or a phase and a delay."""
 
-DELAYS_PER_TONE = 8  # the delay is sought on a comb this fine, then held while the loss is differentiated
+DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in the gradient
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
 
 
@@ -146,11 +146,11 @@ def channel_loss(
     Args:
         prediction, target: alike; (B, A, K) complex where snapshots have offsets.
         mask: like target, True where measured.
-        snapshot: `phase`: the least error over a phase of each sample's own; `phase_timing`: over a phase
+        snapshot: `phase`: the least error over one phase per sample; `phase_timing`: over a phase
             and a delay, `exp(j (phi - 2 pi f tau))`, tones evenly spaced. Both leave the amplitude as it is.
 
     Raises:
-        ValueError: shapes differ; broadcasting would hide an antenna that is not modelled.
+        ValueError: shapes differ; broadcasting would hide a missing antenna.
     """
     if prediction.shape != target.shape:
         raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")

@@ -170,15 +170,11 @@ class GaussianModel(nn.Module):
         """Real outputs of each emission network: one power, or one complex gain."""
         return 2 if self.site.kind == "csi" or self.settings.response.array else 1
 
-    def moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Position of the moving end (B, 3) [m]."""
-        return tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3)
-
     @torch.autocast("cpu", enabled=False)  # a kernel expansion cancels: half precision costs 8 dB
     def features(self, tx: Tensor, rx: Pose) -> Tensor:
         """Attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
         distance = self.distances(tx)
-        emitted = self.emission(self.moving(tx, rx), distance)
+        emitted = self.emission(self.site.moving(tx, rx), distance)
         attenuation = self.attenuation(distance)
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
 
@@ -201,22 +197,22 @@ class GaussianModel(nn.Module):
             return Rendered(self.response(gains, self.gaussians.means, rx), None)
         plan = self.plan(rx)
         if self.site.kind == "spectrum":
-            raster = composite(plan, *self._geometry(), features)
-            seen = raster.image
-            return Rendered(self.response(seen) if self.response else seen.squeeze(1), raster)
-        weights = mean_weights(plan, *self._geometry()).share
+            raster = composite(plan, *self.gaussians.geometry(), features)
+            image = raster.image
+            return Rendered(self.response(image) if self.response else image.squeeze(1), raster)
+        weights = mean_weights(plan, *self.gaussians.geometry()).share
         if self.response is None:
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
         return Rendered(self.response(weights * gains), None)
 
     def plan(self, rx: Pose) -> Plan:
-        """Who is seen where from one pose, or from each of B."""
+        """Footprints and depth order from one pose, or from each of B."""
         settings = self.settings.raster
         image = self.site.kind == "spectrum"
         cutoff = Cutoff(settings.alpha_cutoff if image else settings.relative_cutoff, relative=not image)
         return make_plan(
-            *self._geometry(),
+            *self.gaussians.geometry(),
             rx,
             self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS),
             projection=settings.projection,
@@ -230,8 +226,4 @@ class GaussianModel(nn.Module):
     def freeze(self, rx: Pose) -> FrozenPlan:
         """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
         with torch.no_grad():
-            return freeze(self.plan(rx), *self._geometry(), version=int(self.gaussians.version))
-
-    def _geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        g = self.gaussians
-        return g.means, g.quats, g.scales, g.opacities
+            return freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))

@@ -31,7 +31,7 @@ class ResponseSettings:
             elements measure `h = A z`, and the spectrum is `|A^H h|`, normalised as the dataset says.
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
         carrier: channels take phase, delay and 1/r from the path between Gaussian and receiver. Gaussians
-            are then sources that hide nobody; who sees which is their emission's business.
+            then do not occlude; visibility is part of the emission.
     """
 
     array: bool = False
@@ -43,12 +43,12 @@ class ChannelResponse(nn.Module):
     """Factored channels: each Gaussian has a steering vector over antennas and a delay over subcarriers.
 
     `H = A diag(w g) F^T`: 2 A + 1 numbers per Gaussian however many channels there are, and one pass for all
-    of them. Steering starts at one, delays where the paths' lengths put them.
+    of them. Steering starts at one, delays at the initial path lengths.
 
     Args:
         antennas, subcarriers: A and K.
         tones_hz: (K,) frequencies; None when unknown, then an even comb is assumed.
-        lengths: (N,) [m], of the paths at the start.
+        lengths: (N,) [m], initial path lengths.
     """
 
     per_gaussian = True
@@ -105,8 +105,10 @@ class PathResponse(nn.Module):
         array = torch.as_tensor(site.array).double() if known else torch.zeros(1, 3, dtype=torch.float64)
         self.register_buffer("array", array, persistent=False)
         self.register_buffer("tones", torch.from_numpy(site.tones()), persistent=False)
-        own = 1 if known else antennas
-        self.steering = nn.Parameter(torch.tensor([1.0, 0.0]).repeat(count, own, 1), requires_grad=own > 1)
+        learned = 1 if known else antennas
+        self.steering = nn.Parameter(
+            torch.tensor([1.0, 0.0]).repeat(count, learned, 1), requires_grad=learned > 1
+        )
         self.carrier_hz = float(site.carrier_hz or self.tones.mean())
 
     def waves(self, means: Tensor, rx: Pose) -> Tensor:
@@ -125,9 +127,9 @@ class PathResponse(nn.Module):
         return torch.einsum("bn,na,bnk->bak", gains, torch.view_as_complex(self.steering), waves[:, 0])
 
     def contributions(self, gains: Tensor, means: Tensor, rx: Pose) -> Tensor:
-        """Share (N,) of each Gaussian in the sum of all their powers at B receivers."""
-        loud = torch.view_as_complex(self.steering).abs().square().mean(1)
-        power = (gains.abs().square() * self.waves(means, rx).abs().square().mean((1, 3))).sum(0) * loud
+        """Share (N,) of each Gaussian in the total power at B receivers."""
+        gain = torch.view_as_complex(self.steering).abs().square().mean(1)
+        power = (gains.abs().square() * self.waves(means, rx).abs().square().mean((1, 3))).sum(0) * gain
         return power / power.sum().clamp_min(1e-30)
 
 
@@ -165,7 +167,7 @@ class ArrayResponse(nn.Module):
 
     def spectra(self, vectors: Tensor) -> Tensor:
         """Published spectra (B, H, W) of array vectors (B, M)."""
-        known = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # nothing else is added
+        known = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # no incoherent background
         if self.normalisation != "none":  # scaled first: the slope is cut off below a fixed amplitude
             known = known / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
         image = self.renderer(known).flatten(1)

@@ -48,8 +48,7 @@ class Interpolator(Method):
     def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
         """Places (B, 3) float64 [m] of the moving end."""
         assert self.site is not None
-        moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
-        return moving.cpu().double()
+        return self.site.moving(tx, rx).expand(len(tx), 3).cpu().double()
 
     def state(self) -> dict[str, Any]:
         """Target shape, number of rows, and what the subclass learned."""

@@ -5,22 +5,22 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from gsparc.data.schema import Site
 from gsparc.methods.checkpoint import Stored
-from gsparc.methods.interleaved_timing import Pace, in_turns
 from gsparc.methods.method import Method
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import reduced
 from gsparc.methods.stored_front import Operating, kept
+from gsparc.methods.timing import BLOCKS, Call, interleaved
 
 log = logging.getLogger(__name__)
 
-PACE = Pace(rounds=12, least=5, calls=4, budget_s=3.0)
+CLOCK = replace(BLOCKS, rounds=12, budget_s=3.0)
 QUANTILE = 0.75  # a point fits when three of four of its queries did: its median then does so again
 QUERIES = 16
 
@@ -47,7 +47,7 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
     ways = [reduced(method, point.settings, measured) for point in points]
     calls = {i: _ask(way, stored.site) for i, way in enumerate(ways)}
-    times = in_turns(calls, {i: point.threads for i, point in enumerate(points)}, PACE)
+    times = interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
     here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
     fitting = [i for i in here if here[i] <= budget_ms]
     if not fitting:
@@ -62,9 +62,8 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     return ways[best], points[best]
 
 
-def _ask(method: Method, site: Site) -> Callable[[int], object]:
+def _ask(method: Method, site: Site) -> Call:
     """Queries at places drawn in the scene's box."""
     draw = np.random.default_rng(0)
     places = draw.uniform(site.box[0], site.box[1], (QUERIES, 3)) + site.origin
-    ask = getattr(Predictor(method, site), site.kind)
-    return lambda number: ask(**{site.moving_end: places[number % QUERIES]})
+    return Predictor(method, site).cycling(places)

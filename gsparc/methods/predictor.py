@@ -14,6 +14,7 @@ from gsparc.data.schema import Kind, Site
 from gsparc.methods import checkpoint
 from gsparc.methods.confidence import Trusted, kept
 from gsparc.methods.method import Method, Prediction
+from gsparc.methods.timing import Call
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
@@ -59,6 +60,11 @@ class Predictor:
             f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
             f"the {self.site.moving_end} moves, scene from {low} to {high} m)"
         )
+
+    def cycling(self, places: np.ndarray) -> Call:
+        """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time."""
+        ask = getattr(self, self.site.kind)
+        return lambda number: ask(**{self.site.moving_end: places[number % len(places)]})
 
     def spectrum(self, tx: Any = None, rx: Any = None) -> Any:
         """Power by direction at the receiver, (B, H, W) float32 in [0, 1]; `rx` may be a world `Pose`.
@@ -157,8 +163,7 @@ class Predictor:
             asked, pose, single, like = self._ends(tx, rx)
             with torch.no_grad():
                 said = self._whole.predict(asked, pose)
-            moved = asked if self.site.moving_end == "tx" else pose.position.reshape(-1, 3)
-            places = moved.double().numpy()
+            places = self.site.moving(asked, pose).double().numpy()
         if said.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             raise ValueError(f"{self.method.name} has no confidence")
         return torch.from_numpy(self.trusted.confidence(said, places, self.kind)), single, like

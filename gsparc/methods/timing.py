@@ -7,12 +7,19 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
+
+from gsparc.data.schema import Batch
+from gsparc.methods.method import Method
+
+Key = TypeVar("Key")
+Call = Callable[[int], object]
 
 COPY = "copy"
 COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second everywhere
@@ -23,45 +30,87 @@ class ClockSettings:
     """How long to measure.
 
     Attributes:
-        rounds: largest number of rounds.
+        rounds: largest number of rounds, each visiting every contender once.
         least: rounds that are run even when they exceed the budget.
         warmup: calls of each contender before the clock starts.
         budget_s: no new round starts after this many seconds [s].
+        calls: timed calls of a visit.
+        untimed: calls at the start of each visit, which bring the contender's data back into the caches.
     """
 
     rounds: int = 60
     least: int = 5
     warmup: int = 3
     budget_s: float = 5.0
+    calls: int = 1
+    untimed: int = 0
+
+
+# Where contenders differ in threads: a new team of threads slows the first call of every visit.
+BLOCKS = ClockSettings(rounds=40, warmup=0, budget_s=60.0, calls=4, untimed=1)
 
 
 def interleaved(
-    contenders: Mapping[str, Callable[[int], object]], settings: ClockSettings | None = None
-) -> dict[str, np.ndarray]:
-    """Wall times (rounds,) [ms] of each contender, one call of each per round.
+    contenders: Mapping[Key, Call],
+    settings: ClockSettings | None = None,
+    threads: Mapping[Key, int] | None = None,
+) -> dict[Key, np.ndarray]:
+    """Wall times (rounds * calls,) [ms] of each contender.
 
-    Rounds alternate so that a competing process hits all of them alike; each call is given the round's number
-    (to take another query each time) and the device is synchronised before the clock is read.
+    Rounds alternate so that a competing process hits all of them alike; each timed call is given another
+    number (to take another query each time) and the device is synchronised before the clock is read.
+
+    Args:
+        contenders: what to call.
+        settings: how long to measure.
+        threads: CPU threads of each, in whose order a round visits them; None leaves them as they are.
     """
     settings = settings or ClockSettings()
+    before = torch.get_num_threads()
+    threads = threads or dict.fromkeys(contenders, before)
+    order = sorted(contenders, key=threads.__getitem__)
     for call in contenders.values():
         for warm in range(settings.warmup):
             call(warm)
-    times: dict[str, list[float]] = {name: [] for name in contenders}
+    times: dict[Key, list[float]] = {name: [] for name in contenders}
     begin = time.perf_counter()
-    for turn in range(settings.rounds):
-        if turn >= settings.least and time.perf_counter() - begin > settings.budget_s:
-            break
-        for name, call in contenders.items():
-            synchronise()
-            start = time.perf_counter()
-            call(turn)
-            synchronise()
-            times[name].append((time.perf_counter() - start) * 1e3)
+    try:
+        for turn in range(settings.rounds):
+            if turn >= settings.least and time.perf_counter() - begin > settings.budget_s:
+                break
+            for name in order:
+                if torch.get_num_threads() != threads[name]:
+                    torch.set_num_threads(threads[name])
+                times[name] += _visit(contenders[name], turn, settings)
+    finally:
+        torch.set_num_threads(before)
     return {name: np.array(values) for name, values in times.items()}
 
 
-def reference_copy() -> Callable[[int], object]:
+def _visit(call: Call, turn: int, settings: ClockSettings) -> list[float]:
+    """Wall times [ms] of a contender's calls in one round."""
+    for _ in range(settings.untimed):
+        call(turn)
+    times = []
+    for number in range(turn * settings.calls, (turn + 1) * settings.calls):
+        synchronise()
+        start = time.perf_counter()
+        call(number)
+        synchronise()
+        times.append((time.perf_counter() - start) * 1e3)
+    return times
+
+
+def cycling(methods: Mapping[Key, Method], queries: Sequence[Batch]) -> dict[Key, Call]:
+    """Calls that answer one of `queries` each, another one every time."""
+
+    def call(method: Method) -> Call:
+        return lambda turn: method.answer(queries[turn % len(queries)])
+
+    return {name: call(method) for name, method in methods.items()}
+
+
+def reference_copy() -> Call:
     """A fixed piece of work, a 16 MiB copy, against which times of different machines can be read."""
     source = torch.ones(COPY_BYTES // 4)
     target = torch.empty_like(source)

@@ -1,4 +1,4 @@
-"""Where the Gaussians of a peer start, and how they are seen."""
+"""Initial Gaussians of a peer, and the grid and cut-offs they are rendered with."""
 
 from __future__ import annotations
 
@@ -30,22 +30,17 @@ def gaussians_of(scene: Scene, count: int) -> GaussianField:
     )
 
 
-class Screen:
-    """The grid a scene is seen on, and the thresholds that go with it.
+class RenderSettings:
+    """Grid and cut-off a scene is rendered with.
 
     Args:
-        scene: spectra bring their grid; channels are seen on the full sphere, with relative cut-offs.
+        scene: spectra bring their grid; channels are rendered on the full sphere, with relative cut-offs.
     """
 
     def __init__(self, scene: Scene) -> None:
         image = scene.site.kind == "spectrum"
         self.grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
-        self.optics: dict[str, Any] = {} if image else {"cutoff": Cutoff(1e-3, relative=True)}
-
-    @staticmethod
-    def geometry(field: GaussianField) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Means, quaternions, scales and opacities, as the rasterizer takes them."""
-        return field.means, field.quats, field.scales, field.opacities
+        self.options: dict[str, Any] = {} if image else {"cutoff": Cutoff(1e-3, relative=True)}
 
 
 def render_each(
@@ -53,21 +48,21 @@ def render_each(
     features: Tensor,
     pose: Pose,
     grid: SphereGrid,
-    **optics: Any,
+    **options: Any,
 ) -> Tensor:
-    """Samples that each have Gaussians of their own, one plan each.
+    """Images of samples with different Gaussians each, one plan per sample.
 
     Args:
         geometry: means (B, N, 3), quaternions (B, N, 4), scales (B, N, 3), opacities (B, N).
         features: (B, N, C).
         pose: one shared or B.
-        grid, **optics: see `gsparc.ops.rasterize`.
+        grid, **options: see `gsparc.ops.rasterize`.
 
     Returns:
         (B, C, H, W).
     """
     images = [
-        rasterize(*one, feature, pose[i] if pose.batched else pose, grid, **optics).image[0]  # type: ignore
+        rasterize(*one, feature, pose[i] if pose.batched else pose, grid, **options).image[0]  # type: ignore
         for i, (*one, feature) in enumerate(zip(*geometry, features, strict=True))
     ]
     return torch.stack(images)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
 from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
-from gsparc.peers.gaussians import Screen, gaussians_of
+from gsparc.peers.gaussians import RenderSettings, gaussians_of
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.radiance import fourier_legendre, terms
 from gsparc.peers.trained import TrainedPeer
@@ -71,7 +71,7 @@ class ComplexGaussians(Network):
         self.scene, self.degree, self.order = scene, degree, order
         self.fourier_weight = fourier_weight
         self.field = gaussians_of(scene, count)
-        self.screen = Screen(scene)
+        self.rendering = RenderSettings(scene)
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(degree, order), 2))
         with torch.no_grad():
             self.coefficients[:, 0, 0] += 0.3
@@ -84,7 +84,7 @@ class ComplexGaussians(Network):
 
     def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
         """What each Gaussian sends (B, N, 2), by the direction in which it sees the moving end."""
-        towards = self.scene.moving(tx, rx)[:, None] - self.field.means
+        towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
         series = fourier_legendre(towards / distance, self.degree, self.order)
         sent = torch.einsum("bnk,nkc->bnc", series, self.coefficients)
@@ -97,8 +97,8 @@ class ComplexGaussians(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W) or channels (B, A, K)."""
-        sent, geometry = self.radiance(tx, rx), self.screen.geometry(self.field)
-        plan = make_plan(*geometry, rx, self.screen.grid, **self.screen.optics)
+        sent, geometry = self.radiance(tx, rx), self.field.geometry()
+        plan = make_plan(*geometry, rx, self.rendering.grid, **self.rendering.options)
         if self.response is not None:
             seen = mean_weights(plan, *geometry).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
@@ -125,8 +125,8 @@ class ComplexGaussians(Network):
         if self.response is not None or rx.batched or self.training:
             return self(tx, rx)
         if self._frozen is None:
-            geometry = self.screen.geometry(self.field)
-            plan = make_plan(*geometry, rx, self.screen.grid, **self.screen.optics)
+            geometry = self.field.geometry()
+            plan = make_plan(*geometry, rx, self.rendering.grid, **self.rendering.options)
             self._frozen = freeze(plan, *geometry, version=0)
         return _magnitude(self._frozen.render(self.radiance(tx, rx), 0))
 

@@ -105,7 +105,7 @@ class MarchedField(Network):
         pixel = torch.randint(len(self.directions), (self.rays,), generator=draw)
         origin, heading = self._rays(batch.rx, sample, pixel)
         jitter = torch.rand(self.rays, self.samples, generator=draw)
-        seen = self.march(origin, heading, self.scene.moving(batch.tx, batch.rx)[sample], jitter)
+        seen = self.march(origin, heading, self.scene.site.moving(batch.tx, batch.rx)[sample], jitter)
         error = (seen - batch.target.flatten(1)[sample, pixel]).square()
         if batch.mask is not None:
             error = error * batch.mask.flatten(1)[sample, pixel]
@@ -113,7 +113,7 @@ class MarchedField(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W), every ray of them."""
-        moving, pixels = self.scene.moving(tx, rx), torch.arange(len(self.directions))
+        moving, pixels = self.scene.site.moving(tx, rx), torch.arange(len(self.directions))
         images = []
         for sample in range(len(tx)):
             parts = []

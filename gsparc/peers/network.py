@@ -41,10 +41,6 @@ class Scene:
         apart = 0.0 if still is None else float((still - middle).norm())
         return max(apart + float((high - low).norm()) / 2, 1.0)
 
-    def moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Position of the moving end (B, 3) [m]."""
-        return tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3)
-
 
 class Network(nn.Module):
     """Positions in, targets out: called with tx (B, 3) [m] and one shared or B receiver poses."""

@@ -102,7 +102,7 @@ class Radiators(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Channels (B, A, K) or spectra (B, H, W)."""
-        moving = self.scene.moving(tx, rx)
+        moving = self.scene.site.moving(tx, rx)
         offset = moving[:, None] - self.means
         distance = (offset.square().sum(-1) + (2 * self.log_extents).exp()).sqrt()
         strength = torch.view_as_complex(self.gains) / distance

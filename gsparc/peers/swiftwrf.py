@@ -95,7 +95,7 @@ class PlanarGaussians(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W)."""
-        changes = self.deformation(self.base, self.scene.moving(tx, rx))
+        changes = self.deformation(self.base, self.scene.site.moving(tx, rx))
         move, stretch, turn, light = changes.split(CHANGES, -1)
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)

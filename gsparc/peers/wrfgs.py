@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.ops import Pose
 from gsparc.peers.deformation import Deformation
-from gsparc.peers.gaussians import Screen, gaussians_of, render_each
+from gsparc.peers.gaussians import RenderSettings, gaussians_of, render_each
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.trained import TrainedPeer
 
@@ -67,7 +67,7 @@ class DeformedGaussians(Network):
 
     def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
         super().__init__()
-        self.scene, self.screen = scene, Screen(scene)
+        self.scene, self.rendering = scene, RenderSettings(scene)
         self.field = gaussians_of(scene, count)
         self.signals = nn.Parameter(torch.zeros(count))
         low, high = self.field.means.detach().amin(0), self.field.means.detach().amax(0)
@@ -77,7 +77,7 @@ class DeformedGaussians(Network):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W)."""
         field = self.field
-        changes = self.deformation(field.means, self.scene.moving(tx, rx))
+        changes = self.deformation(field.means, self.scene.site.moving(tx, rx))
         place, turn, stretch, fade, light = changes.split(CHANGES, -1)
         geometry = (
             field.means + SHIFT * place,
@@ -86,4 +86,4 @@ class DeformedGaussians(Network):
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
         )
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
-        return render_each(geometry, signal, rx, self.screen.grid, **self.screen.optics).squeeze(1)
+        return render_each(geometry, signal, rx, self.rendering.grid, **self.rendering.options).squeeze(1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
@@ -29,13 +28,7 @@ class Engine(Protocol):
     def able(self, effects: Effects) -> Effects:
         """These switches without what the engine cannot compute."""
 
-    def trace(
-        self,
-        receivers: np.ndarray,
-        effects: Effects,
-        seed: int | None = None,
-        progress: Callable[[int], None] = ...,
-    ) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
     def versions(self) -> dict[str, str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -41,13 +40,7 @@ class Mirrors:
             depth=effects.depth if effects.specular else 0,
         )
 
-    def trace(
-        self,
-        receivers: np.ndarray,
-        effects: Effects,
-        seed: int | None = None,
-        progress: Callable[[int], None] = lambda done: None,
-    ) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = images(self.room, effects.depth)
         seen = visible(self.room, mirrored, self.transmitter[None], receivers)
@@ -61,7 +54,6 @@ class Mirrors:
         kept = seen[rows, rank]
         gain = (mirrored.gain * self.wavelength / (4 * np.pi * distance))[rows, rank][kept]
         order = np.broadcast_to(mirrored.order, seen.shape)[rows, rank][kept].astype(np.uint8)
-        progress(len(receivers))
         return Paths(
             np.concatenate([[0], np.cumsum(seen.sum(1))]),
             gain[:, None].astype(np.complex64),

@@ -70,12 +70,6 @@ class Paths:
         mean = self.per_receiver(self.power * self.delay) / total
         return np.sqrt(self.per_receiver(self.power * (self.delay - mean[self.owner]) ** 2) / total)
 
-    def below_horizon(self) -> float:
-        """Share of all receivers' power that arrives from below the horizon, each receiver counting alike."""
-        below = self.per_receiver(self.power * (self.direction[:, 2] < 0))
-        heard = self.received_power()
-        return float((below / np.where(heard > 0, heard, 1))[heard > 0].mean()) if heard.any() else 0.0
-
     def responses(self, frequency_hz: np.ndarray, elements: np.ndarray, wavelength: float) -> np.ndarray:
         """Channels (R, ports x M, K) complex128: `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.
 

@@ -8,7 +8,7 @@ specular chains lost to one another (a hash table large enough for a batch), dup
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -77,7 +77,7 @@ class RayTracer:
         sampling: Sampling = Sampling(),
         scattering: float | None = None,
     ) -> None:
-        self.library = llvm.prepare()
+        llvm.prepare()
         self.sampling = sampling
         self.wavelength = LIGHT / carrier_hz
         self._scene = _load(source, carrier_hz, scattering)
@@ -108,20 +108,13 @@ class RayTracer:
             for name, m in self._scene.radio_materials.items()
         }
 
-    def trace(
-        self,
-        receivers: np.ndarray,
-        effects: Effects,
-        seed: int | None = None,
-        progress: Callable[[int], None] = lambda done: None,
-    ) -> Paths:
+    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths from the transmitter to receivers (R, 3) [m].
 
         Args:
             receivers: world coordinates.
             effects: what is computed.
             seed: of the rays instead of `sampling.seed`.
-            progress: called with the number of receivers finished.
 
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
@@ -131,7 +124,6 @@ class RayTracer:
             some = receivers[start : start + self.sampling.batch]
             parts.append(self._batch(some, effects, self.sampling.seed if seed is None else seed))
             start += len(some)
-            progress(start)
         return join(parts)
 
     def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:

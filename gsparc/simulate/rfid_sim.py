@@ -1,7 +1,7 @@
 """`rfid-sim`: a stand-in for the RFID release, in its layout, from image sources and a 4 x 4 array.
 
-Loudly not real data: it exists so that everything runs on a machine without the release, and as ground
-truth for tests. A tag is moved by hand about 5 m from a gateway in a room with reflecting walls; each
+Not real data: it exists so that everything runs on a machine without the release, and as ground truth for
+tests. A tag is moved by hand about 5 m from a gateway in a room with reflecting walls; each
 image is `|A^H h|` over the hemisphere divided by its maximum, in 8 bits.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
@@ -19,6 +18,7 @@ from gsparc.data.files import whole_folder
 from gsparc.data.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import steering
 from gsparc.simulate.shoebox import Room, trace
 
 GATEWAY = np.array([5.0, 0.26, 0.0])  # [m], as in the release
@@ -53,23 +53,6 @@ def hand_moved(count: int, seed: int) -> np.ndarray:
     return np.concatenate(pieces)[:count].round(3)  # the release has millimetres
 
 
-def steering(array: np.ndarray, grid: SphereGrid, wavelength: float) -> np.ndarray:
-    """Steering matrix A (M, H * W) complex64: `exp(+j k u.a_m)` for each element and direction.
-
-    Args:
-        array: (M, 3) [m], receiver frame.
-        grid: directions u.
-        wavelength: [m].
-    """
-    directions = grid.directions(torch.float64).numpy().reshape(-1, 3)
-    return np.exp(2j * np.pi / wavelength * array @ directions.T).astype(np.complex64)
-
-
-def bartlett(h: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-    """Beamformer output `|A^H h|` (..., H * W) of array vectors h (..., M) and steering matrix A."""
-    return np.abs(h.astype(np.complex64) @ matrix.conj())
-
-
 def simulate_rfid(positions: np.ndarray, seed: int = 0, max_order: int = MAX_ORDER) -> np.ndarray:
     """Array vectors (S, 16) complex of tags at `positions` (S, 3) [m], world."""
     rotation = Rotation.from_quat(ORIENTATION).as_matrix()
@@ -92,9 +75,10 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     vectors = simulate_rfid(positions, seed)
     with whole_folder(folder) as partial:
         (partial / "spectrum").mkdir()
-        matrix = steering(planar_array(), SphereGrid.hemisphere(HEIGHT, WIDTH), WAVELENGTH)
+        grid = SphereGrid.hemisphere(HEIGHT, WIDTH)
+        matrix = steering(planar_array(), grid, WAVELENGTH).numpy().astype(np.complex64)
         for i, vector in enumerate(vectors):
-            image = bartlett(vector, matrix).reshape(HEIGHT, WIDTH)
+            image = np.abs(vector.astype(np.complex64) @ matrix.conj()).reshape(HEIGHT, WIDTH)
             grey = np.round(255 * image / image.max()).astype(np.uint8)
             Image.fromarray(grey).save(partial / "spectrum" / f"{i + 1:05d}.png", compress_level=1)
         lines = ["x,y,z", *(",".join(f"{v:.4f}" for v in p) for p in positions)]

@@ -33,7 +33,6 @@ class Shards:
         self.folder = out.with_name(out.name + ".parts")
         self._gone = out.with_name(out.name + ".gone")
         self._sweep()
-        self.resumed = self.folder.exists()
         text = json.dumps(plan, sort_keys=True, indent=1, default=str)
         stored = self.folder / "plan.json"
         if stored.exists() and stored.read_text(encoding="utf-8") != text:

@@ -160,34 +160,6 @@ class Trace:
     visible: np.ndarray
     noise_variance: float
 
-    def as_arrays(self) -> dict[str, np.ndarray]:
-        """The schema of one's own measurements, ready for `write_own` or `from_arrays`.
-
-        With a static transmitter the truth is its images (`source_*`), with a static receiver the
-        images of the array's centre; `source_gain` is the amplitude at 1 m without the wavelength.
-        """
-        still = self.tx if (self.tx == self.tx[0]).all() else self.rx
-        arrays = {
-            "rx_position": _compact(self.rx),
-            "tx_position": _compact(self.tx),
-            "csi": self.csi,
-            "frequency_hz": self.frequency_hz,
-            "source_position": self.images.of(still[0]),
-            "source_gain": self.images.gain,
-            "source_order": self.images.order,
-            "source_visible": self.visible,
-        }
-        if len(self.array) > 1:
-            arrays["array_position"] = self.array
-        if self.noise_variance > 0:
-            arrays["noise_variance"] = np.array(self.noise_variance)
-        return arrays
-
-
-def _compact(position: np.ndarray) -> np.ndarray:
-    """(3,) when all rows are the same, else (S, 3)."""
-    return position[0] if (position == position[0]).all() else position
-
 
 def trace(
     room: Room,
@@ -239,14 +211,3 @@ def trace(
         rng = np.random.default_rng(seed)
         csi += np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))
     return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
-
-
-def scatter(room: Room, count: int, seed: int, margin: float = 0.2) -> np.ndarray:
-    """`count` positions (S, 3) [m] drawn uniformly in the room, `margin` [m] from walls, off occluders."""
-    rng = np.random.default_rng(seed)
-    low, high = np.asarray(room.lower) + margin, np.asarray(room.upper) - margin
-    points = np.empty((0, 3))
-    while len(points) < count:
-        drawn = rng.uniform(low, high, size=(2 * count, 3))
-        points = np.concatenate([points, drawn[room.contains(drawn)]])
-    return points[:count]

@@ -80,13 +80,6 @@ class Rays:
         turns = np.mod(self.delay[..., None] * frequency_hz, 1.0)
         return np.swapaxes(steering, 1, 2) @ (self.gain[..., None] * np.exp(-2j * np.pi * turns))
 
-    def delay_spread(self) -> np.ndarray:
-        """Root mean square delay spread (U,) [s]."""
-        power = np.abs(self.gain) ** 2
-        power /= power.sum(axis=1, keepdims=True)
-        mean = (power * self.delay).sum(axis=1, keepdims=True)
-        return np.sqrt((power * (self.delay - mean) ** 2).sum(axis=1))
-
 
 @dataclass(frozen=True)
 class _Route:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 import os
-import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -13,23 +12,11 @@ from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    InstantiationException,
-    MissingConfigException,
-    OverrideParseException,
-)
 from hydra.types import RunMode
 from omegaconf import DictConfig
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.methods.registry import suggest
-
-FULL_ERROR = "HYDRA_FULL_ERROR"
-CONFIGS = "pkg://gsparc.conf"
-WIDE = 120
+from gsparc.evaluation.console import CONFIGS, FULL_ERROR, one_line
 
 
 class _Failed(BaseException):
@@ -78,76 +65,6 @@ def _explained(task: Callable[[DictConfig], object], config: str) -> str:
     file = Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0]) / f"{config}.yaml"
     settings = file.read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()
     return f"{what}\n\n{settings}\n\n"
-
-
-def console() -> Console:
-    """Where commands print: sentences in one piece, tables as wide as the terminal, or `WIDE` in a log."""
-    to_people = Console(soft_wrap=True)
-    if to_people.is_terminal or "COLUMNS" in os.environ:
-        return to_people
-    return Console(soft_wrap=True, width=WIDE)  # a log has no width: 80 columns cut headings short
-
-
-def one_line(error: BaseException) -> str:
-    """What went wrong and what to do, on one line; a misspelt key or choice gets the nearest right name."""
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
-        group, _, choice = str(error.missing_cfg_file).partition("/")
-        return f"{group}={choice}: no such choice{suggest(choice, _choices(group) or list(error.options))}"
-    if isinstance(error, OverrideParseException):
-        return f"{error.override}: not understood; say KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
-    if isinstance(error, ConfigCompositionException) and isinstance(error.__cause__, OmegaConfBaseException):
-        return _override(error, error.__cause__)
-    if isinstance(error, MissingMandatoryValue):
-        key = str(error.full_key or str(error).rpartition(" ")[2])
-        return f"{key} is not set; say {key}=..."
-    if isinstance(error, InstantiationException) and error.__cause__ is not None:
-        return _argument(str(error)) or one_line(error.__cause__)
-    if isinstance(error, HydraException):
-        return " ".join(str(error).split())
-    if isinstance(error, OmegaConfBaseException) and error.full_key:
-        return f"{error.full_key}: {_first(error)}"
-    if isinstance(error, OSError) and error.filename is not None and error.strerror:
-        return f"{error.filename}: {error.strerror}"
-    text = _first(error)
-    # People's errors are ValueErrors and their like; a bug's type says more than its text.
-    expected = isinstance(error, (ValueError, OSError, RuntimeError)) and text
-    return text if expected else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
-
-
-def _choices(group: str) -> list[str]:
-    """Every choice of a config group, those in its folders as `folder/choice`."""
-    folder = Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0]) / group
-    return sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
-
-
-def _argument(text: str) -> str | None:
-    """The line for a setting that a class does not take (said with a +); None for other errors."""
-    named = re.search(r"target '(gsparc\.[\w.]+)'[\s\S]*unexpected keyword argument '(\w+)'", text)
-    if named is None:
-        return None
-    where = re.search(r"full_key: (\S+)", text)
-    module, _, name = named[1].rpartition(".")
-    known = list(inspect.signature(getattr(import_module(module), name)).parameters)
-    place = f"{where[1]}." if where else ""
-    return f"{place}{named[2]}: no such setting of {name}{suggest(named[2], known)}"
-
-
-def _override(error: Exception, cause: OmegaConfBaseException) -> str:
-    named = re.search(r"override '([^']+)'", str(error))
-    full = str(cause.full_key or (named.group(1) if named else ""))
-    if not full or cause.parent_node is None or "not" not in str(cause):
-        return f"{_first(error)} {_first(cause)}"
-    known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
-    prefix, _, key = full.rpartition(".")
-    hint = suggest(key, known).replace(
-        "did you mean '", f"did you mean '{prefix}." if prefix else "did you mean '"
-    )
-    return f"{full}: no such setting{hint}"
-
-
-def _first(error: BaseException) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return lines[0] if lines else ""
 
 
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:

@@ -13,6 +13,7 @@ import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.report.page import studies, write
 from gsparc.evaluation.report.readme import refresh
 from gsparc.evaluation.report.runs import columns, find_runs
@@ -44,7 +45,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         }
         facts |= {f"{stem}/render_ms_p50": p50, f"{stem}/render_ms_p95": p95}
     write_summary(out / "summary.json", facts)
-    console = cli.console()
+    console = open_console()
     if config.readme:
         refresh(Path(config.readme), runs)
         console.print(f"table in {config.readme} written anew", highlight=False)
@@ -72,6 +73,11 @@ def arguments(given: Sequence[str]) -> list[str]:
     return rest
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Entry point."""
     sys.argv[1:] = arguments(sys.argv[1:])
     cli.run(task, "report")
+
+
+if __name__ == "__main__":
+    main()

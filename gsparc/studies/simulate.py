@@ -14,6 +14,7 @@ from hydra.utils import to_absolute_path
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.evaluation import summary
+from gsparc.evaluation.console import open_console
 from gsparc.simulate import pictures
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
@@ -66,7 +67,7 @@ def task(config: DictConfig) -> Outcome:
     outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
-    console = cli.console()
+    console = open_console()
     if outcome.choice is not None:
         pictures.worth(outcome.choice, run_dir / "effects.png")
         console.print(choice_table(outcome.choice))

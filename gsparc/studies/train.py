@@ -19,6 +19,7 @@ from gsparc.data.files import platform_cache
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
@@ -176,7 +177,7 @@ def task(config: DictConfig) -> float | None:
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     facts, objects = train(config, run_dir)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    console = cli.console()
+    console = open_console()
     console.print(results_table(facts, facts["model/name"], title, config.eval_on))
     for remark in remarks(facts, config.eval_on):
         console.print(remark, highlight=False)

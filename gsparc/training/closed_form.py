@@ -70,7 +70,7 @@ def warm_start(
         attenuation = model.attenuation(distance)
         emission = emission if attenuation is None else emission / attenuation
         logits.append(model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1))
-        encoded.append(model.emission.encoding(model.moving(batch.tx, batch.rx)))
+        encoded.append(model.emission.encoding(model.site.moving(batch.tx, batch.rx)))
     outputs, features = torch.cat(logits).double(), torch.cat(encoded).double()
     mean = outputs.mean(0)
     readout = _ridge(features, outputs - mean, noise)

@@ -101,7 +101,7 @@ class GaussianModule(L.LightningModule):
         if confidence is None:
             loss = task.mean()
         else:
-            exponent = confidence.exponent(self.model.moving(batch.tx, batch.rx))
+            exponent = confidence.exponent(self.model.site.moving(batch.tx, batch.rx))
             loss = weighted(task, exponent, confidence.settings.alpha).mean()
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)

@@ -56,7 +56,7 @@ def contributions(method: LearnedField, data: Measurements, rows: np.ndarray) ->
 
 def _weights(model: GaussianModel, rx: Pose) -> Tensor:
     g = model.gaussians
-    return mean_weights(model.plan(rx), g.means, g.quats, g.scales, g.opacities).mean.reshape(-1, len(g))[0]
+    return mean_weights(model.plan(rx), *g.geometry()).mean.reshape(-1, len(g))[0]
 
 
 def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor]) -> Method:

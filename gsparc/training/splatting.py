@@ -236,7 +236,7 @@ class LearnedField(Method):
             mean = mean.clamp(0, 1)
         if model.confidence is None:
             return Prediction(mean)
-        return Prediction(mean, model.confidence.normalised(model.moving(tx, rx)))
+        return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))
 
     def _frozen_view(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """The matrix of the static receiver, made anew after an edit; None for any other pose."""

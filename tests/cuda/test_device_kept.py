@@ -50,7 +50,7 @@ def test_a_training_loss_and_its_gradients_stay_on_the_models_device(kind, campa
     batch = data.batch(np.arange(6)).to("meta")
     rendered = made.model(batch.tx, batch.rx)
     task = made.task_loss(rendered.mean, batch)
-    exponent = made.model.confidence.exponent(made.model.moving(batch.tx, batch.rx))
+    exponent = made.model.confidence.exponent(made.model.site.moving(batch.tx, batch.rx))
     task.mean().backward()
     assert task.device.type == exponent.device.type == "meta"
     slopes = {name: p.grad for name, p in made.named_parameters() if p.grad is not None}

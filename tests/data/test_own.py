@@ -148,4 +148,4 @@ def test_newrf_conference(real_newrf):
         power = np.abs(file["path_gain"]) ** 2
     assert power[down].sum() / power.sum() == pytest.approx(0.41, abs=0.02)
     batch = data.batch(np.arange(5))
-    assert not batch.shared_pose and batch.rx.position.shape == (5, 3)
+    assert batch.rx.batched and batch.rx.position.shape == (5, 3)

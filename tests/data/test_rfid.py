@@ -18,7 +18,7 @@ def test_tiny_folder(rfid_folder):
     np.testing.assert_allclose(data.tx + data.site.origin, [[0.1 * i, 0.2, 1.0] for i in range(6)])
     np.testing.assert_allclose(data.site.box[0], -data.site.box[1])
     batch = data.batch(np.array([4, 0]))
-    assert batch.shared_pose and batch.index.tolist() == [4, 0] and batch.target.max() <= 1
+    assert not batch.rx.batched and batch.index.tolist() == [4, 0] and batch.target.max() <= 1
     torch.testing.assert_close(
         batch.rx.position + torch.from_numpy(data.site.origin).float(), torch.tensor([5.0, 0.26, 0.0])
     )

@@ -51,9 +51,3 @@ def test_one_calibration_position_gives_a_range():
     sure = confidence()
     sure.calibrate(torch.zeros(1, 3))
     assert torch.isfinite(sure.normalised(torch.randn(5, 3))).all()
-
-
-def test_a_surer_position_expects_a_smaller_error():
-    sure, where = confidence(), torch.randn(20, 3)
-    order = sure.exponent(where).argsort()
-    assert (sure.error_level(where)[order].diff() <= 0).all()

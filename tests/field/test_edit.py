@@ -42,8 +42,7 @@ def test_one_edit_moves_everything_together():
     shared = root.shared
     keep = torch.tensor([True, False, True, True, False, True])
     replace = {"gaussians.means": torch.full((2, 3), 9.0)}
-    counted = {"seen": torch.arange(6.0)}
-    edited = edit.apply(Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer, counted)
+    edit.apply(Edit(keep, torch.tensor([1, 3]), replace), root, root.gaussians, optimizer)
     for name, parameter in row_parameters(root, 6).items():
         assert torch.equal(parameter[:4], rows[name][keep])
         wanted = replace.get(name, rows[name][[1, 3]])
@@ -51,7 +50,6 @@ def test_one_edit_moves_everything_together():
         state = optimizer.state[parameter]
         assert torch.equal(state["exp_avg"][:4], old[name][keep]) and not state["exp_avg"][4:].any()
         assert state["exp_avg_sq"].shape == parameter.shape and not state["exp_avg_sq"][4:].any()
-    assert edited["seen"].tolist() == [0, 2, 3, 5, 0, 0]
     assert root.gaussians.ids.tolist() == [0, 2, 3, 5, 6, 7] and int(root.gaussians.next_id) == 8
     assert int(root.gaussians.version) == 1 and root.shared is shared
     held = {id(group["params"][0]) for group in optimizer.param_groups}

@@ -72,7 +72,7 @@ def test_the_emission_reads_the_end_that_moves(campaign):
     for end in ("rx", "tx"):
         data = campaign("spectrum", static_end=end)
         batch = data.batch(np.arange(3))
-        where = model(data).moving(batch.tx, batch.rx)
+        where = data.site.moving(batch.tx, batch.rx)
         assert torch.allclose(where, torch.from_numpy(data.moving[:3]).float())
 
 
@@ -96,7 +96,7 @@ def test_only_the_gaussians_that_a_static_receiver_sees_emit(campaign):
     want = field(batch.tx, batch.rx)
     view = frozen_view(field, batch.rx)
     seen = int(want.raster.visible.sum())
-    assert 0 < seen < 60 and len(view.seen.gaussians) == seen
+    assert 0 < seen < 60 and len(view.visible.gaussians) == seen
     for some in (batch.tx, batch.tx[:1]):
         assert torch.allclose(view.render(field, some, batch.rx), want.mean[: len(some)], atol=1e-5)
     assert len(field.gaussians) == 60  # the field itself is left as it was

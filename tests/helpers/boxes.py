@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from shoeboxes import scatter
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.mirrors import Mirrors
-from gsparc.simulate.shoebox import Room, scatter
+from gsparc.simulate.shoebox import Room
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
 ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))

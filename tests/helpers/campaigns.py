@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from shoeboxes import scatter
 
 from gsparc.ops import SphereGrid
-from gsparc.simulate.shoebox import Room, scatter, trace
+from gsparc.simulate.shoebox import Room, trace
 
 FREQUENCY_HZ = np.array([3.0e8, 3.1e8])  # a metre of wavelength: 100 places then tell something of the rest
 STILL = np.array([1.0, 1.0, 0.5])

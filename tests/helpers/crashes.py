@@ -26,7 +26,7 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     import torch
     from campaigns import compose
 
-    from gsparc.studies.cli import one_line
+    from gsparc.evaluation.console import one_line
     from gsparc.studies.train import train
 
     torch.set_num_threads(1)
@@ -41,8 +41,8 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
 
 def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
     """`gsparc simulate` of a box room in many small shards."""
+    from gsparc.evaluation.console import one_line
     from gsparc.simulate.campaign import simulate
-    from gsparc.studies.cli import one_line
 
     with Limited(most_bytes):
         try:

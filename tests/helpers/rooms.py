@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from shoeboxes import as_arrays, scatter
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.simulate.shoebox import Room, Trace, scatter, trace
+from gsparc.simulate.shoebox import Room, Trace, trace
 
 WAVELENGTH = 299_792_458.0 / 2.4e9
 PILLAR = np.array([[[1.6, 1.2, 0.0], [2.0, 1.6, 2.5]]])
@@ -32,7 +33,7 @@ def shoebox(
     tx = np.array(size) * [0.15, 0.27, 0.75]
     rx = scatter(room, count, seed + 1, margin=0.1)
     told = trace(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
-    data = from_arrays(told.as_arrays())
+    data = from_arrays(as_arrays(told))
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
 
 
@@ -69,7 +70,7 @@ def furnished(count: int, *, snr_db: float = 30.0, seed: int = 0) -> tuple[Trace
     room = Room(np.zeros(3), np.array([7.0, 5.0, 2.8]), walls, FURNITURE)
     rx = scatter(room, count, seed + 1, margin=0.1)
     told = trace(room, np.array([0.4, 2.2, 2.0]), rx, 2.4e9, snr_db=snr_db, seed=seed)
-    data = from_arrays(told.as_arrays())
+    data = from_arrays(as_arrays(told))
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
 
 
@@ -90,7 +91,7 @@ def rough(count: int, *, share: float = 0.3, spacing: float = 0.4) -> tuple[Meas
     turns = (before + after) / WAVELENGTH + rng.random(400)
     diffuse = (np.exp(-2j * np.pi * turns) / before / after).sum(1)[:, None, None]
     power = (np.abs(told.csi) ** 2).mean() / (np.abs(diffuse) ** 2).mean()
-    arrays = told.as_arrays()
+    arrays = as_arrays(told)
     arrays["csi"] = told.csi + np.sqrt(share / (1 - share) * power) * diffuse
     data = from_arrays(arrays)
     return data, make_split(data.moving, SplitSettings(seed=0)).folds[0]

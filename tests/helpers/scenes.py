@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 from campaigns import spectra
+from shoeboxes import as_arrays, scatter
 
 from gsparc.data.own import from_arrays, load_own
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.ops import SphereGrid
-from gsparc.simulate.shoebox import Room, scatter, trace
+from gsparc.simulate.shoebox import Room, trace
 
 
 def fold_of(data: Measurements) -> Fold:
@@ -42,7 +43,7 @@ def room(
         box, np.array([0.7, 0.8, 1.9]), scatter(box, rows, seed=1, margin=0.3), frequency_hz,
         max_order=max_order, snr_db=40,
     )  # fmt: skip
-    arrays = told.as_arrays()
+    arrays = as_arrays(told)
     sources = told.images.of(told.tx[0])
     if directions:
         paths = (sources[None] - told.rx[:, None]).reshape(-1, 3)

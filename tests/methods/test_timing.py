@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from clocks import WoundClock
 
 from gsparc.methods import timing
@@ -34,3 +35,18 @@ def test_facts_are_numbers_and_words():
 def test_reference_work_takes_time():
     times = interleaved({"copy": reference_copy()}, ClockSettings(rounds=5))["copy"]
     assert (times > 0.05).all()
+
+
+def test_contenders_are_timed_with_their_own_threads():
+    seen: list[tuple[str, int, int]] = []
+    before = torch.get_num_threads()
+
+    def call(name):
+        return lambda number: seen.append((name, number, torch.get_num_threads()))
+
+    clock = ClockSettings(rounds=3, least=3, warmup=0, calls=2, untimed=1)
+    times = interleaved({"a": call("a"), "b": call("b"), "c": call("c")}, clock, {"a": 1, "b": 2, "c": 1})
+    assert {len(ms) for ms in times.values()} == {6} and torch.get_num_threads() == before
+    assert {(name, threads) for name, _, threads in seen} == {("a", 1), ("b", 2), ("c", 1)}
+    first = [name for name, _, _ in seen[:9]]
+    assert len(set(first[:3])) == 1 and set(first) == {"a", "b", "c"}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from rooms import WAVELENGTH, nmse, shoebox
+from shoeboxes import as_arrays
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
@@ -25,7 +26,7 @@ def _room(extra=None):
     told, data, fold = shoebox(220, size=(3.0, 2.5, 2.2), max_order=1, reflection=-0.4)
     if extra is None:
         return told, data, fold
-    arrays = told.as_arrays()
+    arrays = as_arrays(told)
     arrays["csi"] = arrays["csi"] + extra(told.tx[0], told.rx)[:, None, None] * WAVELENGTH / (4 * np.pi)
     return told, from_arrays(arrays), fold
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
+from shoeboxes import as_arrays
 
 from gsparc import load
 from gsparc.auto.decide import probe_phase
@@ -140,7 +141,7 @@ def test_searches_that_agree_at_the_noise_floor_are_enough(tmp_path):
 def test_a_moving_transmitter_is_a_moving_receiver(tmp_path):
     """Searched at the receiver, which stands still, nothing was found (NMSE 1); gsparc did not even try."""
     told, data, fold = shoebox(200, size=(3.0, 2.5, 2.2), max_order=1)
-    arrays = told.as_arrays()
+    arrays = as_arrays(told)
     arrays["rx_position"], arrays["tx_position"] = arrays["tx_position"], arrays["rx_position"]
     swapped = from_arrays(arrays)
     assert swapped.site.moving_end == "tx" and np.array_equal(swapped.moving, data.moving)

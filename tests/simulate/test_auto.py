@@ -32,7 +32,7 @@ class Invented:
     def versions(self):
         return {}
 
-    def trace(self, receivers, effects, seed=None, progress=None):
+    def trace(self, receivers, effects, seed=None):
         rng = np.random.default_rng(0)
         count, each = len(receivers), len(self.record)
         power = np.tile([p for _, _, p in self.record], count)
@@ -112,7 +112,7 @@ def test_what_a_busy_machine_adds_is_not_the_price_of_an_effect(monkeypatch):
     """Waiting was timed, and leaving out seemed to cost: edges worth 1e-8 were kept."""
 
     class HeldUp(Invented):
-        def trace(self, receivers, effects, seed=None, progress=None):
+        def trace(self, receivers, effects, seed=None):
             time.sleep(0.1)
             return super().trace(receivers, effects)
 

@@ -7,7 +7,8 @@ from poses import boresight_degrees
 from gsparc.data.rfid import HEIGHT, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
-from gsparc.simulate.rfid_sim import HAND_BOX, bartlett, ensure_rfid_sim, hand_moved, steering
+from gsparc.physics.array_response import bartlett, steering
+from gsparc.simulate.rfid_sim import HAND_BOX, ensure_rfid_sim, hand_moved
 
 
 def _digest(folder):
@@ -59,8 +60,8 @@ def test_grid_a_point_source_lands_on_its_pixel():
                               np.sin(elevation)])  # fmt: skip
         distance = np.linalg.norm(1e4 * direction - array, axis=1)
         h = np.exp(-2j * np.pi * np.mod(distance / WAVELENGTH, 1))
-        image = bartlett(h, matrix).reshape(HEIGHT, WIDTH)
-        assert np.unravel_index(image.argmax(), image.shape) == (row, column)
+        image = bartlett(torch.from_numpy(h)[None], matrix).reshape(HEIGHT, WIDTH)
+        assert divmod(int(image.argmax()), WIDTH) == (row, column)
         np.testing.assert_allclose(grid.directions(torch.float64)[row, column], direction, atol=1e-12)
 
 

@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
+from shoeboxes import as_arrays, scatter
 
 from gsparc.data.own import from_arrays, load_own, write_own
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.shoebox import Room, images, scatter, trace, visible
+from gsparc.simulate.shoebox import Room, images, trace, visible
 
 ROOM = Room(
     lower=np.array([-1.0, 0.5, 0.0]),
@@ -111,12 +112,12 @@ def test_truth_travels_with_the_file(tmp_path):
     traced = trace(
         room, np.array([0.0, 1, 1]), scatter(room, 30, seed=6), np.array([2.4e9, 2.42e9]), snr_db=30
     )
-    data = write_own(tmp_path / "box.h5", traced.as_arrays(), {"name": "shoebox"})
+    data = write_own(tmp_path / "box.h5", as_arrays(traced), {"name": "shoebox"})
     assert load_own(tmp_path / "box.h5").site.sha256 == data.site.sha256
     assert data.site.static_end == "tx" and data.target.shape == (30, 1, 2)
     np.testing.assert_allclose(data.target * data.site.target_scale, traced.csi, rtol=1e-5)
     moving_tx = trace(room, scatter(room, 30, seed=6), np.array([0.0, 1, 1]), 2.4e9)
-    assert from_arrays(moving_tx.as_arrays()).site.static_end == "rx"
+    assert from_arrays(as_arrays(moving_tx)).site.static_end == "rx"
 
 
 def test_positions_outside_are_refused():

@@ -17,10 +17,10 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 import gsparc.conf
+from gsparc.evaluation.console import one_line
 from gsparc.methods.method import Method
 from gsparc.methods.registry import build
 from gsparc.studies import cli
-from gsparc.studies.cli import one_line
 from gsparc.studies.train import task
 
 CONF = Path(gsparc.conf.__path__[0])

@@ -13,11 +13,13 @@ import pytest
 from omegaconf import OmegaConf
 
 from gsparc.data.load import load, split_for
+from gsparc.evaluation.console import one_line
+from gsparc.evaluation.open_runs import aligned
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.nearest import Nearest
-from gsparc.studies.cli import one_line, run
-from gsparc.studies.evaluate import aligned, evaluate_files, main
+from gsparc.studies.cli import run
+from gsparc.studies.evaluate import evaluate_files, main
 
 
 @pytest.fixture

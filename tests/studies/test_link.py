@@ -250,8 +250,8 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     import gsparc.studies.link.command as command
 
     data, file = trained
-    monkeypatch.setattr("gsparc.studies.evaluate.load", lambda settings: data)
-    monkeypatch.setattr("gsparc.studies.evaluate.split_for", lambda settings, found: _split())
+    monkeypatch.setattr("gsparc.evaluation.open_runs.load", lambda settings: data)
+    monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
     config = compose(
         f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
         "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",

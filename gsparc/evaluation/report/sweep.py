@@ -14,10 +14,10 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table as Shown
 
+from gsparc.evaluation.console import one_line, open_console
 from gsparc.evaluation.report.intervals import Interval
 from gsparc.evaluation.report.table import Column, Table
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.studies import cli
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class SweepReport(Callback):
         if config.hydra.mode != RunMode.MULTIRUN or job_return.status != JobStatus.FAILED:
             return
         error = job_return._return_value
-        said = cli.one_line(error) if isinstance(error, BaseException) else str(error)
+        said = one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
         (folder / FAILURE).write_text(said + "\n", encoding="utf-8")
         log.error("failed", exc_info=error)  # the job's own log keeps the traceback
@@ -56,7 +56,7 @@ class SweepReport(Callback):
         """Time, tabulate and draw what the sweep made."""
         folder = Path(config.hydra.sweep.dir)
         failed = sorted(folder.rglob(FAILURE))
-        console = cli.console()
+        console = open_console()
         if any(path.parent != folder for path in folder.rglob("summary.json")):
             report(folder, str(config.get("title") or folder.name), console, self)
         if failed:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
 
+from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.report.runs import Run
 from gsparc.evaluation.summary import write_samples
-from gsparc.methods.interleaved_timing import Pace, in_turns
-from gsparc.studies.evaluate import open_files
-from gsparc.studies.tradeoff.sweep import asker
+from gsparc.methods.predictor import Predictor
+from gsparc.methods.timing import BLOCKS, Call, interleaved
 
 log = logging.getLogger(__name__)
 
@@ -28,21 +27,19 @@ def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> 
         rounds: visits to each.
         budget_s: no new round after this [s].
     """
-    calls: dict[int, Callable[[int], object]] = {}
+    calls: dict[int, Call] = {}
     for number, run in enumerate(runs):
         try:
             opened = open_files(run.checkpoints[:1])
         except (ValueError, IndexError) as error:
             log.warning("%s is not timed again: %s", run.folder, error or "it left no checkpoint")
             continue
-        calls[number] = asker(opened.methods[0], opened.data, opened.split.folds[0].test)
+        places = opened.data.moving[opened.split.folds[0].test] + opened.data.site.origin
+        calls[number] = Predictor(opened.methods[0], opened.data.site).cycling(places)
     threads = {
         number: int(runs[number].facts.get("machine/threads") or torch.get_num_threads()) for number in calls
     }
-    times = in_turns(calls, threads, Pace(rounds=rounds, budget_s=budget_s)) if calls else {}
+    times = interleaved(calls, replace(BLOCKS, rounds=rounds, budget_s=budget_s), threads)
     for number, ms in times.items():
         write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
-    nothing = np.zeros(0)
-    return [
-        replace(run, render_ms=times.get(i, nothing)) if i in times else run for i, run in enumerate(runs)
-    ]
+    return [replace(run, render_ms=times[i]) if i in times else run for i, run in enumerate(runs)]

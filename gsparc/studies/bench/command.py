@@ -11,6 +11,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.timing import ClockSettings, machine_facts, peak_memory
 from gsparc.ops.native import instruction_set
@@ -62,7 +63,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
         )
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
-    machine, console = Machine(), cli.console()
+    machine, console = Machine(), open_console()
     before = machine_facts()["machine/load"]
     rows: list[Row] = []
     gc.collect()
@@ -94,5 +95,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     return found
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Entry point."""
     cli.run(task, "bench")
+
+
+if __name__ == "__main__":
+    main()

@@ -101,7 +101,7 @@ def backward(scene: Scene, batch: int) -> Case:
         with torch.enable_grad():
             scene.model.zero_grad(set_to_none=True)
             values = scene.model.features(tx, rx)
-            g = scene.model._geometry()
+            g = scene.model.gaussians.geometry()
             composite(made, *g, values).image.backward(slope)
 
     reference = _backward_reference(scene, slope) if batch == 1 and len(scene) <= 1000 else None

@@ -75,7 +75,7 @@ def scene(
         model = ComplexSpectra(settings, _site())
         _scatter(model.gaussians)
         features = torch.rand(count, COMPLEX)
-    means, quats, scales, opacities = (tensor.detach() for tensor in model._geometry())
+    means, quats, scales, opacities = (tensor.detach() for tensor in model.gaussians.geometry())
     return Scene(model, (means, quats, scales, opacities), features, projection)
 
 

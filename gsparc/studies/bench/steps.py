@@ -38,7 +38,7 @@ def _learning(model: GaussianModel, batch: int) -> Call:
         with torch.enable_grad():
             optimizer.zero_grad(set_to_none=True)
             values = model.features(tx, rx)[..., :1]
-            image = composite(model.plan(receiver()), *model._geometry(), values).image
+            image = composite(model.plan(receiver()), *model.gaussians.geometry(), values).image
             loss = spectrum_loss(image.squeeze(1), target).mean()
             loss.backward()
             optimizer.step()

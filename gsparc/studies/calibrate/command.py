@@ -16,7 +16,9 @@ from rich.table import Table
 from gsparc.data.argos import peers_figures, peers_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.confidence import Trusted, keep, threshold_of
@@ -35,7 +37,6 @@ from gsparc.studies import cli
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.studies.calibrate.pictures import draw
 from gsparc.studies.calibrate.trial import How, Trial, accept, divisible, trials
-from gsparc.studies.evaluate import open_files
 
 log = logging.getLogger(__name__)
 
@@ -161,7 +162,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     }
     write_summary(run_dir / "summary.json", facts)
     draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
-    console = cli.console()
+    console = open_console()
     for table in tables(facts, evidence, found):
         console.print(table)
     if config.store:

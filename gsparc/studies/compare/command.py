@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.markdown import Markdown
 
 from gsparc.data.files import platform_cache
+from gsparc.evaluation.console import one_line, open_console
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.studies import cli
 from gsparc.studies.compare import figure, table
@@ -131,7 +132,7 @@ def fill_all(
             try:
                 found = fill(one, room)
             except (ValueError, RuntimeError) as error:
-                log.warning("%s cannot be filled: %s", one.cell, cli.one_line(error))
+                log.warning("%s cannot be filled: %s", one.cell, one_line(error))
                 continue
             score = (
                 f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB"
@@ -212,7 +213,7 @@ def report(
             facts[f"{room}/{row.method}/train_s"] = row.train_s
             facts[f"{room}/{row.method}/query_ms_p50"] = row.query_ms
     write_summary(run_dir / "summary.json", facts)
-    console = cli.console()
+    console = open_console()
     console.print(Markdown(page))
     console.print(f"written to {run_dir}", highlight=False)
     return rows

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from gsparc.methods import checkpoint
 from gsparc.methods.method import Method
-from gsparc.methods.timing import COPY, ClockSettings, interleaved, reference_copy
+from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
 from gsparc.studies.compare.fitting import Filled, Room
 
 QUERIES = 64  # different positions asked for
@@ -42,7 +42,8 @@ def latencies(filled: Sequence[Filled], room: Room) -> dict[str, Latency]:
     for one in filled:
         if one.cell.method not in methods:
             methods[one.cell.method] = _loaded(one.checkpoint)
-    calls = _calls(methods, room)
+    rows = room.folds.folds[0].test[:QUERIES]
+    calls = cycling(methods, [room.data.batch(rows[i : i + 1]) for i in range(len(rows))])
     once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
     endless = {name for name in calls if once[name][0] > ENDLESS_MS}
     cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
@@ -58,17 +59,6 @@ def latencies(filled: Sequence[Filled], room: Room) -> dict[str, Latency]:
 
 def _loaded(path: Path) -> Method:
     return checkpoint.load(path)[0]
-
-
-def _calls(methods: Mapping[str, Method], room: Room) -> dict[str, Callable[[int], object]]:
-    """One query end to end each, another test position every time."""
-    rows = room.folds.folds[0].test[:QUERIES]
-    queries = [room.data.batch(rows[i : i + 1]) for i in range(len(rows))]
-
-    def call(method: Method) -> Callable[[int], object]:
-        return lambda turn: method.answer(queries[turn % len(queries)])
-
-    return {name: call(method) for name, method in methods.items()}
 
 
 def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:

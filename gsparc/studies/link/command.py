@@ -14,14 +14,15 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.resource_grid import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.methods.risk_threshold import Promise
 from gsparc.methods.timing import machine_facts
 from gsparc.studies import cli
 from gsparc.studies.calibrate.trial import accept
-from gsparc.studies.evaluate import open_files
 from gsparc.studies.link.adaptation import Band
 from gsparc.studies.link.channels import Channels, channels
 from gsparc.studies.link.evidence import on_band
@@ -162,7 +163,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
     facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
     write_summary(run_dir / "summary.json", facts)
-    console = cli.console()
+    console = open_console()
     for table in tables(facts, title, list(wanted), levels):
         console.print(table)
     console.print(f"written to {run_dir}", highlight=False)

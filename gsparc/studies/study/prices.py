@@ -13,12 +13,13 @@ from rich.table import Table
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.method import FitContext, Method
-from gsparc.methods.timing import ClockSettings, interleaved, machine_facts
+from gsparc.methods.timing import ClockSettings, cycling, interleaved, machine_facts
 from gsparc.studies import cli
 from gsparc.studies.study.variants import setting
 
@@ -95,11 +96,7 @@ def measure(
             seconds[name].append(report.seconds)
             log.info("%s, round %d of %d: %.1f s", name, turn + 1, rounds, report.seconds)
     batches = [data.batch(np.array([row])) for row in fold.test[:QUERIES]]
-
-    def asking(method: Method) -> Callable[[int], object]:
-        return lambda turn: method.answer(batches[turn % len(batches)])
-
-    times = interleaved({name: asking(method) for name, method in fitted.items()}, clock)
+    times = interleaved(cycling(fitted, batches), clock)
     figure = DECIDING[data.site.kind]
     found = []
     for name, method in fitted.items():
@@ -143,7 +140,7 @@ def task(config: DictConfig) -> list[Price]:
     for p in found:
         numbers = (p.value, p.train_s, p.train_ratio, p.query_ms, p.query_p95_ms, p.query_ratio)
         table.add_row(p.name, p.effects, *(f"{number:.3g}" for number in numbers))
-    console = cli.console()
+    console = open_console()
     console.print(table)
     console.print(f"ratios to {config.plain!r}; written to {where.run_dir}", highlight=False)
     return found

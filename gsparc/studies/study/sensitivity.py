@@ -17,6 +17,7 @@ from rich.table import Table
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import score
@@ -192,7 +193,7 @@ def task(config: DictConfig) -> list[Row]:
         table.add_column(column, justify="left" if column in ("method", "disturbed") else "right")
     for row in rows:
         table.add_row(row.method, row.where, f"{row.error:g}", f"{row.value:.4g}", f"{row.train_s:.3g}")
-    console = cli.console()
+    console = open_console()
     console.print(table)
     console.print(f"written to {run_dir}", highlight=False)
     return rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +19,21 @@ from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.metrics import DECIDING, score_of
+from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
 from gsparc.methods import checkpoint, stored_front
-from gsparc.methods.interleaved_timing import Pace
 from gsparc.methods.method import Method
 from gsparc.methods.pareto import Point, cost_of_halving, front
+from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import combinations, contributions, reduced
-from gsparc.methods.timing import COPY, machine_facts, peak_memory, reference_copy
+from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
 from gsparc.studies import cli
-from gsparc.studies.evaluate import Opened, open_files
 from gsparc.studies.tradeoff.picture import Rival, beaten_by, draw
-from gsparc.studies.tradeoff.sweep import asker, candidate, sweep
+from gsparc.studies.tradeoff.sweep import candidate, sweep
 
 log = logging.getLogger(__name__)
 
@@ -49,11 +51,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
     rivals = _rivals(config, run)
-    clocks = {name: asker(rival, data, rows) for name, (rival, _) in rivals.items()}
-    points, other_ms = sweep(
-        candidates, data, fold, eval_on=config.eval_on,
-        pace=Pace(rounds=config.rounds, budget_s=config.budget_s), others={COPY: reference_copy(), **clocks},
-    )  # fmt: skip
+    places = data.moving[rows] + data.site.origin
+    clocks = {name: Predictor(rival, data.site).cycling(places) for name, (rival, _) in rivals.items()}
+    clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
+    others = {COPY: reference_copy(), **clocks}
+    points, other_ms = sweep(candidates, data, fold, eval_on=config.eval_on, clock=clock, others=others)
     figure = DECIDING[data.site.kind]
     shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
@@ -184,7 +186,7 @@ def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run
         gap, error = p.difference
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
         table.add_row(p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart)
-    console = cli.console()
+    console = open_console()
     console.print(table)
     slope = facts["tradeoff/per_halving"]
     if slope is not None:
@@ -202,5 +204,10 @@ def _plain(node: DictConfig) -> dict[str, Any]:
     return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
 
 
-if __name__ == "__main__":
+def main() -> None:
+    """Entry point."""
     cli.run(task, "tradeoff")
+
+
+if __name__ == "__main__":
+    main()

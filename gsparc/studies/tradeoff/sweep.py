@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,11 +16,11 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import Scores, rows_of, score
-from gsparc.methods.interleaved_timing import Pace, in_turns
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Point, Settings, worded
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import View
+from gsparc.methods.timing import Call, ClockSettings, interleaved
 
 log = logging.getLogger(__name__)
 
@@ -45,28 +45,14 @@ class Candidate:
     threads: tuple[int, ...]
 
 
-def asker(method: Method, data: Measurements, rows: np.ndarray) -> Callable[[int], object]:
-    """A query end to end: a world position as a user holds it in, an array in physical units out.
-
-    Args:
-        method: fitted.
-        data: where the positions come from.
-        rows: (n,), asked one after the other.
-    """
-    ask = getattr(Predictor(method, data.site), data.site.kind)
-    moving = data.site.moving_end
-    places = data.moving[rows] + data.site.origin
-    return lambda number: ask(**{moving: places[number % len(places)]})
-
-
 def sweep(
     candidates: Sequence[Candidate],
     data: Measurements,
     fold: Fold,
     *,
     eval_on: str,
-    pace: Pace,
-    others: Mapping[str, Callable[[int], object]],
+    clock: ClockSettings,
+    others: Mapping[str, Call],
 ) -> tuple[list[Point], dict[str, np.ndarray]]:
     """Measure the candidates; the first is the full model, which the others are compared with.
 
@@ -74,7 +60,7 @@ def sweep(
         candidates: to be measured.
         data, fold: as the model was trained with.
         eval_on: rows whose figures are shown.
-        pace: of the clock.
+        clock: how long to measure.
         others: further contenders for the clock alone (a copy of memory), by name.
 
     Returns:
@@ -84,6 +70,7 @@ def sweep(
     split = Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
     rows, whole = rows_of(fold, eval_on), None
+    places = data.moving[rows] + data.site.origin
     for number, candidate in enumerate(candidates):
         heard = Heard(candidate.method)
         there = score([heard], data, split, eval_on)
@@ -92,15 +79,13 @@ def sweep(
         scored.append((there, closeness(said, whole)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
-    calls: dict[tuple[int, int] | str, Callable[[int], object]] = {
-        name: call for name, call in others.items()
-    }
+    calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
     threads: dict[tuple[int, int] | str, int] = dict.fromkeys(others, 1)
     for index, candidate in enumerate(candidates):
-        ask = asker(candidate.method, data, rows)
+        ask = Predictor(candidate.method, data.site).cycling(places)
         for count in candidate.threads:
             calls[index, count], threads[index, count] = ask, count
-    times = in_turns(calls, threads, pace)
+    times = interleaved(calls, clock, threads)
     points = []
     for key, ms in times.items():
         if isinstance(key, str):

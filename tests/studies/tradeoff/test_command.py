@@ -16,9 +16,8 @@ from hydra.core.hydra_config import HydraConfig
 import gsparc
 from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint, operating_point, stored_front
-from gsparc.methods.interleaved_timing import Pace, in_turns
 from gsparc.methods.pareto import Point
-from gsparc.methods.timing import COPY
+from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.studies.tradeoff.command import task
 from gsparc.studies.tradeoff.sweep import Heard, closeness
 
@@ -99,7 +98,7 @@ def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt = swept
     points, _ = stored_front.kept(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
-    monkeypatch.setattr(operating_point, "in_turns", lambda calls, threads, pace: pretended)
+    monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
     best = max(points, key=lambda p: p.score)
     assert gsparc.load(ckpt, budget_ms=1e6).point == best
     assert gsparc.load(ckpt, budget_ms=1.5).point == points[0]
@@ -113,7 +112,7 @@ def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
     predictor = gsparc.load(ckpt, budget_ms=1000)
     place = predictor.site.origin + 0.1
     assert predictor.spectrum(tx=place).shape == (16, 32) and 0 <= predictor.confidence(tx=place) <= 1
-    times = in_turns({0: lambda n: predictor.spectrum(tx=place)}, {0: 1}, Pace(rounds=5))
+    times = interleaved({0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1})
     assert np.median(times[0]) <= 1000
     torch.set_num_threads(threads)
 
@@ -136,19 +135,3 @@ def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         stored_front.keep(ckpt, [point], "psnr_db", {})
     assert ckpt.read_bytes() == before and list(tmp_path.iterdir()) == [ckpt]
-
-
-def test_contenders_are_timed_in_turns_with_their_own_threads():
-    seen: list[tuple[str, int, int]] = []
-    before = torch.get_num_threads()
-
-    def call(name):
-        return lambda number: seen.append((name, number, torch.get_num_threads()))
-
-    times = in_turns(
-        {"a": call("a"), "b": call("b"), COPY: call("c")}, {"a": 1, "b": 2, COPY: 1}, Pace(3, 3, 2)
-    )
-    assert {len(ms) for ms in times.values()} == {6} and torch.get_num_threads() == before
-    assert {(name, threads) for name, _, threads in seen} == {("a", 1), ("b", 2), ("c", 1)}
-    first = [name for name, _, _ in seen[:9]]
-    assert len(set(first[:3])) == 1 and set(first) == {"a", "b", "c"}  # everybody in every round

@@ -1,0 +1,140 @@
+"""The checkpoints of a run with the data and folds they were trained on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.load import load, split_for
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Split
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.predictor import SAME_PLACE_M
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Opened:
+    """Checkpoints of one run with the data they speak of.
+
+    Attributes:
+        methods: one per fold.
+        stored: what their files hold.
+        data: in the models' local coordinates and units.
+        split: the folds the methods were trained on.
+    """
+
+    methods: list[Method]
+    stored: list[checkpoint.Stored]
+    data: Measurements
+    split: Split
+
+
+def open_files(
+    paths: Sequence[str | Path],
+    dataset: Mapping[str, Any] | None = None,
+    split: Mapping[str, Any] | None = None,
+) -> Opened:
+    """Load checkpoints of one run, one per fold, and their data.
+
+    Args:
+        paths: checkpoint files in the order of their folds.
+        dataset, split: settings that replace those stored in the first checkpoint.
+
+    Raises:
+        ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
+    """
+    loaded = [checkpoint.load(path) for path in paths]
+    stored = [one for _, one in loaded]
+    data = aligned(load(_settings("dataset", stored[0], dataset)), stored[0].site)
+    whole = split_for(_settings("split", stored[0], split), data)
+    chosen = _folds(whole, stored)
+    _warn_if_seen(stored[0], data, whole)
+    return Opened([method for method, _ in loaded], stored, data, chosen)
+
+
+def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The checkpoint's settings of a config group under the ones given now (those that are not null)."""
+    before = stored.configuration.get(group)
+    now = {key: value for key, value in (given or {}).items() if value is not None}
+    if not isinstance(before, dict) or ("name" in now and now["name"] != before.get("name")):
+        before = {}
+    settings = {**before, **now}
+    if "name" not in settings:
+        raise ValueError(f"{stored.path} does not say its {group}; say {group}.name=...")
+    return settings
+
+
+def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
+    """The folds the checkpoints were trained on: all of them in order, or those each file names."""
+    if all("fold" in one.extra for one in stored):
+        numbers = [int(one.extra["fold"]) for one in stored]
+    else:
+        numbers = list(range(len(stored)))
+        if len(stored) != len(split.folds):
+            raise ValueError(
+                f"split={split.name} has {len(split.folds)} folds: "
+                f"give as many checkpoints in their order, ckpt=[fold0.ckpt,fold1.ckpt,...]"
+            )
+    if any(number >= len(split.folds) for number in numbers):
+        raise ValueError(f"fold {max(numbers)} was trained, split={split.name} has {len(split.folds)} folds")
+    return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
+
+
+def _warn_if_seen(stored: checkpoint.Stored, data: Measurements, split: Split) -> None:
+    """A test set that differs from the one kept apart in training may hold rows the model has learned."""
+    before = stored.extra.get("split_sha256")
+    if data.site.sha256 != stored.site.sha256:
+        log.warning(
+            "%s was trained on other data than %s (content hashes differ)", stored.path, data.site.name
+        )
+    elif before not in (None, split.sha256):
+        log.warning("%s was trained on another split: its test rows may have been TRAINED on", stored.path)
+
+
+def aligned(data: Measurements, site: Site) -> Measurements:
+    """`data` in the local coordinates and target units that a model of `site` was trained in.
+
+    Raises:
+        ValueError: another kind, grid, moving end or static place.
+    """
+    own = data.site
+    for what in ("kind", "static_end", "grid"):
+        here, there = getattr(own, what), getattr(site, what)
+        if here != there:
+            raise ValueError(f"the model was trained with {what} {there}, {own.name} has {here}")
+    shift = own.origin - site.origin
+    if own.static_position is not None and site.static_position is not None:
+        gap = float(np.linalg.norm(own.static_position + shift - site.static_position))
+        if gap > SAME_PLACE_M:
+            raise ValueError(f"the static {own.static_end} of {own.name} stands {gap:.3g} m from the model's")
+    if not shift.any() and own.target_scale == site.target_scale:
+        return data
+    rescale = own.target_scale / site.target_scale
+    return replace(
+        data,
+        site=replace(
+            own,
+            origin=site.origin,
+            box=own.box + shift,
+            static_position=site.static_position,
+            target_scale=site.target_scale,
+        ),
+        tx=data.tx + shift,
+        rx_position=data.rx_position + shift,
+        target=_times(data.target, rescale),
+        uplink=None if data.uplink is None else _times(data.uplink, rescale),
+        noise_variance=None if data.noise_variance is None else _times(data.noise_variance, rescale**2),
+    )
+
+
+def _times(values: np.ndarray, factor: float) -> np.ndarray:
+    """Values in another unit, of the same type."""
+    return values if factor == 1 else (values * factor).astype(values.dtype)
