@@ -1,9 +1,8 @@
 """The Argos release's layout: `csidata.npy` [N, 8, 52] and `base-station.yml`, uplink in, downlink out.
 
-The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Nobody noted where the
-users were: positions come from an encoder of the uplink (`gsparc.data.position_encoder`), or from the
-stand-in's truth. Whoever predicts here has heard a fresh uplink of the very snapshot, if only to know where
-the user is.
+The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Users' positions were not
+recorded: they come from an encoder of the uplink (`gsparc.data.position_encoder`), or from the stand-in's
+truth. Every prediction therefore uses a fresh uplink of the same snapshot, if only to locate the user.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gsparc.data.assemble import assemble, one_decibel_rms
+from gsparc.data.assemble import assemble, rounded_rms
 from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
 
@@ -28,7 +27,7 @@ CARRIER_HZ = 2.4e9
 SPACING_HZ = 312.5e3
 TONES = (*range(-26, 0), *range(1, 27))
 STAND_IN = "argos-sim"
-FACTS = ("count", "seed", "scatterers")  # of a stand-in, that make its streets again
+FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets are rebuilt
 
 Encoder = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
@@ -38,7 +37,7 @@ def describe_missing(root: str | Path | None) -> str:
     where = "dataset.root is not set" if root is None else f"{root} is not there"
     return (
         f"The Argos release was not found ({where}): it comes with the code of FIRE and NeRF2; put "
-        "csidata.npy and base-station.yml into a folder and say dataset.root=FOLDER."
+        "csidata.npy and base-station.yml into a folder and set dataset.root=FOLDER."
     )
 
 
@@ -57,8 +56,8 @@ def load_argos(
         encode: uplink (S, U, 26) and training rows to codes (S, 3); needed for `positions="encoder"`.
         antenna: number of the antenna to predict, or `all`.
         positions: `encoder`, or `true` where the folder has `positions.npy` (the stand-in).
-        align: turn every snapshot by the phase and the mean delay of its own uplink. They are the
-            snapshot's, not the place's; multiplying by a number of modulus 1 changes no error.
+        align: turn every snapshot by the phase and the mean delay of its own uplink. These are
+            offsets of the snapshot; a factor of modulus 1 changes no error.
 
     Raises:
         DataError: anything is missing or wrong.
@@ -73,7 +72,7 @@ def load_argos(
     carrier = float(description.get("carrier_hz", CARRIER_HZ))
     if align:
         csi = aligned(csi, tones)
-    scale = one_decibel_rms(csi)
+    scale = rounded_rms(csi)
     csi = (csi / scale).astype(np.complex64)
     uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
     split = _split(root, len(csi))
@@ -85,6 +84,7 @@ def load_argos(
         name=STAND_IN if simulated else "argos",
         stand_in="argos" if simulated else None,
         kind="csi",
+        grid=None,
         static_end="tx",
         tx=np.tile(base, (len(csi), 1)),
         rx=where,
@@ -103,8 +103,8 @@ def load_argos(
             **{name: str(description[name]) for name in FACTS if name in description},
         },
     )
-    heard = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
-    return replace(data, site=replace(data.site, **heard), uplink=np.ascontiguousarray(uplink))
+    uplink_facts = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
+    return replace(data, site=replace(data.site, **uplink_facts), uplink=np.ascontiguousarray(uplink))
 
 
 def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
@@ -114,13 +114,13 @@ def aligned(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
     turn = np.angle((uplink[..., 1:] * uplink[..., :-1].conj()).sum((1, 2))) / step
     middle = numbers.mean()
     straight = csi * np.exp(-1j * turn[:, None] * (tones - middle))[:, None]
-    # The phase of what all antennas and tones hear together; of the loudest entry where that is silence.
+    # The phase of the sum over all antennas and tones.
     phase = np.angle(straight[..., :UPLINK].sum((1, 2)))
     return straight * np.exp(-1j * phase)[:, None, None]
 
 
-def peers_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex, float]:
-    """Mean and spread that published loaders remove: one complex number and one scale for all entries.
+def published_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex, float]:
+    """Mean and standard deviation that published loaders remove, each one number for all entries.
 
     Args:
         values: (S, A, K) targets.
@@ -131,10 +131,10 @@ def peers_normalisation(values: np.ndarray, train: np.ndarray) -> tuple[complex,
     return mean, float(np.sqrt((np.abs(chosen - mean) ** 2).mean()))
 
 
-def peers_figures(
+def published_figures(
     predicted: np.ndarray, target: np.ndarray, mean: complex, spread: float
 ) -> dict[str, float]:
-    """NMSE and mean SNR of all tones and of the first one, as published figures are taken.
+    """NMSE and mean SNR of all tones and of the first one, as published figures are computed.
 
     Args:
         predicted, target: (n, A, K), denormalised.
@@ -181,9 +181,7 @@ def _channels(root: Path) -> np.ndarray:
         raise DataError(f"{path}, snapshot {bad[0]}: NaN or Inf; expected finite channels")
     silent = np.flatnonzero(~np.abs(csi[..., :UPLINK]).any((1, 2)))
     if len(silent):
-        raise DataError(
-            f"{path}, snapshot {silent[0]}: its uplink is silent; expected a packet that was heard"
-        )
+        raise DataError(f"{path}, snapshot {silent[0]}: its uplink is silent; expected a received packet")
     return csi
 
 
@@ -196,7 +194,7 @@ def _antennas(root: Path, description: Mapping[str, Any], count: int) -> np.ndar
     if places.shape != (count, 3) or not np.isfinite(places).all():
         raise DataError(
             f"{root / 'base-station.yml'}: {key} has shape {places.shape}; expected {count} x 3 metres, "
-            "an antenna a line"
+            "one antenna per line"
         )
     return places
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from gsparc.data.errors import Problems
-from gsparc.data.schema import Kind, Measurements, Site
-from gsparc.ops import SphereGrid
+from gsparc.data.schema import Measurements, Site
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
@@ -32,11 +31,11 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
     )
 
 
-def one_decibel_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Root mean square of `values` (real or complex), rounded to whole decibels; 0 for silence.
+def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
+    """Root mean square of `values` (real or complex), rounded to whole dB; 0 if all are zero.
 
     This is a constant of the site, taken over all its rows: rounding keeps any single row (which may be a
-    test row) from leaving a trace in it. `weight` is a bool mask of measured entries.
+    test row) from influencing it. `weight` is a bool mask of measured entries.
     """
     magnitude = np.abs(values if weight is None else values[weight]).astype(np.float64)
     peak = float(magnitude.max(initial=0.0))
@@ -62,84 +61,58 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
 
 def assemble(
     *,
-    name: str,
-    kind: Kind,
     static_end: Literal["rx", "tx"],
     tx: np.ndarray,
     rx: np.ndarray,
     rx_rotation: np.ndarray,
     target: np.ndarray,
     target_scale: float = 1.0,
-    grid: SphereGrid | None = None,
-    array: np.ndarray | None = None,
-    normalisation: str = "none",
-    carrier_hz: float | None = None,
-    subcarriers_hz: np.ndarray | None = None,
-    stand_in: str | None = None,
-    convergence_error: float | None = None,
     mask: np.ndarray | None = None,
     noise_variance: np.ndarray | None = None,
     directions: list[np.ndarray] | None = None,
     row_names: list[str] | None = None,
     release_split: tuple[np.ndarray, np.ndarray] | None = None,
     provenance: Mapping[str, str] | None = None,
+    array: np.ndarray | None = None,
+    carrier_hz: float | None = None,
+    subcarriers_hz: np.ndarray | None = None,
+    **facts: Any,
 ) -> Measurements:
-    """Centre validated world coordinates on the scene box and wrap everything up.
+    """Measurements centred on the scene box, from validated world coordinates.
 
     Args:
+        static_end, array, carrier_hz, subcarriers_hz, **facts: see `Site`.
         tx, rx: (S, 3) [m], world coordinates, float64.
         rx_rotation: (S, 3, 3), local to world.
         target: (S, ...) already divided by `target_scale`.
         target_scale: stored target = physical target / target_scale.
         noise_variance: (S,) in units of the stored target.
         release_split: (train, test) rows that the data themselves name.
-
-    Other arguments are as in `Site` and `Measurements`.
+        mask, directions, row_names, provenance: see `Measurements`.
     """
     ends = np.concatenate([tx, rx])
     lower, upper = ends.min(axis=0), ends.max(axis=0)
     origin = (lower + upper) / 2
+    hashed = {
+        "tx": tx, "rx": rx, "rx_rotation": rx_rotation, "target": target, "mask": mask, "array": array,
+        "target_scale": np.array(target_scale), "subcarriers_hz": subcarriers_hz,
+        "carrier_hz": None if carrier_hz is None else np.array(carrier_hz), "noise_variance": noise_variance,
+    }  # fmt: skip
     site = Site(
-        name=name,
-        kind=kind,
         static_end=static_end,
-        grid=grid,
         array=array,
         carrier_hz=carrier_hz,
         subcarriers_hz=subcarriers_hz,
         origin=origin,
         box=np.stack([lower - origin, upper - origin]),
-        sha256=content_hash(
-            {
-                "tx": tx,
-                "rx": rx,
-                "rx_rotation": rx_rotation,
-                "target": target,
-                "target_scale": np.array(target_scale),
-                "array": array,
-                "carrier_hz": None if carrier_hz is None else np.array(carrier_hz),
-                "subcarriers_hz": subcarriers_hz,
-                "mask": mask,
-                "noise_variance": noise_variance,
-            }
-        ),
-        normalisation=normalisation,
+        sha256=content_hash(hashed),
         target_scale=target_scale,
-        stand_in=stand_in,
-        convergence_error=convergence_error,
         static_position=(rx if static_end == "rx" else tx)[0] - origin,
         rx_rotation=np.array(rx_rotation[0], dtype=np.float64),
+        **facts,
     )
+    names = row_names or [f"row {i}" for i in range(len(target))]
     return Measurements(
-        site=site,
-        tx=tx - origin,
-        rx_position=rx - origin,
-        rx_rotation=rx_rotation,
-        target=target,
-        mask=mask,
-        noise_variance=noise_variance,
-        directions=directions,
-        row_names=row_names or [f"row {i}" for i in range(len(target))],
-        release_split=release_split,
-        provenance=dict(provenance or {}),
-    )
+        site, tx - origin, rx - origin, rx_rotation, target, mask, noise_variance, directions, names,
+        release_split, dict(provenance or {}),
+    )  # fmt: skip

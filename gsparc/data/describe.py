@@ -1,4 +1,4 @@
-"""Say in words what was understood of measurements."""
+"""Sentences about measurements, and warnings about implausible values."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
         ("neighbours", _neighbours(moving, site.wavelength)),
     ]
-    lines += [("units?", hint) for hint in doubts(data)]
+    lines += [("units?", hint) for hint in suspicious_values(data)]
     if site.carrier_hz is not None:
         lines.append(("carrier", f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"))
     else:
@@ -102,8 +102,8 @@ def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
     return text + (f"; {same} rows share their place with another" if same else "")
 
 
-def doubts(data: Measurements) -> list[str]:
-    """What can be read but is hardly meant: millimetres, radians, powers that are no decibels."""
+def suspicious_values(data: Measurements) -> list[str]:
+    """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
     found, site = _units(np.concatenate([data.tx, data.rx_position])), data.site
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
@@ -123,7 +123,7 @@ def doubts(data: Measurements) -> list[str]:
 
 
 def _units(positions: np.ndarray) -> list[str]:
-    """A doubt that positions (n, 3) are metres: a mountain may be a kilometre high, a room is not."""
+    """Warnings that positions (n, 3) may not be metres."""
     extent = np.ptp(positions, axis=0)
     height, width = float(extent[2]), float(extent.max())
     if height > 100 or width > 1e4:

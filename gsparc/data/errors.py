@@ -1,4 +1,4 @@
-"""Refusing bad input in words: where it is, what was found, what was expected."""
+"""Errors of input: where, what was found, what was expected."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DataError(ValueError):
 class Problems(list[str]):
     """Collects what is wrong with one file or folder, so that a user sees all of it at once."""
 
-    LIMIT = 5  # of one sort: a file with 6,000 bad rows needs no 6,000 lines
+    LIMIT = 5  # lines per sort of problem
 
     def __init__(self, source: str | Path) -> None:
         super().__init__()
@@ -35,7 +35,7 @@ class Problems(list[str]):
         self.append(f"{where}: {what}")
 
     def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> None:
-        """Note `what` for each of `rows` (as a user names them), shortened when there are many."""
+        """Note `what` for each of `rows` (as a user names them), at most `LIMIT` of them."""
         names = list(rows)
         for name in names[: self.LIMIT]:
             self.add(f"{where}, {name}", what)

@@ -1,4 +1,4 @@
-"""The names of the schema for measurements of one's own; docs/own-data.md is the same table for people."""
+"""The names of the schema for measurements of one's own; docs/own-data.md is the same table."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class Field:
     Attributes:
         name: of the array.
         shape: allowed shapes; S samples, K frequencies, A antennas, H x W pixels, P paths, I sources.
-        unit: what `units` must say if it says anything.
+        unit: required value of `units` where given.
         required: `yes`, `one of`, or when.
         meaning: in words.
     """
@@ -58,7 +58,7 @@ FIELDS: dict[str, Field] = {
         Field("source_position", "(I, 3)", "m", "no", "truth of a simulation: where each source is"),
         Field("source_gain", "(I,)", "1", "no", "truth of a simulation: complex amplitude at 1 m"),
         Field("source_order", "(I,)", "1", "no", "truth of a simulation: reflections of each source"),
-        Field("source_visible", "(S, I)", "1", "no", "truth of a simulation: who sees which source"),
+        Field("source_visible", "(S, I)", "1", "no", "truth of a simulation: visibility of each source"),
         Field("split_train", "(n,)", "1", "no", "rows to train on, from 0; together with split_test"),
         Field("split_test", "(n,)", "1", "no", "rows to test on, from 0"),
         Field("row_name", "(S,)", "1", "no", "what you call each row; used in messages"),

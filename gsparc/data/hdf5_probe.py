@@ -1,4 +1,4 @@
-"""Reading HDF5 text of variable length in a program of its own first: damage in it can hang or crash libhdf5.
+"""Reading HDF5 text of variable length in a subprocess first: damage in it can hang or crash libhdf5.
 
 Such text lies in global heaps, whose damage no checksum sees; files without one need no trial, nor do ours,
 which hold text of fixed length.
@@ -25,7 +25,7 @@ with h5py.File(sys.argv[1], "r") as file:
 """
 
 
-def fails(path: Path, seconds: float = SECONDS) -> str | None:
+def read_error(path: Path, seconds: float = SECONDS) -> str | None:
     """Why text in an HDF5 file cannot be read within `seconds`; None when it can, or when there is none."""
     if not _has_heap(path):
         return None

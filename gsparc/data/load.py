@@ -95,12 +95,12 @@ def _newrf(config: Mapping[str, Any]) -> Measurements:
 
 
 def _own(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.data.describe import doubts
+    from gsparc.data.describe import suspicious_values
     from gsparc.data.own import load_own
 
     file = _required_file(config)
     data = load_own(file)
-    for doubt in doubts(data):
+    for doubt in suspicious_values(data):
         log.warning("%s: units? %s", file, doubt)
     return data
 

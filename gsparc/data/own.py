@@ -1,7 +1,7 @@
 """Measurements of one's own, and what our simulators write: one documented schema, npz or HDF5.
 
-docs/own-data.md is this schema for people; `fields.py` is its table. `interpret` says what arrays mean or
-everything that is wrong with them, `load_own` is its strict form, `write_own` refuses what `load_own` would.
+docs/own-data.md documents the schema; `fields.py` is its table. `interpret` turns arrays into measurements or
+lists everything that is wrong, `load_own` is its strict form, `write_own` refuses what `load_own` would.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, bad_positions, one_decibel_rms
+from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.own_checks import Checker
@@ -23,17 +23,17 @@ from gsparc.data.schema import LIGHT, Kind, Measurements
 
 log = logging.getLogger(__name__)
 
-SSIM_WINDOW = 11  # pixels along each side; of losses and metrics, which data do not know
+SSIM_WINDOW = 11  # pixels along each side; as in losses and metrics, which data do not import
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What was understood of a file.
+    """Measurements read from a file, and notes.
 
     Attributes:
         data: the measurements.
-        notes: what a user should know although nothing is wrong, one line each.
+        notes: remarks for the user, one line each; nothing is wrong.
     """
 
     data: Measurements
@@ -55,12 +55,12 @@ def load_own(path: str | Path) -> Measurements:
 def write_own(
     path: str | Path, arrays: Mapping[str, np.ndarray], attributes: Mapping[str, Any] | None = None
 ) -> Measurements:
-    """Write arrays named as in the schema (validated first, whole or not at all) and return their meaning.
+    """Write arrays named as in the schema (validated first, atomically) and return them as measurements.
 
     Args:
         path: *.npz, *.h5 or *.hdf5.
         arrays: by name, in the schema's units.
-        attributes: `name`, `normalisation`, `stand_in`, `convergence_error`, and provenance as you like.
+        attributes: `name`, `normalisation`, `stand_in`, `convergence_error`, and any provenance.
 
     Raises:
         DataError: what `load_own` would refuse.
@@ -130,7 +130,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     if kind == "spectrum" and min(values.shape[1:]) < SSIM_WINDOW:
         check.notes.append(
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
-            f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is not told"
+            f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
@@ -273,7 +273,7 @@ def _in_range(
 def _static_end(
     check: Checker, rx: np.ndarray | None, tx: np.ndarray | None, rotation: np.ndarray | None
 ) -> Literal["rx", "tx"] | None:
-    """Which end stays put; one must, and the other must move."""
+    """The static end; exactly one must be static."""
     if rx is None or tx is None or rotation is None:
         return None
     still = {
@@ -293,7 +293,7 @@ def _static_end(
 
 
 def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) -> None:
-    """Positions in one plane cannot tell a source from its mirror image in that plane."""
+    """Note positions in one plane: a source and its mirror image in it are indistinguishable."""
     if carrier_hz is None:
         return
     thickness = float(np.sqrt(np.linalg.eigvalsh(np.cov(moving.T))[0].clip(0)))
@@ -341,9 +341,9 @@ def _scaled(name: str, values: np.ndarray, mask: np.ndarray | None) -> tuple[np.
         largest = float(values.max())
         scale = 1.0 if 0.1 <= largest <= 1 else largest
     elif name == "csi":
-        scale = one_decibel_rms(values, mask)
+        scale = rounded_rms(values, mask)
     else:
-        scale = one_decibel_rms(np.sqrt(values), mask) ** 2
+        scale = rounded_rms(np.sqrt(values), mask) ** 2
     if scale <= 0:
         return values, 0.0
     return (values / scale).astype(np.complex64 if name == "csi" else np.float32), scale

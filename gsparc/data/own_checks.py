@@ -76,8 +76,8 @@ class Checker:
             "; transposed?" if any(array.shape[::-1] == s for s in shapes) or array.shape[:1] == (3,) else ""
         )
         expected = FIELDS[name].shape
-        told = any(count is not None for shape in shapes for count in shape)
-        here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if told else ""
+        constrained = any(count is not None for shape in shapes for count in shape)
+        here = f", here {' or '.join(str(s).replace('None', 'any') for s in shapes)}" if constrained else ""
         self.problems.add(self.where(name), f"expected shape {expected}{here}, found {array.shape}{hint}")
         return False
 

@@ -17,7 +17,7 @@ import h5py
 import numpy as np
 
 from gsparc.data.errors import DataError
-from gsparc.data.hdf5_probe import fails
+from gsparc.data.hdf5_probe import read_error
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
@@ -43,7 +43,7 @@ class Raw:
     Attributes:
         arrays: by name.
         attributes: numbers and strings about the whole file.
-        units: unit of an array where the file says one.
+        units: unit of an array where the file gives one.
     """
 
     arrays: dict[str, np.ndarray]
@@ -70,7 +70,7 @@ def read_raw(path: str | Path) -> Raw:
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
-    """Write `raw`, whole or not at all: to a partial file that is renamed when complete.
+    """Write `raw`, atomically: to a partial file that is renamed when complete.
 
     Raises:
         DataError: another ending, or there is no room; what was there is kept.
@@ -85,8 +85,8 @@ def write_raw(path: str | Path, raw: Raw) -> None:
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
         partial.unlink(missing_ok=True)
-        said = re.search(r"error message = '([^']+)'", str(error))
-        why = said[1] if said else getattr(error, "strerror", None) or _one_line(error)
+        found = re.search(r"error message = '([^']+)'", str(error))
+        why = found[1] if found else getattr(error, "strerror", None) or _one_line(error)
         raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
@@ -147,7 +147,7 @@ def _read_hdf5(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     units: dict[str, str] = {}
     name = "the file"
-    reason = fails(path)
+    reason = read_error(path)
     if reason is not None:
         raise DataError(f"{path}: damaged ({reason}); write it again, text best with a fixed length")
     try:

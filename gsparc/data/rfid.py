@@ -23,7 +23,7 @@ from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
-WAVELENGTH = 0.3259  # [m], 920 MHz; the release's spectra themselves say 0.3258 to 0.3260
+WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
@@ -275,10 +275,10 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
 
 
 def describe_missing(root: str | Path | None) -> str:
-    """What to tell a user whose release is not on disk, and how to get it."""
+    """Message that the release is not on disk, and how to get it."""
     wanted = "dataset.root is not set" if root is None else f"dataset.root={root} does not exist"
     return (
         f"{wanted}: the RFID release is NOT on disk. Get it from the NeRF2 project "
         "(https://github.com/XPengZhao/NeRF2, data set s23: gateway_info.yml, tx_pos.csv, spectrum/), "
-        "then say dataset.root=DIR."
+        "then set dataset.root=DIR."
     )

@@ -1,11 +1,11 @@
-"""Quaternions at the data door; everything behind it uses rotation matrices, local to world."""
+"""Quaternions of data files as rotation matrices, local to world."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this it is not one
+UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this they are refused
 
 
 def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:

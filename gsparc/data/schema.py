@@ -1,4 +1,4 @@
-"""What a dataset declares about itself, and what one sample and one batch hold."""
+"""Facts of a dataset, its samples and batches of them."""
 
 from __future__ import annotations
 

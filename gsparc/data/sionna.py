@@ -1,4 +1,4 @@
-"""What `gsparc simulate` writes: one file with spectra, channels and paths, read as either."""
+"""Files of `gsparc simulate` with spectra, channels and paths, read as spectra or as channels."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def load_sionna(path: str | Path, target: str | None = None, truth: str | Path |
     Args:
         path: file that the simulator wrote.
         target: `spectrum` or `csi`; None for the one the file was mainly made for.
-        truth: another simulation of the same receivers, which test rows are compared with: what is lost by
-            having learned from a world with fewer effects.
+        truth: another simulation of the same receivers, whose targets replace those of the test rows: the
+            loss by training on a simulation with fewer effects.
 
     Raises:
         DataError: not such a file, no such target, other receivers, or anything that `load_own` refuses.
@@ -34,11 +34,11 @@ def load_sionna(path: str | Path, target: str | None = None, truth: str | Path |
     data = _load(path, target)
     if truth is None or Path(truth).resolve() == Path(path).resolve():
         return data
-    return judged_by(data, _load(truth, target or data.site.kind), f"dataset.truth={truth}")
+    return with_true_targets(data, _load(truth, target or data.site.kind), f"dataset.truth={truth}")
 
 
-def judged_by(data: Measurements, truth: Measurements, named: str) -> Measurements:
-    """`data`, whose own test rows hold the targets of `truth`; never those of training rows.
+def with_true_targets(data: Measurements, truth: Measurements, named: str) -> Measurements:
+    """`data` with the targets of `truth` in its test rows; training rows keep their own.
 
     Raises:
         DataError: `truth` is not of the same receivers, kind and split.
@@ -72,7 +72,7 @@ def _load(path: str | Path, target: str | None) -> Measurements:
 
 
 def read_as(raw: Raw, target: str) -> Raw:
-    """The same file with one measurement, the array it was seen through, its noise and its solver's error."""
+    """The same file with one measurement, its array, noise and solver error."""
     other = [name for name in TARGETS if name != target]
     arrays = {k: v for k, v in raw.arrays.items() if k not in (*other, "array_position", "noise_variance")}
     names = {f"{target}_array_position": "array_position", f"{target}_noise_variance": "noise_variance"}

@@ -1,4 +1,4 @@
-"""Which rows train, validate and test: pure functions of positions and settings, stored with a hash."""
+"""Training, validation and test rows: pure functions of positions and settings, stored with a hash."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Baselines fitted once per dataset, split and settings: sweeps find their results on disk."""
+"""Baselines fitted once per dataset, split and settings, and cached on disk."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from gsparc.methods.registry import method_class
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 3  # raise it when a baseline or a metric changes its answers
-STORE_ABOVE_S = 3.0  # of the processor; a cheaper fit is repeated, so that its seconds are of today
+CACHE_VERSION = 3  # raise it when a baseline or a metric changes its results
+STORE_ABOVE_S = 3.0  # processor time; cheaper fits are repeated, so that their times are current
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Fitted:
     Attributes:
         methods: one fitted method per fold.
         scores: pooled results.
-        train_s: seconds of each fold's fit, as measured when it was first made [s].
+        train_s: fitting time of each fold, as first measured [s].
     """
 
     methods: tuple[Method, ...]
@@ -54,35 +54,35 @@ def baseline(
         cache: folder of earlier results; None keeps nothing.
     """
     unseen = eval_on == "val"
-    # The same data may be looked at in another model's local coordinates and units.
+    # The same data may be in another model's local coordinates and units.
     frame = f"{data.site.origin.tolist()} {data.site.target_scale}"
     key = hashlib.sha256(f"{data.site.sha256} {split.sha256} {frame}".encode()).hexdigest()[:24]
-    room = (
+    folder = (
         None
         if cache is None
         else Path(cache) / f"baselines-v{CACHE_VERSION}" / key / (f"{name}-train" if unseen else name)
     )
     methods, seconds = [], []
     for number, fold in enumerate(split.folds):
-        found = None if room is None else _stored_fit(room / f"fold{number}.ckpt")
+        found = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
         if found is None:
             method = method_class(name)()
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
-            report = method.fit(data, known, FitContext(room or Path()))
-            spent = time.process_time() - spent  # a busy machine's clock is not to be kept
+            report = method.fit(data, known, FitContext(folder or Path()))
+            spent = time.process_time() - spent  # wall time on a busy machine would mislead
             for note in report.notes:
                 log.info("fold %d: %s", number, note)
             found = (method, report.seconds)
-            if room is not None and spent > STORE_ABOVE_S:
-                checkpoint.save(room / f"fold{number}.ckpt", method, extra={"train_s": report.seconds})
+            if folder is not None and spent > STORE_ABOVE_S:
+                checkpoint.save(folder / f"fold{number}.ckpt", method, extra={"train_s": report.seconds})
         methods.append(found[0])
         seconds.append(found[1])
-    scores = None if room is None else _stored_scores(room / f"{eval_on}.npz")
+    scores = None if folder is None else _stored_scores(folder / f"{eval_on}.npz")
     if scores is None:
         scores = score(methods, data, split, eval_on)
-        if room is not None:
-            _store_scores(room / f"{eval_on}.npz", scores)
+        if folder is not None:
+            _store_scores(folder / f"{eval_on}.npz", scores)
     return Fitted(tuple(methods), scores, tuple(seconds))
 
 
@@ -93,7 +93,7 @@ def _stored_fit(path: Path) -> tuple[Method, float] | None:
         method, stored = checkpoint.load(path)
         return method, float(stored.extra["train_s"])
     except (checkpoint.CheckpointError, KeyError, ValueError) as error:
-        log.warning("a stored baseline is not usable and is made anew: %s", error)
+        log.warning("a cached baseline is unusable and fitted again: %s", error)
         return None
 
 
@@ -104,7 +104,7 @@ def _stored_scores(path: Path) -> Scores | None:
         with np.load(path, allow_pickle=False) as file:
             return Scores.from_arrays(dict(file))
     except Exception as error:  # whatever a damaged archive raises: it is only a cache
-        log.warning("stored results are not usable and are made anew: %s (%s)", path, error)
+        log.warning("cached results are unusable and computed again: %s (%s)", path, error)
         return None
 
 

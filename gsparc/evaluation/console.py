@@ -1,4 +1,4 @@
-"""What commands print: tables and sentences, errors in one line that says what to do."""
+"""Output of commands: a console, and errors in one line with what to do."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ WIDE = 120
 
 
 def open_console() -> Console:
-    """Where commands print: sentences in one piece, tables as wide as the terminal, or `WIDE` in a log."""
-    to_people = Console(soft_wrap=True)
-    if to_people.is_terminal or "COLUMNS" in os.environ:
-        return to_people
+    """Console without line breaks in sentences; tables as wide as the terminal, or `WIDE` in a log."""
+    terminal = Console(soft_wrap=True)
+    if terminal.is_terminal or "COLUMNS" in os.environ:
+        return terminal
     return Console(soft_wrap=True, width=WIDE)  # a log has no width: 80 columns cut headings short
 
 
@@ -39,12 +39,12 @@ def one_line(error: BaseException) -> str:
         group, _, choice = str(error.missing_cfg_file).partition("/")
         return f"{group}={choice}: no such choice{suggest(choice, _choices(group) or list(error.options))}"
     if isinstance(error, OverrideParseException):
-        return f"{error.override}: not understood; say KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
+        return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
     if isinstance(error, ConfigCompositionException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _override(error, error.__cause__)
     if isinstance(error, MissingMandatoryValue):
         key = str(error.full_key or str(error).rpartition(" ")[2])
-        return f"{key} is not set; say {key}=..."
+        return f"{key} is not set; give {key}=..."
     if isinstance(error, InstantiationException) and error.__cause__ is not None:
         return _argument(str(error)) or one_line(error.__cause__)
     if isinstance(error, HydraException):
@@ -54,7 +54,7 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror}"
     text = _first(error)
-    # People's errors are ValueErrors and their like; a bug's type says more than its text.
+    # Errors of use are ValueErrors and their like; for a bug the type is shown too.
     expected = isinstance(error, (ValueError, OSError, RuntimeError)) and text
     return text if expected else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
 
@@ -66,7 +66,7 @@ def _choices(group: str) -> list[str]:
 
 
 def _argument(text: str) -> str | None:
-    """The line for a setting that a class does not take (said with a +); None for other errors."""
+    """The line for a setting that a class does not take (added with +); None for other errors."""
     named = re.search(r"target '(gsparc\.[\w.]+)'[\s\S]*unexpected keyword argument '(\w+)'", text)
     if named is None:
         return None

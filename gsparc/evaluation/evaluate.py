@@ -1,4 +1,4 @@
-"""The harness: one method and the baselines under the same data, metrics and clock."""
+"""Evaluation of one method beside the baselines: same data, metrics and clock."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from gsparc.methods.timing import (
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
 SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
-OWN = "self"  # the evaluated method's name on the clock; baselines may carry the same name as it
+OWN = "self"  # the evaluated method's name among the timed ones; baselines may carry the same name as it
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What an evaluation found.
+    """Results of an evaluation.
 
     Attributes:
         facts: flat keys as in `summary.json`.
@@ -108,7 +108,7 @@ def paired_differences(scores: Scores, reference: Scores, name: str) -> dict[str
     The standard error takes samples as independent; under `grouped` neighbours are not: it is a lower bound.
 
     Raises:
-        ValueError: the two speak of different rows.
+        ValueError: the two are of different rows.
     """
     if not (np.array_equal(scores.row, reference.row) and np.array_equal(scores.fold, reference.fold)):
         raise ValueError(f"results cannot be paired with {name}: they are on different rows")
@@ -128,7 +128,7 @@ def latencies(
 ) -> dict[str, float | int | str | None]:
     """`time/*` of the method called OWN and `baseline/<name>/render_ms_*` of the others, timed in turns.
 
-    A method that marches rays for seconds a query has no batch figure: it would be timed for many minutes.
+    Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
     """
     clock = clock or ClockSettings()
     singles = cycling(methods, _queries(data, rows, 1))
@@ -179,7 +179,7 @@ def split_facts(split: Split) -> dict[str, Any]:
 
 
 def _queries(data: Measurements, rows: np.ndarray, size: int) -> list[Batch]:
-    """What is known of `size` of the `rows`, another set each time."""
+    """Batches of `size` of the `rows`, another set each, without targets."""
     picks = [np.take(rows, np.arange(turn, turn + size), mode="wrap") for turn in range(min(len(rows), 64))]
     where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
     return [where.batch(pick) for pick in picks]

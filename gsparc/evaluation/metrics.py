@@ -1,4 +1,4 @@
-"""The figures of merit every method is judged by; accumulated per sample so that differences can be paired.
+"""Figures of merit of all methods, accumulated per sample so that differences can be paired.
 
 Undefined values (the signal-to-noise ratio of a silent channel, the SSIM of an image smaller than its window)
 are NaN in the per-sample arrays, never enter a mean, are counted, and come out of `summary` as None.
@@ -22,14 +22,12 @@ from gsparc.data.schema import Kind
 log = logging.getLogger(__name__)
 
 DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
-SMALLEST_UNIT = (
-    1e-140  # squares of channels of a smaller or of its inverse are no numbers: told in stored units
-)
+SMALLEST_UNIT = 1e-140  # beyond it or its inverse squares under- or overflow: figures stay in stored units
 SILENCE = 1e-6  # of the true power: a silent prediction is 60 dB off, not infinitely
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
 DECIDING: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
-"""The one figure that places, fronts and prices are given by."""
+"""The figure by which methods, fronts and effects are compared."""
 
 RATIOS = ("nmse", "mse")  # of powers: compared in decibels, smaller is better
 DISTANCES = ("rmse_db", "mae_db", "mae")  # smaller is better
@@ -94,7 +92,7 @@ class SpectrumMetrics(SampleMetric):
         p, t = prediction.double().numpy(), target.double().numpy()
         m = np.ones(t.shape, bool) if mask is None else mask.numpy()
         p = np.where(m, p, t)  # an unmeasured pixel can be neither right nor wrong
-        count = _counted(m.sum((1, 2)))
+        count = _nonzero(m.sum((1, 2)))
         mse = ((p - t) ** 2).sum((1, 2)) / count
         return {
             "ssim": [_ssim(a, b, w, SSIM_WINDOW) for a, b, w in zip(p, t, m, strict=True)],
@@ -123,7 +121,7 @@ class SpectrumMetrics(SampleMetric):
 class ChannelMetrics(SampleMetric):
     """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR, NMSE after one complex scalar each.
 
-    `power_mae_db` is what a map of power can be judged by: how far the predicted power of a sample is off.
+    `power_mae_db` is the mean absolute error of a sample's power in dB, the figure of coverage maps.
 
     Args:
         scale: physical channel = stored channel * scale.
@@ -136,14 +134,14 @@ class ChannelMetrics(SampleMetric):
         self.scale = scale
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
-        # Of stored units, which are near 1: fourth powers of a channel of 1e-90 or 1e90 are no numbers.
+        # In stored units, which are near 1: fourth powers of 1e-90 or 1e90 under- or overflow.
         p, t = (x.to(torch.complex128).flatten(1).numpy() for x in (prediction, target))
         m = np.ones(t.shape, bool) if mask is None else mask.flatten(1).numpy()
-        p, t, count = np.where(m, p, 0), np.where(m, t, 0), _counted(m.sum(1))
+        p, t, count = np.where(m, p, 0), np.where(m, t, 0), _nonzero(m.sum(1))
         error, power = (np.abs(p - t) ** 2).sum(1), (np.abs(t) ** 2).sum(1)
         own, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
         explained = np.divide(cross, own, out=np.zeros_like(own), where=own > 0)
-        # One free number fits one number: for a single-entry channel the figure would say nothing.
+        # One free scalar fits a single-entry channel exactly: the figure is undefined there.
         left = np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan
         scale = self.scale if SMALLEST_UNIT <= self.scale <= 1 / SMALLEST_UNIT else 1.0
         unit = scale**2
@@ -179,7 +177,7 @@ class ChannelMetrics(SampleMetric):
 class PowerMetrics(SampleMetric):
     """RSSI (B, 1), linear power, denormalised: errors in dB and the linear NMSE.
 
-    A prediction at or below zero is read as the weakest power measured in the scored set, and counted; a
+    A prediction at or below zero is taken as the weakest power measured in the scored set, and counted; a
     target at or below zero has no decibels and is left out of the dB figures.
     """
 
@@ -197,9 +195,9 @@ class PowerMetrics(SampleMetric):
         """Adds `error_db`, `error_power`, `target_power`, `mse`, each (S,)."""
         raw = super().compute()
         p, t = raw["prediction"], raw["target"]
-        loud = t > 0
-        floor = t[loud].min() if loud.any() else np.finfo(np.float64).tiny
-        error_db = np.where(loud, _db(np.maximum(p, floor), np.where(loud, t, 1.0)), np.nan)
+        positive = t > 0
+        floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
+        error_db = np.where(positive, _db(np.maximum(p, floor), np.where(positive, t, 1.0)), np.nan)
         error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
         return {**raw, "error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
 
@@ -276,8 +274,8 @@ def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
     return np.where(signal > 0, np.clip(np.where(noise == 0, np.inf, ratio), -DB_CAP, DB_CAP), np.nan)
 
 
-def _counted(entries: np.ndarray) -> np.ndarray:
-    """Numbers of measured entries (B,) to divide by; NaN where nothing was measured: that is not perfect."""
+def _nonzero(entries: np.ndarray) -> np.ndarray:
+    """Numbers of measured entries (B,) to divide by; NaN where nothing was measured."""
     return np.where(entries > 0, entries, np.nan)
 
 

@@ -22,11 +22,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Opened:
-    """Checkpoints of one run with the data they speak of.
+    """Checkpoints of one run with their data.
 
     Attributes:
         methods: one per fold.
-        stored: what their files hold.
+        stored: contents of their files.
         data: in the models' local coordinates and units.
         split: the folds the methods were trained on.
     """
@@ -68,7 +68,7 @@ def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | 
         before = {}
     settings = {**before, **now}
     if "name" not in settings:
-        raise ValueError(f"{stored.path} does not say its {group}; say {group}.name=...")
+        raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")
     return settings
 
 
@@ -114,7 +114,7 @@ def aligned(data: Measurements, site: Site) -> Measurements:
     if own.static_position is not None and site.static_position is not None:
         gap = float(np.linalg.norm(own.static_position + shift - site.static_position))
         if gap > SAME_PLACE_M:
-            raise ValueError(f"the static {own.static_end} of {own.name} stands {gap:.3g} m from the model's")
+            raise ValueError(f"the static {own.static_end} of {own.name} is {gap:.3g} m from the model's")
     if not shift.any() and own.target_scale == site.target_scale:
         return data
     rescale = own.target_scale / site.target_scale

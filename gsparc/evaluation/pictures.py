@@ -1,4 +1,4 @@
-"""What was measured beside what was predicted, as a person looks at it."""
+"""Pictures of measured beside predicted targets."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ def draw_predictions(
     found = method.answer(batch)
     predicted = found.mean.numpy()
     if spectra:
-        sure = None if found.confidence is None else found.confidence.numpy()
-        draw_spectra(batch.target.numpy(), predicted, rows, title, path, sure)
+        confidence = None if found.confidence is None else found.confidence.numpy()
+        draw_spectra(batch.target.numpy(), predicted, rows, title, path, confidence)
     else:
         draw_points(batch.target.numpy(), predicted, title, path)
 

@@ -1,4 +1,4 @@
-"""Predictions on the chosen rows, turned into per-sample results pooled over folds."""
+"""Per-sample results of predictions on chosen rows, pooled over folds."""
 
 from __future__ import annotations
 

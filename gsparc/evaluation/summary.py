@@ -1,4 +1,4 @@
-"""What a run leaves behind: `summary.json` for scripts, `per_sample.csv` for plots, a table for people."""
+"""Results of a run: `summary.json`, `per_sample.csv` and a table."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsparc.data.files import whole_file
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 
-BUSY = 1.2  # 1-minute load per core above which times are said to be inflated
+BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
 def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
@@ -58,7 +58,7 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
 
     Args:
         facts: flat facts as in `summary.json`.
-        method: name of the row that `facts[prefix/...]` speaks of.
+        method: name of the row with `facts[prefix/...]`.
         title: what was measured.
         prefix: `test`, `train` or `val`.
     """
@@ -84,23 +84,23 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """What a reader of the table must know besides: stand-ins, a busy machine, a simpler method that wins."""
-    return circumstances(facts) + simpler_wins(facts, prefix)
+    """Remarks on a table: stand-ins, a busy machine, a baseline that is better."""
+    return run_conditions(facts) + better_baseline(facts, prefix)
 
 
-def circumstances(facts: Mapping[str, Any]) -> list[str]:
+def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     """Stand-ins, and a busy machine."""
     found = []
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
-        found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here speaks of it")
+        found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here is about it")
     load = facts.get("machine/load")
     if load is not None and load > BUSY:
         found.append(f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so")
     return found
 
 
-def simpler_wins(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
+def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """The baseline that beats the method, if one does."""
     figure = next((name for name in ("psnr_db", "rmse_db") if f"{prefix}/{name}" in facts), "nmse")
     sign = -1 if figure == "psnr_db" else 1

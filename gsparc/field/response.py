@@ -1,7 +1,7 @@
-"""From what Gaussians emit to what a receiver reports: channels, carrier phase, an array's spectra.
+"""From emissions of Gaussians to measurements: channels, carrier phase, an array's spectra.
 
-Each response is one term of the model, with its own gradients; the model holds the one that its site and
-settings ask for.
+Each response is one term of the model, with its own gradients; the model holds the one that site and
+settings require.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ResponseSettings:
 
     Attributes:
         array: spectra arise in the static array: complex emissions are composited per direction to z, the
-            elements measure `h = A z`, and the spectrum is `|A^H h|`, normalised as the dataset says.
+            elements measure `h = A z`, and the spectrum is `|A^H h|`, normalised as the dataset is.
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
         carrier: channels take phase, delay and 1/r from the path between Gaussian and receiver. Gaussians
             then do not occlude; visibility is part of the emission.

@@ -1,1 +1,1 @@
-"""Other methods of the field behind the same face, from the mean image to the Gaussian process."""
+"""Published learned methods as `Method`s, trained and stored alike."""

@@ -10,14 +10,14 @@ from torch import Tensor, nn
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 
-def perceptron(inner: int, outer: int, width: int, depth: int, *, quiet: bool = False) -> nn.Sequential:
-    """`depth` hidden layers of `width`; `quiet` starts at zero output."""
+def perceptron(inner: int, outer: int, width: int, depth: int, *, zero_output: bool = False) -> nn.Sequential:
+    """`depth` hidden layers of `width`; `zero_output`: the last layer starts at zero."""
     sizes = [inner, *[width] * depth]
     layers: list[nn.Module] = []
     for a, b in pairwise(sizes):
         layers += [nn.Linear(a, b), nn.ReLU()]
     last = nn.Linear(sizes[-1], outer)
-    if quiet:
+    if zero_output:
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
     return nn.Sequential(*layers, last)
@@ -43,7 +43,7 @@ class Deformation(nn.Module):
         # The first layer is linear: its two halves are added instead of writing every pair of inputs out.
         self.by_place = nn.Linear(self.place.width, width)
         self.by_query = nn.Linear(self.query.width, width)
-        self.rest = perceptron(width, outputs, width, depth - 1, quiet=True)
+        self.rest = perceptron(width, outputs, width, depth - 1, zero_output=True)
 
     def forward(self, places: Tensor, queries: Tensor) -> Tensor:
         """places (N, 3) [m], queries (B, 3) [m] -> (B, N, outputs)."""

@@ -1,4 +1,4 @@
-"""From directions of arrival to virtual transmitters, and back to directions where none were measured."""
+"""Virtual transmitters from directions of arrival, and directions where none were measured."""
 
 from __future__ import annotations
 

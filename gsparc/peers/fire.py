@@ -1,7 +1,7 @@
 """A network in the style of FIRE: a variational autoencoder from one antenna's uplink to its downlink.
 
-After Liu et al., "FIRE: Enabling reciprocity for FDD MIMO systems", MobiCom 2021: the code sums up the
-paths, and the decoder plays them in the other band. Sizes and training are ours.
+After Liu et al., "FIRE: Enabling reciprocity for FDD MIMO systems", MobiCom 2021: the code represents the
+paths, and the decoder evaluates them in the other band. Sizes and training are ours.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Fire(UplinkMethod):
         for _ in range(self.steps):
             pick = torch.randint(len(x), (self.batch,), generator=generator)
             noise = torch.randn(self.batch, self.code, generator=generator)
-            # A snapshot's phase is its own: any turn of both ends is as good a sample.
+            # Snapshots have arbitrary phase: rotating both ends augments the data.
             turn = torch.polar(
                 torch.ones(self.batch, 1), 6.2832 * torch.rand(self.batch, 1, generator=generator)
             )

@@ -5,8 +5,8 @@ Radio-Frequency Data Synthesis", NeurIPS 2025. Its forerunner RFSPM (K. Yang et 
 Splatting-Based RF Signal Spatial Propagation Modeling", 2025) had a network per Gaussian instead.
 
 Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum, the loss
-in the frequency domain. Left out: the phase of the transmittance (ours hides, it does not turn; radiances
-take up what is turned behind others), adaptive density control, orthographic splatting onto a sphere of rays
+in the frequency domain. Left out: the phase of the transmittance (ours attenuates without a phase; radiances
+absorb it), adaptive density control, orthographic splatting onto a sphere of rays
 (our footprints lie on the tangent plane).
 """
 
@@ -83,7 +83,7 @@ class ComplexGaussians(Network):
         self._frozen: FrozenPlan | None = None
 
     def radiance(self, tx: Tensor, rx: Pose) -> Tensor:
-        """What each Gaussian sends (B, N, 2), by the direction in which it sees the moving end."""
+        """Radiance (B, N, 2) of each Gaussian towards the moving end."""
         towards = self.scene.site.moving(tx, rx)[:, None] - self.field.means
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(0.05)
         series = fourier_legendre(towards / distance, self.degree, self.order)
@@ -114,7 +114,7 @@ class ComplexGaussians(Network):
         return plain + self.fourier_weight * difference
 
     def train(self, mode: bool = True) -> ComplexGaussians:
-        """A view kept for inference ends with further training."""
+        """Further training drops the frozen view."""
         self._frozen = None
         super().train(mode)
         return self

@@ -1,4 +1,4 @@
-"""What every network of a peer knows of its scene, and what is asked of it."""
+"""Scene description and base class of the peers' networks."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Scene:
 
     @property
     def reach(self) -> float:
-        """A length in which the scene is large [m]: from the static end to the far side of the box."""
+        """Extent of the scene [m]: from the static end to the far side of the box."""
         low, high = self.box
         still = self.receiver.position if self.receiver is not None else self.transmitter
         middle = (low + high) / 2
@@ -56,5 +56,5 @@ class Network(nn.Module):
 
     @torch.no_grad()
     def answer(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The prediction at inference, where something may be kept between calls."""
+        """The prediction at inference, which may keep state between calls."""
         return self(tx, rx)

@@ -57,7 +57,7 @@ class NeWRF(TrainedPeer):
         super().__init__(name, **training)
         self.shape = (width, depth, octaves, samples, neighbours)
 
-    def look(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Virtual transmitters, and which of them every training receiver sees.
 
         Raises:

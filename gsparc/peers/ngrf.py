@@ -1,4 +1,4 @@
-"""nGRF: channels as a direct complex sum over Gaussians, with no picture in between.
+"""nGRF: channels as a direct complex sum over Gaussians, with no image in between.
 
 M. Umer, M. A. Mohsin, A. Bilal, J. M. Cioffi, "Neural Gaussian Radio Fields for Channel Estimation", 2025.
 

@@ -6,8 +6,8 @@ for Efficient Wireless Radiance Field Rendering" (SwiftWRF), 2025.
 Kept: two-dimensional Gaussians without depth, a plain sum instead of compositing, one small network from
 (Gaussian, position of the moving end) to changes of centre, shape and strength. Left out: the two stages with
 annealed smoothing and the residual scheme between groups of spectra. The Gaussians lie on the unit sphere
-around the receiver rather than in the picture's plane, so that the seam in azimuth closes; the plain sum is
-our compositing in the limit of vanishing opacity, where nobody hides anybody.
+around the receiver rather than in the image plane, so that the seam in azimuth closes; the plain sum is
+our compositing in the limit of vanishing opacity, without occlusion.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gsparc.peers.network import Network, Scene
 from gsparc.peers.trained import TrainedPeer
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
-THIN = 1e-3  # opacity of every Gaussian; a hundred on top of each other hide a twentieth
+THIN = 1e-3  # opacity of every Gaussian; a hundred on top of each other lose a twentieth on average
 CUTOFF = Cutoff(3e-3, relative=True)
 SHIFT = 0.1  # [rad] per unit of the network's output
 
@@ -71,7 +71,7 @@ class SwiftWRF(TrainedPeer):
 
 
 class PlanarGaussians(Network):
-    """N Gaussians on the picture; each has a tangent plane of its own in which it moves and turns."""
+    """N Gaussians on the sphere; each moves and turns in its own tangent plane."""
 
     base: Tensor
     axes: Tensor
@@ -104,7 +104,7 @@ class PlanarGaussians(Network):
         flat = torch.full_like(widths[..., :1], 1e-4)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
         batch = len(moved)
-        quats = spun(self.frames, angle)
+        quats = turned_about_normal(self.frames, angle)
         opacities = widths.new_full((batch, len(self.base)), THIN)
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
         strength = (self.strengths.unsqueeze(-1) + light) / THIN
@@ -136,7 +136,7 @@ def frame_quaternions(axes: Tensor, normal: Tensor) -> Tensor:
     return torch.from_numpy(Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)).float()
 
 
-def spun(frame: Tensor, half: Tensor) -> Tensor:
+def turned_about_normal(frame: Tensor, half: Tensor) -> Tensor:
     """Frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
     w, x, y, z = frame.unsqueeze(-1).unbind(-2)
     c, s = half.cos(), half.sin()

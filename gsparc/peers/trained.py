@@ -1,4 +1,4 @@
-"""What all peers trained by gradient share: one loop under a budget of seconds, one way to store."""
+"""Base of peers trained by gradient: training loop under a time budget, stored state."""
 
 from __future__ import annotations
 
@@ -71,8 +71,8 @@ class TrainedPeer(Method):
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """The untrained network of a scene."""
 
-    def look(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """What is read off the training rows (n,) before training; stored with the weights."""
+    def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+        """Tensors computed from the training rows (n,) before training; stored with the weights."""
         return {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -92,7 +92,7 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: the training set is empty")
         L.seed_everything(self.seed, verbose=False)
         self.site, self.scene = data.site, _scene(data, rows)
-        self.found = self.look(data, rows)
+        self.found = self.precompute(data, rows)
         self.network = self.build(self.scene, self.found)
         self._train(data, rows, watch)
         self.network.eval()

@@ -1,4 +1,4 @@
-"""What a static antenna array makes of arriving waves: `h = A z`, the Bartlett spectrum `|A^H h|`, its lags.
+"""Response of a static antenna array to arriving waves: `h = A z`, the Bartlett spectrum `|A^H h|`, its lags.
 
 The squared spectrum of M elements is a trigonometric polynomial: `|A^H h|^2 = B r`, where the columns of B
 are the cosines and sines of the array's distinct element differences (its co-array; 49 columns for a 4 x 4

@@ -1,4 +1,4 @@
-"""The frozen small matrices of a static array: vectors and a noise floor in, whole spectra out."""
+"""Bartlett spectra of a static array from small precomputed matrices."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import lags
 
 TINY = 1e-9  # of a squared spectrum: keeps the slope of the square root finite
-SILENT = 1e-9  # harmonics this much weaker than the strongest are none: float32 would not see them
+NEGLIGIBLE = 1e-9  # harmonics this much weaker than the strongest are below float32's resolution
 
 
 class SpectrumRenderer(nn.Module):
@@ -92,8 +92,8 @@ def _harmonics(basis: Tensor, columns: int, periodic: bool) -> tuple[Tensor, Ten
     if not periodic:
         return basis.permute(2, 0, 1).reshape(numbers, -1), torch.eye(width, dtype=basis.dtype)
     spectrum = torch.fft.rfft(basis, dim=1) / width
-    loud = spectrum.abs().amax((0, 2))
-    kept = torch.nonzero(loud > SILENT * loud.max()).squeeze(1)
+    peak = spectrum.abs().amax((0, 2))
+    kept = torch.nonzero(peak > NEGLIGIBLE * peak.max()).squeeze(1)
     twice = torch.where((kept == 0) | (2 * kept == width), 1.0, 2.0).double()
     turn = 2 * torch.pi / width * kept[:, None] * torch.arange(columns, dtype=torch.float64)
     waves = torch.stack([twice[:, None] * turn.cos(), -twice[:, None] * turn.sin()], 1).flatten(0, 1)

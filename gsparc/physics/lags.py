@@ -1,4 +1,4 @@
-"""A Bartlett spectrum in the few numbers it is made of: one complex number per difference of array elements.
+"""A Bartlett spectrum as its lags: one complex number per difference of array elements.
 
 `P(u) = a(u)^H R a(u) = sum_d r_d exp(-j k u.d)` over the differences d of the elements; a plane wave of unit
 power from v has `r_d = c_d / M^2 exp(+j k v.d)`, c_d being how many pairs of elements are d apart.

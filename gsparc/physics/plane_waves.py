@@ -1,4 +1,4 @@
-"""Plane waves with a delay: what one source puts on every antenna and tone.
+"""Plane waves with a delay: response of one source at every antenna and tone.
 
 h[a, k] = sum_n g_n exp(+j 2 pi q_a . w_n) exp(-j 2 pi k t_n), with q_a the antenna's place in the array's
 plane in wavelengths, w_n the source's direction cosines in that plane, k the tone's number and t_n its delay
@@ -30,13 +30,13 @@ class Aperture:
     tones: Tensor
 
     @cached_property
-    def turning(self) -> Tensor:
-        """What an atom is multiplied by when a cosine moves (2, 1, A)."""
+    def cosine_slope(self) -> Tensor:
+        """Factor (2, 1, A) of the derivative by a direction cosine."""
         return (2j * math.pi * self.places.T)[:, None]
 
     @cached_property
-    def delaying(self) -> Tensor:
-        """What an atom is multiplied by when its delay moves (K,)."""
+    def delay_slope(self) -> Tensor:
+        """Factor (K,) of the derivative by the delay."""
         return -2j * math.pi * self.tones
 
     def at(self, tones: Tensor) -> Aperture:
@@ -53,7 +53,7 @@ def flat_places(array: np.ndarray, wavelength: float) -> Tensor:
 
 @dataclass(frozen=True)
 class Columns:
-    """What N sources and their slopes put on an aperture: 4 N columns, each antennas times tones.
+    """Responses of N sources and their derivatives on an aperture: 4 N columns, each antennas times tones.
 
     The slopes are of an atom of gain 1, by its first cosine, its second and its delay, in that order.
 
@@ -70,8 +70,8 @@ class Columns:
         """Of sources (B, N, 2) and (B, N)."""
         over_antennas = steering(direction, aperture)[:, None]
         over_tones = delays(delay, aperture)[:, None]
-        by_cosine = over_antennas * aperture.turning
-        by_delay = over_tones * aperture.delaying
+        by_cosine = over_antennas * aperture.cosine_slope
+        by_delay = over_tones * aperture.delay_slope
         return Columns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
 
     def gram(self) -> Tensor:
@@ -87,9 +87,9 @@ class Columns:
     def inner(self, snapshot: Tensor) -> Tensor:
         """Inner products (B, 4 N) of all columns with snapshots (B, A, K)."""
         n, (antennas, tones) = self.antennas.shape[2], self._flat()
-        heard = antennas.conj() @ snapshot
-        by_cosine = (heard.unflatten(1, (3, n)) * tones[:, None, :n].conj()).sum(-1)
-        by_delay = (heard[:, :n] * tones[:, n:].conj()).sum(-1)
+        correlation = antennas.conj() @ snapshot
+        by_cosine = (correlation.unflatten(1, (3, n)) * tones[:, None, :n].conj()).sum(-1)
+        by_delay = (correlation[:, :n] * tones[:, n:].conj()).sum(-1)
         return torch.cat([by_cosine.flatten(1), by_delay], 1)
 
     def _flat(self) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,6 @@
 """`argos-sim`: a stand-in for the Argos release, in its layout, from rays among city blocks.
 
-Loudly not real data. 4,000 users walk in open and blocked streets before an 8 x 8 array at 2.4 GHz; each
+Not real data. 4,000 users walk in open and blocked streets before an 8 x 8 array at 2.4 GHz; each
 snapshot carries a phase, a timing and a frequency offset of its own, as measured ones do. Besides the
 release's files (`csidata.npy` of 8 antennas, `base-station.yml`) there are all 64 antennas
 (`csidata-64.npy`) and what no release tells: where the users were (`positions.npy`).
@@ -20,21 +20,21 @@ from gsparc.simulate.streets import Rays, Streets, trace
 
 STAND_IN = "argos-sim"  # `dataset_name` of the simulated replacement
 CARRIER_HZ = 2.4e9
-SPACING_HZ = 312.5e3  # 20 MHz in 64 tones, of which 52 carry something
+SPACING_HZ = 312.5e3  # 20 MHz in 64 tones, of which 52 are used
 TONES = np.concatenate([np.arange(-26, 0), np.arange(1, 27)])
 FFT = 64
 SIDE = 8
 LOWER, UPPER = np.array([-140.0, -105.0]), np.array([140.0, 105.0])  # [m] where users walk
 HEIGHT_M = (1.0, 1.9)
 MEDIAN_SNR_DB = 25.0
-HEARD_DB = 5.0  # a weaker packet is not decoded, so no snapshot of it exists
+DECODED_DB = 5.0  # a weaker packet is not decoded, so no snapshot of it exists
 SCATTERERS = 60
 CHUNK = 250  # users whose responses are in memory at once
 
 
 @dataclass(frozen=True)
 class Offsets:
-    """What every snapshot has of its own; 0 switches one off.
+    """Random offsets of each snapshot; 0 switches one off.
 
     Attributes:
         phase: 1 for a phase drawn from the whole circle.
@@ -106,10 +106,10 @@ class World:
 
 
 def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
-    """`count` users that the base station hears, in streets open to it and blocked from it.
+    """`count` users whose packets the base station decodes, in streets open to it and blocked from it.
 
     Raises:
-        ValueError: fewer than `count` of all places are audible.
+        ValueError: fewer than `count` users are decoded.
     """
     streets, rng = scene(seed, scatterers), np.random.default_rng([seed, 2])
     drawn = rng.uniform(LOWER, UPPER, (8 * count, 2))
@@ -118,11 +118,11 @@ def world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
     rays = trace(streets, users, LIGHT / CARRIER_HZ)
     power = (np.abs(rays.gain) ** 2).sum(axis=1)
     noise = float(np.median(power)) / 10 ** (MEDIAN_SNR_DB / 10)
-    heard = np.flatnonzero(power > noise * 10 ** (HEARD_DB / 10))[:count]
-    if len(heard) < count:
-        raise ValueError(f"argos-sim: only {len(heard)} of {count} users are heard")
-    kept = Rays(rays.gain[heard], rays.delay[heard], rays.direction[heard])
-    return World(users[heard], kept, noise)
+    decoded = np.flatnonzero(power > noise * 10 ** (DECODED_DB / 10))[:count]
+    if len(decoded) < count:
+        raise ValueError(f"argos-sim: only {len(decoded)} of {count} users are decoded")
+    kept = Rays(rays.gain[decoded], rays.delay[decoded], rays.direction[decoded])
+    return World(users[decoded], kept, noise)
 
 
 def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:

@@ -22,12 +22,12 @@ from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import Shards
 from gsparc.simulate.spectrum import spectra
 
-SECONDS = "seconds"  # entry of a shard: what tracing it cost, so that the bill survives an interruption
+SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
 
 
 @dataclass(frozen=True)
 class Assembled:
-    """A finished file and what is drawn and told of it.
+    """A finished file and facts about it.
 
     Attributes:
         data: as `load_own` reads the file.
@@ -42,7 +42,7 @@ class Assembled:
     facts: dict[str, float]
 
 
-def part(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
+def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[str, np.ndarray]:
     """What a shard keeps of some receivers."""
     frequency = campaign.scene.frequency_hz
     images, peak = spectra(paths, campaign.spectrum, frequency, wavelength)
@@ -91,18 +91,18 @@ def assemble(
     paths = join([Paths(*(p[name] for name in ("offsets", *ARRAYS))) for p in parts])
     del parts
     power = whole["received_power"]
-    heard = power > 0
-    if not heard.any():
+    reached = power > 0
+    if not reached.any():
         raise ValueError("nothing reaches any receiver; is the transmitter inside a building?")
     facts = priors.scene_facts(
-        whole["delay_spread"][heard],
-        float((whole["power_below"][heard] / power[heard]).mean()),
+        whole["delay_spread"][reached],
+        float((whole["power_below"][reached] / power[reached]).mean()),
         campaign.scene.bandwidth_hz,
         np.linalg.norm(receivers - engine.transmitter, axis=1),
         campaign.spectrum.near_field(engine.wavelength),
     )
     facts |= {
-        "silent_receivers": float((~heard).sum()),
+        "silent_receivers": float((~reached).sum()),
         "paths_per_receiver": len(paths.order) / len(receivers),
     }
     arrays = _arrays(campaign, engine, receivers, effects, whole, paths)

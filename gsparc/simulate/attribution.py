@@ -1,6 +1,6 @@
-"""What each effect is worth to each receiver, from the interaction record of one full simulation.
+"""Contribution of each effect at each receiver, from the interaction record of one full simulation.
 
-Nothing is traced again: dropping an effect in the solver reshuffles the rays of the others and would measure
+Nothing is traced again: without an effect the solver draws other rays, and the difference would include
 the solver's noise.
 """
 
@@ -16,13 +16,13 @@ from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
-SILENCE_DB = 99.0  # a receiver that loses everything is off by this much
-ASKED = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
+SILENCE_DB = 99.0  # error of a receiver that loses everything
+REQUIREMENT = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
 class Deliverable:
-    """What must hold, for how many receivers.
+    """A requirement: kind of error, tolerance and share of receivers.
 
     Attributes:
         kind: `coverage` (received power), `csi` (channel) or `spectrum`.
@@ -37,12 +37,12 @@ class Deliverable:
 
     @staticmethod
     def parse(text: str, quantile: float = 0.95) -> Deliverable:
-        """From words: `coverage +-1 dB`, `csi -20 dB`, `spectrum skill` (0.9 unless a number is given).
+        """From text: `coverage +-1 dB`, `csi -20 dB`, `spectrum skill` (0.9 unless a number is given).
 
         Raises:
             ValueError: none of these.
         """
-        found = ASKED.fullmatch(text.strip())
+        found = REQUIREMENT.fullmatch(text.strip())
         if not (found and 0 < quantile < 1):
             raise ValueError(
                 f"effects.deliverable={text!r}: expected 'coverage +-1 dB', 'csi -20 dB' or "
@@ -94,8 +94,8 @@ class Probe:
         object.__setattr__(self, "_images", {})
 
     @property
-    def heard(self) -> np.ndarray:
-        """Receivers that anything reaches (R,) bool; the others are judged by nobody."""
+    def reached(self) -> np.ndarray:
+        """Receivers that at least one path reaches (R,) bool; the others are not evaluated."""
         return self.paths.received_power() > 0
 
     def shares(self, kept: Effects) -> np.ndarray:
@@ -129,7 +129,7 @@ class Probe:
 
     def _image(self, kept: Effects | None) -> np.ndarray:
         if kept is None and self.nearest is None:
-            raise ValueError("spectra are judged against the nearest receiver's: trace it too")
+            raise ValueError("spectra are compared with the nearest receiver's: trace it too")
         memory: dict[Effects | None, np.ndarray] = self._images  # type: ignore[attr-defined]
         if kept is not None and kept != self.effects:
             return self._render(self.paths.under(kept))

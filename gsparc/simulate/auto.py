@@ -1,4 +1,4 @@
-"""`effects=auto`: measure what each effect is worth, keep what the deliverable needs, verify the promise."""
+"""`effects=auto`: measure each effect, keep those the requirement needs, verify on held-back receivers."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class AutoSettings:
     """How `auto` decides.
 
     Attributes:
-        deliverable: what must hold, in words (`attribution.Deliverable.parse`).
+        deliverable: the requirement, as text (`attribution.Deliverable.parse`).
         quantile: share of receivers for which it must hold.
         probes: receivers the decision is measured on, at least 16, spread out.
         confidence: with which the quantile must follow from them (`allowed_failures`).
-        held_back: other receivers on which the promise is then verified.
+        held_back: other receivers on which the choice is then verified.
         full: what "everything on" means.
     """
 
@@ -52,8 +52,8 @@ class AutoSettings:
 
 
 @dataclass(frozen=True)
-class Worth:
-    """One row of the table: what is lost when one effect is left out.
+class EffectRow:
+    """One row of the table: errors when one effect is left out.
 
     Attributes:
         effect: as in `removals`.
@@ -62,7 +62,7 @@ class Worth:
         nmse, nmse_p95: of the channel, median and 95th percentile.
         error, error_p95: of the deliverable, likewise.
         seconds: CPU time of tracing `TIMED` probes without it [s].
-        reason: what physics says beforehand; empty where it says nothing.
+        reason: expectation from physics; empty where there is none.
         kept: whether it is simulated.
     """
 
@@ -79,14 +79,14 @@ class Worth:
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """Whether the promise holds on receivers that had no say.
+class Verification:
+    """Whether the requirement holds on receivers that were not used to decide.
 
     Attributes:
-        receivers: how many were asked.
+        receivers: how many were verified.
         met: share of them within the tolerance.
         error, error_p95: of the deliverable, median and 95th percentile.
-        kept: whether the promise is kept.
+        kept: whether the requirement is met.
     """
 
     receivers: int
@@ -98,11 +98,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Choice:
-    """What `auto` decided, and on what grounds.
+    """The decision of `auto` and the measurements behind it.
 
     Attributes:
         effects: to simulate.
-        deliverable: what was promised, in words.
+        deliverable: the requirement, as text.
         table: one row per effect.
         seconds_all, seconds_chosen: the same with everything and with the choice [s].
         seconds: what deciding cost in all [s].
@@ -111,11 +111,11 @@ class Choice:
 
     effects: Effects
     deliverable: str
-    table: tuple[Worth, ...]
+    table: tuple[EffectRow, ...]
     seconds_all: float
     seconds_chosen: float
     seconds: float
-    verdict: Verdict | None = None
+    verdict: Verification | None = None
 
     @property
     def saved(self) -> float:
@@ -133,11 +133,11 @@ class Choice:
         return Choice(
             Effects(**stored["effects"]),
             stored["deliverable"],
-            tuple(Worth(**row) for row in stored["table"]),
+            tuple(EffectRow(**row) for row in stored["table"]),
             float(stored["seconds_all"]),
             float(stored["seconds_chosen"]),
             float(stored["seconds"]),
-            None if verdict is None else Verdict(**verdict),
+            None if verdict is None else Verification(**verdict),
         )
 
 
@@ -148,26 +148,26 @@ def decide(
     probe: Probe,
     explain: Callable[[Probe], Mapping[str, str]],
 ) -> Choice:
-    """Measure on `receivers` (R, 3) [m] and choose the cheapest set of effects that keeps the promise there.
+    """Measure on `receivers` (R, 3) [m] and choose the cheapest effects that meet the requirement.
 
     Args:
         engine: traces.
         receivers: the probes.
-        settings: what must hold.
+        settings: requirement and confidence.
         probe: the same receivers traced with everything.
         explain: prior reasons by effect.
     """
     begin = time.perf_counter()
     full = probe.effects
     deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
-    heard = probe.heard
-    if not heard.any():
+    reached = probe.reached
+    if not reached.any():
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
     dropped = removals(full)
-    errors = {name: probe.errors(kept, deliverable)[heard] for name, kept in dropped.items()}
-    failures = allowed_failures(int(heard.sum()), settings.quantile, settings.confidence)
+    errors = {name: probe.errors(kept, deliverable)[reached] for name, kept in dropped.items()}
+    failures = allowed_failures(int(reached.sum()), settings.quantile, settings.confidence)
 
     def holds(error: np.ndarray) -> bool:
         return bool((error > deliverable.tolerance).sum() <= failures)
@@ -177,14 +177,14 @@ def decide(
     seconds_all = _timed(engine, timed, full)
     seconds = {name: _timed(engine, timed, less) for name, less in dropped.items()}
     costs = {s: _estimate(s, full, seconds, seconds_all) for s in combinations(full, removable)}
-    chosen = _cheapest(costs, lambda some: holds(probe.errors(some, deliverable)[heard]), full)
+    chosen = _cheapest(costs, lambda some: holds(probe.errors(some, deliverable)[reached]), full)
     why = explain(probe)
     table = []
     for name, less in dropped.items():
-        share, nmse = probe.shares(less)[heard], probe.nmse(less)[heard]
+        share, nmse = probe.shares(less)[reached], probe.nmse(less)[reached]
         kept = _keeps(chosen, name)
         reason = why.get("depth" if name.startswith("depth") else name, "")
-        table.append(Worth(
+        table.append(EffectRow(
             name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
             float(np.median(errors[name])), _p95(errors[name]), seconds[name], reason, kept,
         ))  # fmt: skip
@@ -195,25 +195,26 @@ def decide(
 
 
 def verify(choice: Choice, settings: AutoSettings, held_back: Probe) -> Choice:
-    """The choice with its verdict on receivers that had no say, by path attribution in a full run."""
+    """The choice with its verification on held-back receivers, by path attribution in a full run."""
     deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
-    errors = held_back.errors(choice.effects, deliverable)[held_back.heard]
+    errors = held_back.errors(choice.effects, deliverable)[held_back.reached]
     met = float((errors <= deliverable.tolerance).mean())
-    verdict = Verdict(len(errors), met, float(np.median(errors)), _p95(errors), met >= deliverable.quantile)
+    kept = met >= deliverable.quantile
+    verdict = Verification(len(errors), met, float(np.median(errors)), _p95(errors), kept)
     return replace(choice, verdict=verdict)
 
 
 def allowed_failures(probes: int, quantile: float, confidence: float) -> int:
-    """Most probes that may break the tolerance while the promise still follows.
+    """Most probes that may exceed the tolerance while the requirement still follows.
 
-    The largest c with P(Binomial(probes, 1 - quantile) <= c) <= 1 - confidence: were the promise broken, so
-    few failures would be that unlikely. 0 where even none proves nothing (too few probes).
+    The largest c with P(Binomial(probes, 1 - quantile) <= c) <= 1 - confidence: were it violated, so few
+    failures would be that unlikely. 0 where even none proves nothing (too few probes).
     """
     return max(0, int(binom.ppf(1 - confidence, probes, 1 - quantile)) - 1)
 
 
 def _cheapest(costs: Mapping[Effects, float], holds: Callable[[Effects], bool], full: Effects) -> Effects:
-    """The set of least cost that keeps the promise; where costs are too near to tell, the smallest set."""
+    """The cheapest set that meets the requirement; of sets with similar costs, the smallest."""
     found: list[Effects] = []
     for some in sorted(costs, key=lambda s: costs[s]):
         if found and costs[some] > (1 + TIMING_NOISE) * costs[found[0]]:
@@ -237,7 +238,7 @@ def _timed(engine: Engine, receivers: np.ndarray, effects: Effects) -> float:
 def _estimate(some: Effects, full: Effects, seconds: Mapping[str, float], everything: float) -> float:
     """Seconds of a combination, as if what each removal saves multiplied; the choice itself is then timed.
 
-    Leaving something out never costs: a time that says so is noise, which once kept effects worth nothing.
+    Leaving an effect out never costs time: a measurement that says so is noise.
     """
     saved = []
     if some.depth < full.depth:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.simulate import auto, priors
-from gsparc.simulate.assembly import SECONDS, Assembled, assemble, part
+from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
 from gsparc.simulate.attribution import Deliverable, Probe
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.convergence import Convergence, compare
@@ -28,7 +28,7 @@ PARTS = 2  # version of what a shard holds: those of another are refused
 
 @dataclass(frozen=True)
 class Changed:
-    """What dropping effects does to receivers that had no say.
+    """Errors by dropped effects at held-back receivers.
 
     Attributes:
         rows: (n,) receivers.
@@ -44,7 +44,7 @@ class Outcome:
     """A finished dataset and what it cost.
 
     Attributes:
-        made: the file and what is told of it.
+        made: the file and facts about it.
         receivers: (S, 3) [m], world.
         transmitter: (3,) [m].
         effects: that were simulated.
@@ -71,7 +71,7 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
         SimulatorMissing: the scene needs Sionna and it is not here.
     """
     if out.exists():
-        raise ValueError(f"out={out} exists; remove it or say another")
+        raise ValueError(f"out={out} exists; remove it or choose another")
     clock = _Clock()
     engine, receivers = build(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS})
@@ -80,14 +80,14 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     if isinstance(effects, AutoSettings):
         choice, changed = _choose(campaign, effects, engine, receivers, shards)
         effects = choice.effects
-    effects = engine.able(effects)
+    effects = engine.supported(effects)
     clock.lap("decide")
     _trace_all(campaign, engine, receivers, effects, shards)
     clock.lap("trace")
     convergence = _converge(campaign, engine, receivers, effects)
     clock.lap("converge")
-    besides = clock.seconds["build"] + _decided_s(shards) + clock.seconds["converge"]
-    made = assemble(campaign, engine, receivers, effects, choice, convergence, besides, shards, out)
+    other_s = clock.seconds["build"] + _decided_s(shards) + clock.seconds["converge"]
+    made = assemble(campaign, engine, receivers, effects, choice, convergence, other_s, shards, out)
     clock.lap("write")
     return Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, clock.seconds)
 
@@ -105,18 +105,18 @@ class _Clock:
 def _choose(
     campaign: Campaign, settings: AutoSettings, engine: Engine, receivers: np.ndarray, shards: Shards
 ) -> tuple[Choice, Changed]:
-    """The decision of `auto`, taken once and kept with the shards; and what the dropped effects change."""
+    """The decision of `auto`, taken once and stored with the shards, and errors by the dropped effects."""
     begin = time.perf_counter()
-    stored = shards.noted("choice")
+    stored = shards.read_note("choice")
     if stored is not None:
         changed = Changed(np.array(stored["rows"], dtype=int), np.array(stored["errors"]))
         return Choice.from_dict(stored["choice"]), changed
-    asked = spread(receivers, settings.probes + settings.held_back, campaign.scene.seed)
+    chosen = spread(receivers, settings.probes + settings.held_back, campaign.scene.seed)
     # Farthest-point order: taking every so many leaves both groups spread out.
-    taken = np.zeros(len(asked), dtype=bool)
-    taken[np.linspace(0, len(asked) - 1, settings.probes).round().astype(int)] = True
-    probes, held = asked[taken], asked[~taken]
-    full = engine.able(settings.full)
+    taken = np.zeros(len(chosen), dtype=bool)
+    taken[np.linspace(0, len(chosen) - 1, settings.probes).round().astype(int)] = True
+    probes, held = chosen[taken], chosen[~taken]
+    full = engine.supported(settings.full)
     log.info("auto: %d probes with %s", len(probes), full)
     choice = auto.decide(
         engine,
@@ -130,7 +130,7 @@ def _choose(
     choice = auto.verify(choice, settings, probe)
     deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
     changed = Changed(held, probe.errors(choice.effects, deliverable))
-    shards.note(
+    shards.write_note(
         "choice",
         {
             "choice": choice.as_dict(),
@@ -145,10 +145,10 @@ def _choose(
 def _probe(
     campaign: Campaign, engine: Engine, receivers: np.ndarray, rows: np.ndarray, effects: Effects
 ) -> Probe:
-    """Some receivers traced, with their nearest others where spectra are judged."""
-    asked, beside = campaign.effects, None
-    if isinstance(asked, AutoSettings) and Deliverable.parse(asked.deliverable).kind == "spectrum":
-        beside = engine.trace(receivers[neighbours(receivers, rows)], effects)
+    """Some receivers traced, with their nearest others where the requirement is about spectra."""
+    settings, nearest = campaign.effects, None
+    if isinstance(settings, AutoSettings) and Deliverable.parse(settings.deliverable).kind == "spectrum":
+        nearest = engine.trace(receivers[neighbours(receivers, rows)], effects)
     return Probe(
         engine.trace(receivers[rows], effects),
         effects,
@@ -156,7 +156,7 @@ def _probe(
         engine.wavelength,
         campaign.csi.elements(engine.wavelength),
         campaign.spectrum,
-        beside,
+        nearest,
     )
 
 
@@ -174,7 +174,7 @@ def _converge(
 def _trace_all(
     campaign: Campaign, engine: Engine, receivers: np.ndarray, effects: Effects, shards: Shards
 ) -> None:
-    """Every shard that is not there yet, telling how far it is."""
+    """Every shard that is not there yet, with progress in the log."""
     starts = range(0, len(receivers), campaign.shard)
     missing = [n for n in range(len(starts)) if not shards.done(n)]
     if len(missing) < len(starts):
@@ -184,7 +184,7 @@ def _trace_all(
     for number in missing:
         places = receivers[starts[number] : starts[number] + campaign.shard]
         start = time.perf_counter()
-        made = part(engine.trace(places, effects), campaign, engine.wavelength)
+        made = shard_arrays(engine.trace(places, effects), campaign, engine.wavelength)
         shards.put(number, {**made, SECONDS: np.array(time.perf_counter() - start)})
         done += len(places)
         rate = done / (time.perf_counter() - begin)
@@ -194,6 +194,6 @@ def _trace_all(
 
 
 def _decided_s(shards: Shards) -> float:
-    """What `auto` cost in whichever run decided [s]."""
-    stored = shards.noted("choice")
+    """Time of the decision, in whichever run took it [s]."""
+    stored = shards.read_note("choice")
     return 0.0 if stored is None else float(stored["seconds"])

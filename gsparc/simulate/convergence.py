@@ -13,12 +13,12 @@ from gsparc.simulate.spectrum import spectra
 
 @dataclass(frozen=True)
 class Convergence:
-    """Differences between two seeds, over the receivers asked.
+    """Differences between two seeds, over the receivers traced twice.
 
     Attributes:
         nmse: of the channels, sum |difference|^2 / sum |channel|^2.
         spectrum_nmse, spectrum_mse, spectrum_psnr_db, spectrum_ssim: of the spectra.
-        receivers: how many were asked.
+        receivers: how many were traced twice.
     """
 
     nmse: float

@@ -1,4 +1,4 @@
-"""The one face of every simulator: positions and switches in, paths out."""
+"""Protocol of all simulators: positions and switches in, paths out."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ class Engine(Protocol):
     wavelength: float
     random: bool
 
-    def able(self, effects: Effects) -> Effects:
+    def supported(self, effects: Effects) -> Effects:
         """These switches without what the engine cannot compute."""
 
     def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
     def versions(self) -> dict[str, str]:
-        """What computes."""
+        """Versions of the solver's packages."""
 
     def materials(self) -> dict[str, dict[str, Any]]:
-        """What the scene is made of, for provenance and for physical reasons."""
+        """Material properties of the scene, for provenance and physical expectations."""

@@ -1,7 +1,7 @@
 """The LLVM library that Sionna's CPU back end needs: found, fetched without root, tried in a subprocess.
 
 Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first solve,
-which no `try` catches. So a library is believed only after a tiny solve in a process of its own.
+which no `try` catches. So a library is accepted only after a tiny solve in a process of its own.
 
 `python -m gsparc.simulate.llvm` (or `make sionna`) fetches Debian's package where no library is good.
 """
@@ -140,7 +140,7 @@ def _require_sionna() -> None:
     from importlib.util import find_spec
 
     if find_spec("sionna") is None or find_spec("sionna.rt") is None:
-        raise SimulatorMissing("Sionna is not installed; say `make sionna` or pip install 'gsparc[sionna]'")
+        raise SimulatorMissing("Sionna is not installed; run `make sionna` or pip install 'gsparc[sionna]'")
 
 
 def main() -> int:

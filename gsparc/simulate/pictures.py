@@ -23,20 +23,20 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     figure = Figure(figsize=(5.4 * count, high), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, count)
-    heard = outcome.made.power > 0
+    reached = outcome.made.power > 0
     size = float(np.clip(6000 / len(places), 2, 40))
-    power = 10 * np.log10(outcome.made.power[heard])
-    _map(panels[0], places[heard], power, "received power [dB]", size, robust=True)
+    power = 10 * np.log10(outcome.made.power[reached])
+    _map(panels[0], places[reached], power, "received power [dB]", size, robust=True)
     _map(
         panels[1],
-        places[heard],
-        outcome.made.delay_spread[heard] * 1e9,
+        places[reached],
+        outcome.made.delay_spread[reached] * 1e9,
         "delay spread [ns]",
         size,
         robust=True,
     )
     if changed is not None:
-        known = heard[changed.rows]
+        known = reached[changed.rows]
         errors = changed.errors[known]
         label = "error by what was dropped" if np.ptp(errors) > 0 else "nothing dropped, no error"
         _map(
@@ -48,8 +48,8 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
             robust=False,
         )
     for panel in panels:
-        if (~heard).any():
-            x, y = places[~heard, 0], places[~heard, 1]
+        if (~reached).any():
+            x, y = places[~reached, 0], places[~reached, 1]
             panel.scatter(x, y, s=size, c="lightgrey", label="nothing arrives")
         panel.plot(*outcome.transmitter[:2], "r^", markersize=9, label="transmitter")
         panel.set_aspect("equal")
@@ -69,7 +69,7 @@ def _map(axes: Axes, places: np.ndarray, values: np.ndarray, label: str, size: f
     axes.figure.colorbar(drawn, ax=axes, location="bottom", label=label, shrink=0.8)
 
 
-def worth(choice: Choice, path: Path) -> None:
+def effect_shares(choice: Choice, path: Path) -> None:
     """Share of power and channel NMSE of each effect, kept or dropped."""
     rows = [row for row in choice.table if row.share > 0 or row.nmse_p95 > 0][::-1]
     names = [row.effect.replace("_", " ") for row in rows]

@@ -1,4 +1,4 @@
-"""Reasons that physics gives beforehand; printed beside the measurement, never instead of it."""
+"""Physical expectations of effects, printed beside the measured ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsparc.simulate.attribution import Probe
 def reasons(
     probe: Probe, transmitter: np.ndarray, receivers: np.ndarray, materials: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, str]:
-    """Why an effect should or should not matter, by its name; absent where physics gives no short reason.
+    """Why an effect should or should not matter, by its name; absent where there is no short one.
 
     Args:
         probe: everything on.
@@ -56,9 +56,9 @@ def scene_facts(
     """Numbers about the scene that decide what a dataset can be used for.
 
     Args:
-        delay_spread_s: (R,) of the receivers that hear anything [s].
+        delay_spread_s: (R,) of the receivers that any path reaches [s].
         below_horizon: share of their power that an upper hemisphere cannot show.
-        bandwidth_hz: times the delay spread far below 1, the band is flat and one tone says it all [Hz].
+        bandwidth_hz: times the delay spread far below 1, the channel is flat over the band [Hz].
         distance: (R,) from the transmitter [m].
         near_field_m: Fraunhofer distance of the spectrum's array; nearer, waves over it are not plane.
     """
@@ -80,8 +80,8 @@ def _slab(material: Mapping[str, Any]) -> bool:
 def _normal_incidence(material: Mapping[str, Any], wavelength: float) -> tuple[float, float]:
     """Loss [dB] of a reflection off, and of a passage through, a lossless slab at normal incidence."""
     index = np.sqrt(float(material["permittivity"]))
-    face = (1 - index) / (1 + index)
+    fresnel = (1 - index) / (1 + index)
     turn = np.exp(-4j * np.pi * index * float(material["thickness_m"]) / wavelength)
-    through = (1 - face**2) * np.sqrt(turn) / (1 - face**2 * turn)
+    through = (1 - fresnel**2) * np.sqrt(turn) / (1 - fresnel**2 * turn)
     back = 1 - abs(through) ** 2
     return -10 * np.log10(max(back, 1e-9)), -20 * np.log10(max(abs(through), 1e-9))

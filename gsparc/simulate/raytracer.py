@@ -1,4 +1,4 @@
-"""Sionna's ray tracer behind our interface, with a guard for each of its traps; imported only when it traces.
+"""Sionna's ray tracer as an engine, with a check for each known failure; Sionna is imported when it traces.
 
 What is guarded: candidates cut off at the shared limit (detected, and the batch is halved and traced again),
 specular chains lost to one another (a hash table large enough for a batch), duplicated lines of sight
@@ -27,7 +27,7 @@ CANDIDATES_PER_RECEIVER = 20_000
 # Two tables of this, 512 MB; Sionna's own (1e6 at least) loses a tenth of the paths of 200 receivers.
 HASHES = 64_000_000
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
-MATERIALS = {  # thickness [m] and scattering coefficient, where a scene says nothing
+MATERIALS = {  # thickness [m] and scattering coefficient, where a scene gives none
     "concrete": (0.20, 0.20), "brick": (0.12, 0.25), "plasterboard": (0.025, 0.10), "wood": (0.03, 0.15),
     "glass": (0.008, 0.05), "ceiling_board": (0.015, 0.20), "chipboard": (0.018, 0.15),
     "plywood": (0.012, 0.15),
@@ -38,7 +38,7 @@ OTHERS = (0.10, 0.20)
 
 @dataclass(frozen=True)
 class Sampling:
-    """How hard the solver works.
+    """Effort of the solver.
 
     Attributes:
         samples: rays per call; the convergence error falls with it.
@@ -58,7 +58,7 @@ class RayTracer:
         source: objects built in code, the name of one of Sionna's scenes, or the path of an XML file.
         transmitter: (3,) [m].
         carrier_hz: [Hz].
-        sampling: how hard to work.
+        sampling: effort of the solver.
         scattering: scattering coefficient of all materials instead of `MATERIALS`; None for those.
 
     Raises:
@@ -84,14 +84,14 @@ class RayTracer:
         self.transmitter = np.asarray(transmitter, dtype=np.float64)
         self._ports = 0
         self.retried = 0  # batches traced again because candidates were cut off
-        self._room: dict[Effects, int] = {}  # how much more than usual they needed
+        self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
 
-    def able(self, effects: Effects) -> Effects:
+    def supported(self, effects: Effects) -> Effects:
         """Everything."""
         return effects
 
     def versions(self) -> dict[str, str]:
-        """What computes."""
+        """Versions of the solver's packages."""
         from importlib.metadata import version
 
         return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
@@ -128,7 +128,7 @@ class RayTracer:
 
     def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
-        boost = self._room.get(effects, 1)
+        boost = self._buffer_factor.get(effects, 1)
         limit = min(CANDIDATES_PER_RECEIVER * boost * len(receivers), LARGEST_BUFFER)
         if effects.depth == 0:
             limit = max(limit, len(receivers))
@@ -138,7 +138,7 @@ class RayTracer:
         self.retried += 1
         if limit < LARGEST_BUFFER:
             log.info("candidate paths were cut off at %d; tracing %d receivers again", limit, len(receivers))
-            self._room[effects] = boost * 4
+            self._buffer_factor[effects] = boost * 4
             return self._batch(receivers, effects, seed)
         if len(receivers) == 1:
             raise RuntimeError(
@@ -153,12 +153,12 @@ class RayTracer:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
-        self._stand(receivers, 2 if effects.polarisation else 1)
-        # Chains of all receivers of a call share the table; what collides is dropped without a word.
+        self._place_ends(receivers, 2 if effects.polarisation else 1)
+        # Chains of all receivers of a call share the table; collisions are dropped silently.
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = HASHES
         solver = rt.PathSolver()
-        watched = _Watched(solver._candidate_generator)
-        solver._candidate_generator = watched
+        counting = _CountingGenerator(solver._candidate_generator)
+        solver._candidate_generator = counting
         found = solver(
             self._scene,
             max_depth=effects.depth,
@@ -172,10 +172,10 @@ class RayTracer:
             edge_diffraction=effects.edge_diffraction,
             seed=seed,
         )
-        return None if watched.stored() >= limit else _collect(found, len(receivers))
+        return None if counting.stored() >= limit else _collect(found, len(receivers))
 
-    def _stand(self, receivers: np.ndarray, ports: int) -> None:
-        """Put the ends into the scene."""
+    def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
+        """Place transmitter and receivers in the scene."""
         import mitsuba as mi
         import sionna.rt as rt
 
@@ -212,8 +212,8 @@ class RayTracer:
         return self._scene.mi_scene.ray_intersect(ray).t.numpy()
 
 
-class _Watched:
-    """A candidate generator that remembers how many candidates it stored; the solver does not tell."""
+class _CountingGenerator:
+    """A candidate generator that counts the candidates it stored; the solver does not report it."""
 
     def __init__(self, generator: Any) -> None:
         self._generator = generator
@@ -262,7 +262,7 @@ def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: f
     if isinstance(source, (str, Path)):
         scene = _load_file(source)
         for material in scene.radio_materials.values():
-            # Built-in scenes come with 0: diffuse reflection would contribute nothing without a word.
+            # Built-in scenes come with 0: diffuse reflection would silently contribute nothing.
             if float(material.scattering_coefficient[0]) == 0.0:
                 usual = MATERIALS.get(getattr(material, "itu_type", None) or "", OTHERS)[1]
                 material.scattering_coefficient = usual if scattering is None else scattering

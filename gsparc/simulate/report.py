@@ -11,8 +11,8 @@ from gsparc.simulate.campaign import Outcome
 
 
 def choice_table(choice: Choice) -> Table:
-    """Every effect a row: what it is worth, what it costs, why, kept or dropped."""
-    table = Table(title=f"promise: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
+    """A row per effect: its share of power, errors without it, its cost, kept or dropped."""
+    table = Table(title=f"requirement: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
     table.add_column("left out")
     for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "CPU s"):
         table.add_column(name, justify="right")
@@ -29,24 +29,24 @@ def choice_table(choice: Choice) -> Table:
 
 
 def reasons(choice: Choice) -> list[str]:
-    """What physics says beforehand, one line an effect."""
+    """Expectations from physics, one line per effect."""
     found = {row.effect.split(" >")[0]: row.reason for row in choice.table if row.reason}
     return [f"physics, {name.replace('_', ' ')}: {reason}" for name, reason in found.items()]
 
 
 def verdict(choice: Choice) -> str:
-    """What was chosen, what it saves, and whether the promise holds."""
-    said = (
+    """What was chosen, what it saves, and whether the requirement is met on held-back receivers."""
+    chosen = (
         f"simulated: {choice.effects}; tracing takes {choice.seconds_chosen:.1f} CPU s instead of "
         f"{choice.seconds_all:.1f} on the probes ({choice.saved:.0%} saved)"
     )
     found = choice.verdict
     if found is None:
-        return said
-    judged = "kept" if found.kept else "NOT KEPT"
+        return chosen
+    outcome = "met" if found.kept else "NOT MET"
     return (
-        f"{said}; promise {judged}: {found.met:.1%} of {found.receivers} held-back receivers are within it "
-        f"(error {found.error:.2g} median, {found.error_p95:.2g} at 95 %)"
+        f"{chosen}; requirement {outcome}: {found.met:.1%} of {found.receivers} held-back receivers are "
+        f"within tolerance (error {found.error:.2g} median, {found.error_p95:.2g} at 95 %)"
     )
 
 

@@ -32,7 +32,7 @@ MAX_ORDER = 4
 ROOM = Room(
     lower=np.array([-1.5, -2.0, -0.9]),
     upper=np.array([5.6, 2.2, 1.8]),
-    # Narrow and bright: images then differ with the distance of two tags about as the release's do
+    # Narrow and reflective: images then differ with the distance of two tags about as the release's do
     # (root mean square 0.04 below 1 cm, 0.13 at 5 cm, 0.24 beyond 20 cm; mean pixel 0.42).
     reflection=np.full(6, -0.9),
 )

@@ -1,4 +1,4 @@
-"""A simulation on its way to disk: shards written once, atomically, and only counted when whole.
+"""Shards of a simulation on disk: each written once and atomically, and counted only when complete.
 
 HDF5 does not survive a kill, so nothing is appended to: each shard is a file of its own that appears by
 renaming, and the dataset is written from all of them at the end.
@@ -31,24 +31,24 @@ class Shards:
 
     def __init__(self, out: Path, plan: Mapping[str, Any]) -> None:
         self.folder = out.with_name(out.name + ".parts")
-        self._gone = out.with_name(out.name + ".gone")
+        self._removed = out.with_name(out.name + ".gone")
         self._sweep()
         text = json.dumps(plan, sort_keys=True, indent=1, default=str)
         stored = self.folder / "plan.json"
         if stored.exists() and stored.read_text(encoding="utf-8") != text:
             raise ValueError(
-                f"{self.folder} holds parts of a different simulation; remove it, or say another out="
+                f"{self.folder} holds parts of a different simulation; remove it, or choose another out="
             )
         if not stored.exists():
             self.folder.mkdir(parents=True, exist_ok=True)
             _write(stored, text.encode())
 
-    def note(self, name: str, content: Mapping[str, Any]) -> None:
-        """Keep a decision, so that a resumed run does not decide again."""
+    def write_note(self, name: str, content: Mapping[str, Any]) -> None:
+        """Store a decision, so that a resumed run does not decide again."""
         _write(self.folder / f"{name}.json", json.dumps(content, indent=1).encode())
 
-    def noted(self, name: str) -> dict[str, Any] | None:
-        """What was noted, or None."""
+    def read_note(self, name: str) -> dict[str, Any] | None:
+        """The stored decision, or None."""
         path = self.folder / f"{name}.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
@@ -74,12 +74,12 @@ class Shards:
         """After the dataset is written."""
         # Renamed first: a kill amid the removal would leave shards without the plan that they belong to.
         self._sweep()
-        os.replace(self.folder, self._gone)
+        os.replace(self.folder, self._removed)
         self._sweep()
 
     def _sweep(self) -> None:
-        if self._gone.exists():
-            shutil.rmtree(self._gone)
+        if self._removed.exists():
+            shutil.rmtree(self._removed)
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -1,6 +1,6 @@
-"""What a simulated spectrum is: fixed and stored before anything is trained.
+"""Definition of a simulated spectrum, stored with the data.
 
-Bartlett (default): the elements of a stated planar array hear the paths from above their ground plane on
+Bartlett (default): the elements of a stated planar array receive the paths from above their ground plane on
 every subcarrier, `P(u) = mean_k |a(u)^H h_k|^2 / M^2`, the subcarriers being the snapshots; interference
 within the band is real. Beam: every path is a von Mises-Fisher spot of a stated width carrying its power.
 """
@@ -87,7 +87,7 @@ def spectra(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Spectra (R, H, W) float32, and what each was divided by (R,) (its own unit: amplitude or power).
 
-    Only paths from above the horizon are heard. A receiver that hears nothing is black, divided by 1.
+    Only paths from above the horizon are received. A receiver without any is black, divided by 1.
 
     Args:
         paths: of R receivers, world axes as the receivers' axes.

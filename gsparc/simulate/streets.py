@@ -182,7 +182,7 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
 
 
 def _bounce(streets: Streets, flat: np.ndarray, place: np.ndarray, law) -> Iterator[_Route]:
-    """Base to `place` to those users who see it; amplitude `law(first leg, second leg)` [m]."""
+    """Base to `place` to the users in its line of sight; amplitude `law(first leg, second leg)` [m]."""
     base = streets.base[:2]
     if streets.blocked(base[None], place[None])[0]:
         return

@@ -69,7 +69,7 @@ def task(config: DictConfig) -> Outcome:
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
     console = open_console()
     if outcome.choice is not None:
-        pictures.worth(outcome.choice, run_dir / "effects.png")
+        pictures.effect_shares(outcome.choice, run_dir / "effects.png")
         console.print(choice_table(outcome.choice))
         for line in reasons(outcome.choice):
             console.print(line, highlight=False, soft_wrap=True, markup=False)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cities import city, folder
 
-from gsparc.data.argos import TONES, aligned, load_argos, peers_figures, peers_normalisation
+from gsparc.data.argos import TONES, aligned, load_argos, published_figures, published_normalisation
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 
@@ -56,14 +56,14 @@ def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
 
 def test_peers_normalisation_is_one_number_for_all() -> None:
     data = city()
-    mean, spread = peers_normalisation(data.target, np.arange(50))
+    mean, spread = published_normalisation(data.target, np.arange(50))
     rest = (data.target[:50] - mean) / spread
     assert abs(rest.mean()) < 1e-6 and np.isclose((np.abs(rest) ** 2).mean(), 1)
     some = data.target[:50]
-    plain = peers_figures(0.9 * some, some, 0j, 1.0)
+    plain = published_figures(0.9 * some, some, 0j, 1.0)
     assert np.isclose(plain["nmse"], 0.01) and np.isclose(plain["snr_db"], 20)
     # A common mean makes the power larger or smaller, the error stays: the two figures differ.
-    assert peers_figures(0.9 * some, some, mean, spread)["nmse"] >= plain["nmse"]
+    assert published_figures(0.9 * some, some, mean, spread)["nmse"] >= plain["nmse"]
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_rfid_unknown_gateway(rfid_folder):
 def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
     for case in ("csv nan", "spectrum truncated", "index twice"):
         SPOILT[case][0](rfid_folder)
-    with pytest.raises(DataError, match=r"and 2 more: python -m gsparc\.check") as error:
+    with pytest.raises(DataError, match=r"and 2 more: gsparc check") as error:
         load_rfid(rfid_folder)
     assert len(error.value.problems) == 3
 

@@ -183,7 +183,7 @@ def test_a_damaged_cache_is_made_anew(campaign, folds, tmp_path, monkeypatch, ca
         path.write_bytes(b"rubbish")
     again = baseline("gp", data, split, cache=tmp_path)
     assert again.scores.figures() == first.scores.figures()
-    assert "made anew" in caplog.text
+    assert "fitted again" in caplog.text
 
 
 class Remembering(Method):

@@ -10,8 +10,8 @@ from shoeboxes import scatter
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.mirrors import Mirrors
 from gsparc.simulate.shoebox import Room
+from gsparc.simulate.shoebox_engine import ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings, spectra
 
 ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))
@@ -22,9 +22,9 @@ TONES = 2.4e9 + np.linspace(-100e6, 100e6, 16)
 
 def room_of_spectra(count: int = 160, **changes: float) -> Measurements:
     """`count` receivers over the floor; `changes` are of `SpectrumSettings`."""
-    engine = Mirrors(ROOM, TRANSMITTER, 2.4e9)
+    engine = ShoeboxEngine(ROOM, TRANSMITTER, 2.4e9)
     receivers = scatter(ROOM, count, seed=0) * [1, 1, 0.1] + [0, 0, 1.0]
-    paths = engine.trace(receivers, engine.able(Effects(depth=2)))
+    paths = engine.trace(receivers, engine.supported(Effects(depth=2)))
     settings = dataclasses.replace(SETTINGS, **changes)
     pictures, _ = spectra(paths, settings, TONES, engine.wavelength)
     return from_arrays(

@@ -23,7 +23,7 @@ class Invented:
     def __init__(self, record):
         self.record = record  # list of (mechanisms, order, power)
 
-    def able(self, effects):
+    def supported(self, effects):
         return effects
 
     def materials(self):
@@ -102,7 +102,7 @@ def test_a_stricter_deliverable_keeps_more():
 
 
 def test_what_is_dropped_together_is_judged_together():
-    """Each of two effects alone is within the promise, both together are not."""
+    """Each of two effects alone is within tolerance, both together are not."""
     record = [(0, 0, 1.0), (REFRACTION, 1, 0.15), (DIFFRACTION, 1, 0.15)]
     effects = decided("coverage +-1 dB", record).effects
     assert effects.refraction != effects.diffraction
@@ -142,7 +142,7 @@ def test_one_odd_receiver_does_not_keep_everything():
     assert not choice.effects.diffuse and choice.effects.specular
 
 
-def test_a_broken_promise_is_said():
+def test_a_violated_requirement_is_reported():
     choice = decided("coverage +-1 dB")
     other = Invented([(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]).trace(np.zeros((30, 3)), FULL)
     probe = Probe(other, FULL, np.array([2.4e9]), 0.125, np.zeros((1, 3)), SpectrumSettings())

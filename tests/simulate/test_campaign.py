@@ -16,12 +16,12 @@ from gsparc.simulate import campaign as campaigns
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.mirrors import Mirrors
-from gsparc.simulate.pictures import floor_plan, worth
+from gsparc.simulate.pictures import effect_shares, floor_plan
 from gsparc.simulate.report import choice_table, figures, verdict
 from gsparc.simulate.scenes.build import SceneSettings
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.shoebox import Room, trace
+from gsparc.simulate.shoebox_engine import ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings
 from gsparc.studies.check import main as check
 
@@ -65,7 +65,7 @@ def test_the_file_is_the_schema_and_equals_the_exact_room(tmp_path):
 
 
 def test_paths_make_the_channel(tmp_path):
-    """What the attributes promise about gain and delay holds."""
+    """Gain and delay are as the attributes state."""
     simulate(plan(weakest_db=200.0), tmp_path / "box.h5")
     stored, _ = arrays(tmp_path / "box.h5")
     some = slice(*stored["path_offsets"][7:9])
@@ -104,7 +104,7 @@ def test_noise_is_as_loud_as_said(tmp_path):
 def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
     """Finished shards are not touched, every receiver is there once, the file is the uninterrupted one's."""
     simulate(plan(), tmp_path / "whole.h5")
-    real, calls = Mirrors.trace, []
+    real, calls = ShoeboxEngine.trace, []
 
     def dies(self, receivers, *rest, **named):
         calls.append(len(receivers))
@@ -113,7 +113,7 @@ def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
         time.sleep(0.1)
         return real(self, receivers, *rest, **named)
 
-    monkeypatch.setattr(Mirrors, "trace", dies)
+    monkeypatch.setattr(ShoeboxEngine, "trace", dies)
     with pytest.raises(KeyboardInterrupt):
         simulate(plan(), tmp_path / "cut.h5")
     assert not (tmp_path / "cut.h5").exists()
@@ -126,7 +126,7 @@ def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
         seen.append([(s.name, s.stat().st_mtime_ns, s.read_bytes()) for s in shards])
         return real(self, receivers, *rest, **named)
 
-    monkeypatch.setattr(Mirrors, "trace", watches)
+    monkeypatch.setattr(ShoeboxEngine, "trace", watches)
     simulate(plan(), tmp_path / "cut.h5")
     assert len(seen) == 2 and all(state == before for state in seen)
     (one, about), (two, other) = (arrays(tmp_path / f"{n}.h5") for n in ("whole", "cut"))
@@ -179,8 +179,8 @@ def test_auto_decides_once_verifies_and_is_drawn(tmp_path):
     assert [row["effect"] for row in stored["table"]] == [row.effect for row in choice.table]
     facts = figures(outcome)
     assert facts["auto/verdict/met"] >= 0.95 and facts["auto/specular/kept"] is True
-    assert "promise kept" in verdict(choice) and choice_table(choice).row_count == len(choice.table)
-    for draw, what in ((floor_plan, outcome), (worth, choice)):
+    assert "requirement met" in verdict(choice) and choice_table(choice).row_count == len(choice.table)
+    for draw, what in ((floor_plan, outcome), (effect_shares, choice)):
         draw(what, tmp_path / "picture.png")
         assert (tmp_path / "picture.png").stat().st_size > 10_000
 

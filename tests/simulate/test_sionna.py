@@ -105,7 +105,7 @@ def test_cut_off_paths_are_found_out_and_traced_again(places, monkeypatch):
     assert np.median(np.abs(near)) < 0.2
     tries = starved.retried
     starved.trace(places[:20], PLAIN)
-    assert starved.retried == tries  # the room they needed is remembered
+    assert starved.retried == tries  # the buffer stays enlarged
 
 
 def test_chains_do_not_cost_each_other_their_place(places):

@@ -10,7 +10,7 @@ from campaigns import compose
 import gsparc
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
-from gsparc.data.sionna import judged_by
+from gsparc.data.sionna import with_true_targets
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import SceneSettings
@@ -64,9 +64,9 @@ def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tm
     assert load({**config, "truth": config["file"]}).site.sha256 == alone.site.sha256
     elsewhere = dataclasses.replace(whole, rx_position=whole.rx_position + 0.1)
     with pytest.raises(DataError, match="other receivers"):
-        judged_by(alone, elsewhere, "dataset.truth=x")
+        with_true_targets(alone, elsewhere, "dataset.truth=x")
     with pytest.raises(DataError, match="same test rows"):
-        judged_by(alone, dataclasses.replace(whole, release_split=None), "dataset.truth=x")
+        with_true_targets(alone, dataclasses.replace(whole, release_split=None), "dataset.truth=x")
 
 
 @pytest.mark.parametrize("kind", ROAD)

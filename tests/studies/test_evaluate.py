@@ -82,7 +82,7 @@ def test_the_command_leaves_summary_samples_and_table(trained, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        ([], "error: ckpt is not set; say ckpt=..."),
+        ([], "error: ckpt is not set; give ckpt=..."),
         (["ckpt=none.ckpt"], "error: none.ckpt: no such checkpoint"),
         (["eval_onn=val"], "error: eval_onn: no such setting; did you mean 'eval_on'?"),
         (["dataset.rot=x"], "error: dataset.rot: no such setting; did you mean 'dataset.root'?"),
@@ -146,7 +146,7 @@ def test_data_centred_elsewhere_are_moved_not_misread(trained, room):
     assert aligned(data, stored.site) is data
     away = data.site.static_position + np.array([1, 0, 0])
     for change, words in (
-        ({"static_position": away}, "stands 1 m from"),
+        ({"static_position": away}, "is 1 m from"),
         ({"kind": "rssi"}, "with kind csi"),
     ):
         other = dataclasses.replace(data, site=dataclasses.replace(data.site, **change))

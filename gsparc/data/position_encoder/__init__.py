@@ -1,1 +1,1 @@
-"""From a measured uplink to a place in three dimensions, where nobody noted where the user stood."""
+"""Learned positions: a measured uplink to three coordinates, where no user positions were recorded."""

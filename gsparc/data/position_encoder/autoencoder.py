@@ -1,4 +1,4 @@
-"""An autoencoder whose code is a place: near uplinks lie near, and the codes fill their space."""
+"""An autoencoder whose code is a position: similar uplinks are close, and codes fill their space."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Autoencoder(nn.Module):
         self.decoder = nn.Sequential(
             nn.Linear(CODE, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, width)
         )
-        # The normalisation belongs to the encoder: whoever loads it maps new uplinks alike.
+        # Stored with the encoder: new uplinks are normalised alike.
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("scale", torch.ones(width))
 

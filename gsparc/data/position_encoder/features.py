@@ -1,4 +1,4 @@
-"""What of an uplink depends on the place and not on the snapshot: no phase, no timing, no common gain."""
+"""Features of an uplink that do not depend on the snapshot's phase, timing and gain."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What each effect gives and costs, sample by sample."""
+"""Gain and cost of each effect, paired by sample."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from gsparc.evaluation.report.tables import HEADS
 
 
 def effects(runs: Sequence[Run]) -> Table | None:
-    """What each effect gives and costs: paired differences between runs of one split; None without pairs."""
+    """Gain and cost of each effect: paired differences between runs of one split; None without pairs."""
     name = PER_SAMPLE[runs[0].kind]
     table = Table(
-        "Effects: what they give and cost",
+        "Effects: gain and cost",
         [
             Column("effect"), Column("without"), Column("with"),
             Column(f"{HEADS.get(name, name)} gained", "+.2f"),
@@ -27,7 +27,7 @@ def effects(runs: Sequence[Run]) -> Table | None:
     )  # fmt: skip
     for off in runs:
         for on in runs:
-            if not _only_an_effect_apart(off, on):
+            if not _differ_by_effect(off, on):
                 continue
             gain = _paired(off, on, name)
             spent = [_minus(on.facts.get("time/train_s"), off.facts.get("time/train_s"))]
@@ -36,7 +36,7 @@ def effects(runs: Sequence[Run]) -> Table | None:
     return table if table.rows else None
 
 
-def _only_an_effect_apart(off: Run, on: Run) -> bool:
+def _differ_by_effect(off: Run, on: Run) -> bool:
     same = all(
         off.facts.get(k) == on.facts.get(k) for k in ("dataset/sha256", "split/sha256", "seed", "model/name")
     )

@@ -1,4 +1,4 @@
-"""How sure a figure is: bootstrap over test samples, spread over seeds."""
+"""Uncertainty of figures: bootstrap over test samples, spread over seeds."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Interval:
-    """A value and where it may as well lie.
+    """A value and its interval.
 
     Attributes:
         value: the figure.
-        low, high: ends of the interval; None when it cannot be told.
+        low, high: ends of the interval; None when unknown.
     """
 
     value: float

@@ -15,9 +15,9 @@ from jinja2 import Environment
 from PIL import Image
 
 from gsparc.evaluation.report import effects, learning, plots, tables
-from gsparc.evaluation.report.runs import Run, by_study, told_apart
+from gsparc.evaluation.report.runs import Run, by_study, distinct_overrides
 from gsparc.evaluation.report.table import Table
-from gsparc.evaluation.summary import BUSY, circumstances, simpler_wins
+from gsparc.evaluation.summary import BUSY, better_baseline, run_conditions
 
 PICTURE_PX = 1000  # width at which pictures are kept
 MOST_PICTURES = 6
@@ -56,14 +56,14 @@ def studies(runs: Sequence[Run], fronts: Sequence[tuple[str, dict[str, np.ndarra
 
 
 def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]]) -> Study:
-    runs = told_apart(group)
+    runs = distinct_overrides(group)
     study = Study(title, warnings(runs))
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
     found = (
         tables.results(runs),
         learning.within_minutes(runs),
-        tables.bill(runs),
+        tables.costs(runs),
         effects.effects(runs),
         tables.worst(runs),
     )
@@ -73,11 +73,11 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         plots.accuracy_cdf(runs),
         plots.latency_cdf(runs),
         plots.learning(runs),
-        plots.bill(runs),
+        plots.costs(runs),
         plots.measurements(runs),
         plots.confidence(runs),
     )
-    study.plots = [_named_apart(plots.svg(figure), i) for i, figure in enumerate(drawn) if figure is not None]
+    study.plots = [_unique_ids(plots.svg(figure), i) for i, figure in enumerate(drawn) if figure is not None]
     firsts = [group[0] for group in tables.grouped(runs).values()]
     study.pictures = [
         (run.setting, _png(run.folder / "test.png"))
@@ -89,19 +89,19 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
 
 def warnings(runs: Sequence[Run]) -> list[str]:
     """What a reader must know first, each once: the loads of a busy machine are one range."""
-    said = [remark for run in runs for remark in circumstances({**run.facts, "machine/load": None})]
+    remarks = [remark for run in runs for remark in run_conditions({**run.facts, "machine/load": None})]
     scored = [(figure, run) for run in runs if (figure := run.figure_of(run.figure)) is not None]
-    if scored:  # what beats the worse runs of a page alone is no better choice
+    if scored:  # a baseline must beat the best run of the page
         last = max if runs[0].kind == "spectrum" else min
-        said += simpler_wins(last(scored, key=lambda one: one[0])[1].facts)
+        remarks += better_baseline(last(scored, key=lambda one: one[0])[1].facts)
     loads = [float(run.facts["machine/load"]) for run in runs if run.facts.get("machine/load") is not None]
     if loads and max(loads) > BUSY:
         ends = " to ".join(dict.fromkeys(f"{load:.1f}" for load in (min(loads), max(loads))))
-        said.append(f"the machine was busy (load {ends} per core): times are inflated, ratios less so")
-    return list(dict.fromkeys(said))
+        remarks.append(f"the machine was busy (load {ends} per core): times are inflated, ratios less so")
+    return list(dict.fromkeys(remarks))
 
 
-def _named_apart(svg: str, number: int) -> str:
+def _unique_ids(svg: str, number: int) -> str:
     """Ids of several drawings on one page must differ: matplotlib repeats them."""
     return re.sub(r'(id="|url\(#|href="#)', rf"\g<1>p{number}-", svg)
 

@@ -1,4 +1,4 @@
-"""What the runs say, drawn; every plot an SVG text of its own."""
+"""Plots of runs, each an SVG text."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ def svg(figure: Figure) -> str:
 
 
 def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
-    """Test accuracy against latency: runs with intervals, baselines, swept fronts, and who is not beaten."""
+    """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
     name = runs[0].figure
-    figure, axes = _one()
+    figure, axes = _figure()
     x: list[float] = []
     y: list[float] = []
     for number, (setting, group) in enumerate(grouped(runs).items()):
@@ -77,10 +77,10 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
                 columns["render_ms_p50"][on], columns[name][on], ".-", lw=0.8, c="k", label="swept front"
             )
     best = front(x, [score_of(name, v) for v in y])
-    axes.step([x[i] for i in best], [y[i] for i in best], where="post", lw=0.6, c="0.7", label="not beaten")
+    axes.step([x[i] for i in best], [y[i] for i in best], where="post", lw=0.6, c="0.7", label="Pareto front")
     axes.set_xscale("log")
-    _accuracy(axes, name)
-    _leave_out_far(axes, name, y)
+    _accuracy_axis(axes, name)
+    _clip_outliers(axes, name, y)
     axes.set_xlabel("one query [ms], median; whisker to the 95th percentile")
     axes.set_title("Accuracy against latency (95 % intervals)", fontsize=9)
     _legend(axes)
@@ -90,7 +90,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name = PER_SAMPLE[runs[0].kind]
-    figure, axes = _one()
+    figure, axes = _figure()
     for number, (setting, group) in enumerate(grouped(runs).items()):
         values = [run.samples[name] for run in group if name in run.samples]
         if values:
@@ -155,7 +155,7 @@ def latency_cdf(runs: Sequence[Run]) -> Figure | None:
     timed = {k: g for k, g in grouped(runs).items() if any(len(run.render_ms) for run in g)}
     if not timed:
         return None
-    figure, axes = _one()
+    figure, axes = _figure()
     for number, (setting, group) in enumerate(timed.items()):
         _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, number)
     axes.set_xscale("log")
@@ -179,7 +179,7 @@ def _cdf(axes: Axes, values: np.ndarray, label: str, number: int, samples: int |
 def learning(runs: Sequence[Run]) -> Figure:
     """Validation accuracy against seconds of learning; settings of several seeds as a band."""
     name = validation_figure(runs[0])
-    figure, axes = _one()
+    figure, axes = _figure()
     for number, (setting, group) in enumerate(grouped(runs).items()):
         color, first = f"C{number % 10}", True
         for run in group:
@@ -193,15 +193,15 @@ def learning(runs: Sequence[Run]) -> Figure:
             when = np.stack([curve(run)[0] for run in group]).mean(0)
             axes.fill_between(when, every.min(0), every.max(0), color=color, alpha=0.15, lw=0)
     axes.set_xscale("log")
-    _accuracy(axes, name)
+    _accuracy_axis(axes, name)
     axes.set_xlabel("seconds of learning (diamond: trained in one piece, test rows)")
     axes.set_title("Validation accuracy against training time (band: seeds)", fontsize=9)
     _legend(axes)
     return figure
 
 
-def bill(runs: Sequence[Run]) -> Figure:
-    """Points measured, seconds simulated, seconds trained, milliseconds a query, and what they bought."""
+def costs(runs: Sequence[Run]) -> Figure:
+    """Points measured, seconds simulated, seconds trained, milliseconds a query, and the accuracy."""
     groups = grouped(runs)
     figure = Figure(figsize=(WIDE + 2, 1.2 + 0.35 * len(groups)), layout="constrained")
     panels = figure.subplots(1, 5, sharey=True)
@@ -231,7 +231,7 @@ def bill(runs: Sequence[Run]) -> Figure:
         panel.margins(x=0.3)
     panels[0].set_yticks(range(len(groups)), [_short(setting) for setting in groups])
     panels[0].invert_yaxis()
-    figure.suptitle("The whole bill (lines: spread over seeds)", fontsize=9)
+    figure.suptitle("Total costs (lines: spread over seeds)", fontsize=9)
     return figure
 
 
@@ -239,8 +239,8 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     """Accuracy against the number of measurements for every method; None when all runs had equally many."""
     if len({run.measured for run in runs}) < 2:
         return None
-    name, figure_axes = runs[0].figure, _one()
-    figure, axes = figure_axes
+    name = runs[0].figure
+    figure, axes = _figure()
     series: dict[str, dict[int, list[float]]] = {}
     for run in runs:
         found = {str(run.facts.get("model/name")): run.figure_of(name)}
@@ -255,7 +255,7 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
         low, high = [min(by_count[n]) for n in counts], [max(by_count[n]) for n in counts]
         axes.fill_between(counts, low, high, color=f"C{number % 10}", alpha=0.15, lw=0)
     axes.set_xscale("log")
-    _accuracy(axes, name)
+    _accuracy_axis(axes, name)
     axes.set_xlabel("measurements learned from")
     axes.set_title("Accuracy against the number of measurements (band: seeds)", fontsize=9)
     _legend(axes)
@@ -263,7 +263,7 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
 
 
 def confidence(runs: Sequence[Run]) -> Figure | None:
-    """Error against confidence, and what is left when only the surest answers are used; None without any."""
+    """Error against confidence, and the error of the most confident share of answers; None without any."""
     name = PER_SAMPLE[runs[0].kind]
     sure = [r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()]
     if not sure:
@@ -273,23 +273,23 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     for number, run in enumerate(sure[:8]):
         value = np.abs(run.samples[name]) if name == "error_db" else run.samples[name]
         known = np.isfinite(value) & np.isfinite(run.samples["confidence"])
-        said, value = run.samples["confidence"][known], value[known]
-        if len(said) < 3 or np.ptp(said) == 0:
+        stated, value = run.samples["confidence"][known], value[known]
+        if len(stated) < 3 or np.ptp(stated) == 0:
             continue
-        rank = spearmanr(said, value)
-        order = np.argsort(-said, kind="stable")
+        rank = spearmanr(stated, value)
+        order = np.argsort(-stated, kind="stable")
         share = np.arange(1, len(order) + 1) / len(order)
         mean = np.cumsum(value[order]) / np.arange(1, len(order) + 1)
         error = value.std(ddof=1) / np.sqrt(np.arange(1, len(order) + 1))
         color = f"C{number % 10}"
         points.scatter(
-            said, value, s=8, color=color, label=f"{_short(run.setting)}: rank {rank.statistic:+.2f}"
+            stated, value, s=8, color=color, label=f"{_short(run.setting)}: rank {rank.statistic:+.2f}"
         )
         kept.plot(share, mean, color=color, lw=1)
         kept.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
     points.set_xlabel("confidence")
     points.set_ylabel(HEADS.get(name, name))
-    kept.set_xlabel("share of answers used, surest first")
+    kept.set_xlabel("share of answers used, most confident first")
     kept.set_title("mean over the answers used (95 % band)", fontsize=8)
     for axes in (points, kept):
         axes.grid(alpha=0.3)
@@ -297,21 +297,21 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     return figure
 
 
-def _one() -> tuple[Figure, Axes]:
+def _figure() -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDE, TALL), layout="constrained")
     axes = figure.subplots()
     axes.grid(alpha=0.3)
     return figure, axes
 
 
-def _accuracy(axes: Axes, name: str) -> None:
+def _accuracy_axis(axes: Axes, name: str) -> None:
     axes.set_ylabel(HEADS.get(name, name))
     if lower_is_better(name):
         axes.set_yscale("log")
 
 
-def _leave_out_far(axes: Axes, name: str, values: Sequence[float]) -> None:
-    """A black image at 6 dB would flatten everything above 25: what is far below the median is not drawn."""
+def _clip_outliers(axes: Axes, name: str, values: Sequence[float]) -> None:
+    """A black image at 6 dB would flatten everything above 25: values far below the median are not drawn."""
     if name == "psnr_db" and len(values) > 1:
         middle, best = float(np.median(values)), max(values)
         axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best - middle), 5.0)))
@@ -324,7 +324,7 @@ def _legend(axes: Axes) -> None:
 
 
 def _short(text: str, most: int = 32) -> str:
-    """Overrides by the last part of their names, then cut: `inverse_distance=True` says enough."""
+    """Overrides by the last part of their names, then cut to `most` characters."""
     words = [word.partition("=") for word in text.split()]
     text = " ".join(
         (key.rpartition(".")[2] if equals else key) + equals + value for key, equals, value in words

@@ -1,4 +1,4 @@
-"""The results table of a document, written by a command and never by hand."""
+"""The results table of a document, written by a command."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gsparc.evaluation.report.tables import results, seeds
 
 BEGIN = "<!-- results: written by `make results` -->"
 END = "<!-- end of results -->"
-LEFT_OUT = ("SSIM (uniform 7)", "MSE", "p95", "Gaussians")  # columns for the report's page
-UNSAID = ("zero",)  # rows likewise
+OMITTED_COLUMNS = ("SSIM (uniform 7)", "MSE", "p95", "Gaussians")  # columns for the report's page
+OMITTED_ROWS = ("zero",)  # rows likewise
 
 
 def refresh(path: Path, runs: Sequence[Run]) -> None:
@@ -49,7 +49,7 @@ def _short(title: str, runs: Sequence[Run]) -> str:
     rows = list(table.rows)
     for row in whole.rows[len(runs) :]:  # the baselines have no seeds
         cells = dict(zip(heads, row, strict=True))
-        if cells[heads[0]] in UNSAID:
+        if cells[heads[0]] in OMITTED_ROWS:
             continue
         named = {"query ms p50": cells["query ms p50"], "seeds": None, **cells}
         rows.append([named.get(name) for name in wanted])
@@ -59,6 +59,6 @@ def _short(title: str, runs: Sequence[Run]) -> str:
         f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s), load {load:.1f} per core"
     )
     note = f"{machine}; queries in turns."
-    kept = [i for i, name in enumerate(wanted) if name not in LEFT_OUT]
+    kept = [i for i, name in enumerate(wanted) if name not in OMITTED_COLUMNS]
     short = [[row[i] for i in kept] for row in rows]
     return Table(title, [table.columns[i] for i in kept], short, note).markdown()

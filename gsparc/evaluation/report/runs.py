@@ -1,4 +1,4 @@
-"""Run directories as the report reads them."""
+"""Run directories read for the report."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ SIDE: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "ssim", "mse"), "csi": ("snr_db",), "rssi": ("mae_db", "nmse")
 }  # fmt: skip
 PER_SAMPLE: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": "error_db"}
-NEVER_SAID = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
+HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
 
 
 @dataclass(frozen=True)
 class Run:
-    """What one training run left behind.
+    """Files of one training run.
 
     Attributes:
         folder: its directory.
         facts: `summary.json`.
         samples: `per_sample.csv` by column; empty when absent.
         curve: `learning_curve.csv` by column, (n,) float64; empty for methods that train in one piece.
-        overrides: what was said on the command line, `model.emission.hidden=8`.
+        overrides: of the command line, `model.emission.hidden=8`.
         render_ms: (n,) times of single queries measured after a sweep, alone; empty when not.
     """
 
@@ -57,8 +57,8 @@ class Run:
     @cached_property
     def setting(self) -> str:
         """What distinguishes it from others but the seed: the method and its overrides."""
-        said = [o for o in self.overrides if not o.lstrip("+~").startswith(NEVER_SAID)]
-        named = [o for o in said if not o.startswith(("model=", "dataset=", "split="))]
+        shown = [o for o in self.overrides if not o.lstrip("+~").startswith(HIDDEN)]
+        named = [o for o in shown if not o.startswith(("model=", "dataset=", "split="))]
         short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
         return " ".join([str(self.facts.get("model/name", "?")), *short])
 
@@ -92,7 +92,7 @@ class Run:
 
 
 def find_runs(paths: Iterable[str | Path]) -> list[Run]:
-    """Training runs in and below directories, in the order given; simulations there tell what data cost.
+    """Training runs in and below directories, in the order given; simulations there give the cost of data.
 
     Raises:
         ValueError: a directory that does not exist or holds no run; it is named.
@@ -137,7 +137,7 @@ def by_study(runs: Iterable[Run]) -> dict[tuple[str, str], list[Run]]:
     return groups
 
 
-def told_apart(runs: Sequence[Run]) -> list[Run]:
+def distinct_overrides(runs: Sequence[Run]) -> list[Run]:
     """The runs with only those overrides in which they differ, so that names are short."""
     if len(runs) < 2:
         return list(runs)

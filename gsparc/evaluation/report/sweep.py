@@ -1,4 +1,4 @@
-"""The end of a multirun: failures said at once, models timed alone, one table and one figure."""
+"""The end of a multirun: failures reported at once, models timed alone, a table and a figure."""
 
 from __future__ import annotations
 
@@ -38,16 +38,19 @@ class SweepReport(Callback):
         self.retime, self.rounds, self.budget_s = retime, rounds, budget_s
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **unused: Any) -> None:
-        """Say a failure when it happens; the sweep goes on, and ends with exit status 1."""
+        """Report a failure when it happens; the sweep goes on, and ends with exit status 1."""
         if config.hydra.mode != RunMode.MULTIRUN or job_return.status != JobStatus.FAILED:
             return
         error = job_return._return_value
-        said = one_line(error) if isinstance(error, BaseException) else str(error)
+        message = one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
-        (folder / FAILURE).write_text(said + "\n", encoding="utf-8")
+        (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
         log.error("failed", exc_info=error)  # the job's own log keeps the traceback
         Console(stderr=True, soft_wrap=True).print(
-            f"job {folder.name} failed, the others go on: {said}", style="red", markup=False, highlight=False
+            f"job {folder.name} failed, others continue: {message}",
+            style="red",
+            markup=False,
+            highlight=False,
         )
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None
@@ -69,7 +72,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     """`sweep.csv`, `sweep.png`, `report.html` and `summary.json` of a sweep's directory, and its table."""
     from gsparc.evaluation.report import plots
     from gsparc.evaluation.report.page import studies, write
-    from gsparc.evaluation.report.runs import by_study, find_runs, told_apart
+    from gsparc.evaluation.report.runs import by_study, distinct_overrides, find_runs
     from gsparc.evaluation.report.tables import seeds
     from gsparc.evaluation.report.timing import retime
 
@@ -80,7 +83,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     write(folder, title, f"{len(runs)} runs at commit {str(origin['git'])[:8]}", studies(runs))
     facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
     for number, (study, together) in enumerate(by_study(runs).items()):
-        group = told_apart(together)
+        group = distinct_overrides(together)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")

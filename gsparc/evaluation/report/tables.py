@@ -1,4 +1,4 @@
-"""What the runs say, as tables; no accuracy without its time."""
+"""Tables of runs; no accuracy without its time."""
 
 from __future__ import annotations
 
@@ -91,11 +91,11 @@ def seeds(runs: Sequence[Run]) -> Table:
     return table
 
 
-def bill(runs: Sequence[Run]) -> Table:
-    """The whole bill: what it took to be able to answer."""
+def costs(runs: Sequence[Run]) -> Table:
+    """Total costs: measurements, simulation, training and query time."""
     figure = runs[0].figure
     table = Table(
-        "The whole bill",
+        "Total costs",
         [
             Column("method and setting"), Column("seed", "d"), Column("points measured", "d"),
             Column("seconds simulated", ".3g"), Column("seconds trained", ".3g"), Column("ms a query", ".3g"),
@@ -112,7 +112,7 @@ def bill(runs: Sequence[Run]) -> Table:
 
 
 def worst(runs: Sequence[Run]) -> Table:
-    """The three test places that each run gets most wrong."""
+    """The three test positions with the largest error of each run."""
     name = PER_SAMPLE[runs[0].kind]
     table = Table(
         "The three worst receivers",
@@ -120,14 +120,14 @@ def worst(runs: Sequence[Run]) -> Table:
             Column("method and setting"), Column("seed", "d"), Column("sample"), Column("where [m]"),
             Column(HEADS.get(name, name), ".2f"), Column("gp there", ".2f"), Column("confidence", ".2f"),
         ],
-        note="The moving end's position; the Gaussian process there says whether it is hard for all.",
+        note="The moving end's position; the Gaussian process there shows whether it is hard for all.",
     )  # fmt: skip
     for run in runs:
         own = run.samples
         if name not in own:
             continue
-        badness = np.abs(own[name]) if name == "error_db" else -own[name]
-        for i in np.argsort(-np.nan_to_num(badness, nan=-np.inf))[:WORST]:
+        error = np.abs(own[name]) if name == "error_db" else -own[name]
+        for i in np.argsort(-np.nan_to_num(error, nan=-np.inf))[:WORST]:
             place = ", ".join(f"{own[axis][i]:.2f}" for axis in ("x_m", "y_m", "z_m"))
             rival = own.get(f"baseline/gp/{name}")
             table.add(

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 def retime(runs: Sequence[Run], *, rounds: int = 40, budget_s: float = 60.0) -> list[Run]:
     """The runs with the times of single queries, each also written to its `render_ms.csv`.
 
-    A sweep runs jobs at the same time, which spoils every time column; this is for after it.
+    A sweep runs jobs at the same time, which disturbs their times; call this after it.
 
     Args:
         runs: those without a readable checkpoint keep the times they have.

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from gsparc.simulate.engine import Engine
-from gsparc.simulate.mirrors import Mirrors
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.placement import clear_of, place
 from gsparc.simulate.shoebox import Room
+from gsparc.simulate.shoebox_engine import ShoeboxEngine
 
 BUILDERS = {"conference_room": conference_room}
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
@@ -22,7 +22,7 @@ CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a 
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """One place; exactly one of `builder`, `builtin`, `xml`, `room` says which.
+    """One scene, chosen by exactly one of `builder`, `builtin`, `xml`, `room`.
 
     Attributes:
         name: of the dataset.
@@ -37,7 +37,7 @@ class SceneSettings:
         xml: a Mitsuba or Sionna scene file.
         room: of the shoebox engine: size_m, reflection (one number or six), boxes_m.
         open_sky: receivers stand where nothing is above them.
-        scattering: scattering coefficient of all materials that say 0; None: by material.
+        scattering: scattering coefficient of all materials without one; None: by material.
         seed: of the procedure and of the receivers.
     """
 
@@ -62,7 +62,7 @@ class SceneSettings:
         named = [k for k in ("builder", "builtin", "xml", "room") if getattr(self, k) is not None]
         if len(named) != 1:
             raise ValueError(
-                f"scene: say exactly one of builder, builtin, xml, room; got {', '.join(named) or 'none'}"
+                f"scene: give exactly one of builder, builtin, xml, room; got {', '.join(named) or 'none'}"
             )
         if self.num_receivers < 20:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least 20")
@@ -108,7 +108,7 @@ def _engine(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, Callable[
     transmitter = np.array(scene.transmitter_m, dtype=np.float64)
     if scene.room is not None:
         room = _room(scene.room)
-        return Mirrors(room, transmitter, scene.carrier_hz), room.contains
+        return ShoeboxEngine(room, transmitter, scene.carrier_hz), room.contains
     if scene.builder is not None:
         if scene.builder not in BUILDERS:
             raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")

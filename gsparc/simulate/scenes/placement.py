@@ -1,4 +1,4 @@
-"""Where receivers stand: over the floor, not inside things, the same places for the same seed."""
+"""Receiver positions: over the floor, outside objects, reproducible by seed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def place(
     allowed: Callable[[np.ndarray], np.ndarray],
     seed: int,
 ) -> np.ndarray:
-    """`count` positions (S, 3) float64 [m], uniform over an area, where `allowed` says so.
+    """`count` positions (S, 3) float64 [m], uniform over an area where `allowed` is True.
 
     Args:
         count: how many.

@@ -13,7 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc.data.argos import peers_figures, peers_normalisation
+from gsparc.data.argos import published_figures, published_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import open_console
@@ -91,8 +91,8 @@ def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, floa
     batches = (data.batch(fold.test[i : i + CHUNK]) for i in range(0, len(fold.test), CHUNK))
     predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
     target = data.target[fold.test]
-    both = {"peers": peers_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
-    found = {room: peers_figures(predicted, target, *removed) for room, removed in both.items()}
+    both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
+    found = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
     return {f"{room}/{name}": value for room, one in found.items() for name, value in one.items()}
 
 

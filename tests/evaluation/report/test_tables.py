@@ -12,7 +12,7 @@ import pytest
 from gsparc.evaluation.report import effects, learning, tables
 from gsparc.evaluation.report.intervals import Interval, bootstrap, interval
 from gsparc.evaluation.report.plots import _short
-from gsparc.evaluation.report.runs import Run, columns, find_runs, told_apart
+from gsparc.evaluation.report.runs import Run, columns, distinct_overrides, find_runs
 from gsparc.evaluation.report.table import Column, Table
 
 
@@ -25,10 +25,10 @@ def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
     assert [run.folder.name for run in runs] == ["a0", "a1", "b0"] and find_runs(three[:1])[0].facts[
         "seed"
     ] == 0
-    assert [run.setting for run in told_apart(runs)] == ["gsparc emission.hidden=8"] * 2 + [
+    assert [run.setting for run in distinct_overrides(runs)] == ["gsparc emission.hidden=8"] * 2 + [
         "gsparc emission.hidden=64"
     ]
-    assert {run.setting for run in told_apart(runs[:2])} == {"gsparc"}
+    assert {run.setting for run in distinct_overrides(runs[:2])} == {"gsparc"}
     assert list(tables.grouped(runs)) == ["gsparc emission.hidden=8", "gsparc emission.hidden=64"]
 
 
@@ -123,7 +123,7 @@ def test_the_worst_receivers_are_the_worst(three):
 
 
 def test_the_bill_counts_measurements_and_every_second(three):
-    row = cells(tables.bill(find_runs(three)), 2)
+    row = cells(tables.costs(find_runs(three)), 2)
     assert row["points measured"] == 60 and row["seconds trained"] == 130 and row["seconds simulated"] is None
     assert row["ms a query"] == 0.2
 
@@ -162,7 +162,7 @@ def test_a_simulation_among_the_directories_is_on_the_bill(three):
     folder.mkdir()
     made = {"dataset/sha256": "d" * 64, "time/total_s": 62.0, "dataset/receivers": 500}
     (folder / "summary.json").write_text(json.dumps(made))
-    table = tables.bill(find_runs([three[0], folder]))
+    table = tables.costs(find_runs([three[0], folder]))
     assert cells(table, 0)["seconds simulated"] == 62.0 and len(table.rows) == 1
     with pytest.raises(ValueError, match="give the directory of a run too"):
         find_runs([folder])

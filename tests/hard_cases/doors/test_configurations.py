@@ -95,7 +95,7 @@ VALUES = {
     "split.test_fraction=0": "split.test_fraction=0",
     "split.thin=-1": "split.thin=-1",
     "dataset.file=": "dataset.file is not set",
-    "trainer.max_steps": "trainer.max_steps: not understood; say KEY=VALUE",
+    "trainer.max_steps": "trainer.max_steps: not understood; write KEY=VALUE",
     "trainer.max_steps=[1": "not understood",
     "=": "Could not override",
 }

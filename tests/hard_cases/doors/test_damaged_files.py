@@ -78,7 +78,7 @@ def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
 def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
     path = users_file(tmp_path / "mine.h5")
     monkeypatch.setattr(hdf5_probe, "READ", "import time; time.sleep(60)")
-    assert "cannot be read in 0.5 s" in str(hdf5_probe.fails(path, seconds=0.5))
+    assert "cannot be read in 0.5 s" in str(hdf5_probe.read_error(path, seconds=0.5))
     monkeypatch.setattr(hdf5_probe, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
         load_own(path)
@@ -101,7 +101,7 @@ def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
     spoilt[spoilt.index(hdf5_probe.HEAP) + 25] = 8  # second byte of the first object's size
     path = tmp_path / "loops.h5"
     path.write_bytes(spoilt)
-    monkeypatch.setattr(hdf5_probe.fails, "__defaults__", (3.0,))
+    monkeypatch.setattr(hdf5_probe.read_error, "__defaults__", (3.0,))
     with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 3 s\)"):
         load_own(path)
     LEDGER.count("bad inputs")

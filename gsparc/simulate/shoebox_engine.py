@@ -1,4 +1,4 @@
-"""Our exact image sources behind the simulators' interface: line of sight and mirror reflections."""
+"""Exact image sources as an engine: line of sight and mirror reflections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsparc.simulate.paths import Paths
 from gsparc.simulate.shoebox import Room, images, visible
 
 
-class Mirrors:
+class ShoeboxEngine:
     """A shoebox room with one transmitter.
 
     Args:
@@ -32,7 +32,7 @@ class Mirrors:
         if not room.contains(self.transmitter):
             raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
 
-    def able(self, effects: Effects) -> Effects:
+    def supported(self, effects: Effects) -> Effects:
         """Line of sight and specular reflection; walls do not transmit, edges do not diffract."""
         return replace(
             effects.without("diffuse", "diffraction", "refraction"),
