@@ -27,8 +27,8 @@ class Slow(Nearest):
 
     effects = "sleep"
 
-    def fit(self, data, fold, run_dir):
-        super().fit(data, fold, FitContext(run_dir))
+    def fit(self, data, fold, context):
+        super().fit(data, fold, context)
         return FitReport(3.0)
 
     def predict(self, tx, rx):
@@ -37,8 +37,8 @@ class Slow(Nearest):
 
 
 class Quick(Nearest):
-    def fit(self, data, fold, run_dir):
-        super().fit(data, fold, FitContext(run_dir))
+    def fit(self, data, fold, context):
+        super().fit(data, fold, context)
         return FitReport(1.0)
 
     def predict(self, tx, rx):
@@ -47,14 +47,14 @@ class Quick(Nearest):
 
 
 class Impossible(Mean):
-    def fit(self, data, fold, run_dir):
+    def fit(self, data, fold, context):
         decide_array(True, data.site, None)
         raise AssertionError
 
 
 def priced(makers, data, folder):
     settings = ClockSettings(rounds=10, budget_s=2)
-    found = measure(makers, data, FOLD, folder, plain="plain", rounds=2, clock=settings)
+    found = measure(makers, data, FOLD, FitContext(folder), plain="plain", rounds=2, clock=settings)
     return {price.name: price for price in found}
 
 
@@ -84,6 +84,6 @@ def test_methods_that_hear_an_uplink_are_asked_with_it(tmp_path):
 
 def test_the_plain_variant_must_be_there(tmp_path):
     with pytest.raises(ValueError, match="no such variant; there are mean"):
-        measure({"mean": Mean}, invent("csi"), FOLD, tmp_path, plain="plain", rounds=1)
+        measure({"mean": Mean}, invent("csi"), FOLD, FitContext(tmp_path), plain="plain", rounds=1)
     with pytest.raises(ValueError, match="not possible"):
-        measure({"plain": Impossible}, invent("csi"), FOLD, tmp_path, plain="plain", rounds=1)
+        measure({"plain": Impossible}, invent("csi"), FOLD, FitContext(tmp_path), plain="plain", rounds=1)

@@ -46,12 +46,8 @@ class SweepReport(Callback):
         folder = Path(config.hydra.runtime.output_dir)
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
         log.error("failed", exc_info=error)  # the job's own log keeps the traceback
-        Console(stderr=True, soft_wrap=True).print(
-            f"job {folder.name} failed, others continue: {message}",
-            style="red",
-            markup=False,
-            highlight=False,
-        )
+        text = f"job {folder.name} failed, others go on: {message}"
+        Console(stderr=True, soft_wrap=True).print(text, style="red", markup=False, highlight=False)
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None
 
