@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -179,7 +179,7 @@ class Reducible(Protocol):
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """What must be known of training rows (n,) to reduce it; stored with the model."""
 
-    def reduced(self, settings: dict[str, Any], measured: dict[str, Tensor]) -> Method:
+    def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """A method that answers with these settings; this one is left as it is."""
 
 
