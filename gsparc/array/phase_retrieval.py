@@ -26,7 +26,7 @@ STARTS = (24, 48, 96, 384)  # random starts of the rows still unsolved, round by
 SCREENING = 12  # iterations, after which only the best eighth of the starts continues
 ITERATIONS = 60
 FINAL_ITERATIONS = 12  # from every solution
-ENOUGH = 1.0  # a residual within the lags this many quantisation errors large cannot be told from zero
+ENOUGH = 1.0  # a residual within the lags this many quantisation errors large is consistent with zero
 SUSPECT = 4.0  # misfit over quantisation error above which an image is reported
 
 
@@ -200,7 +200,7 @@ def _search(
     """Best of several starts per row: state (n, unknowns) and sum of squared errors (n,).
 
     Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the best eighth
-    goes on, and rows at the quantisation floor leave.
+    continues, and rows at the quantisation floor end.
     """
     n, starts = len(rows), len(start) // len(rows)
     best, best_cost = (

@@ -276,8 +276,8 @@ class DirectionalGP(PredictsVariance):
         tones = torch.from_numpy(self._fitted().tones())
         gains = query.probability[:, :, None] * self._gains(query)
         mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(query.away, tones))
-        loudness = (self.frame.carrier_hz / tones).float()
-        return (mean * (loudness * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
+        tone_scale = (self.frame.carrier_hz / tones).float()
+        return (mean * (tone_scale * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""

@@ -262,8 +262,8 @@ class ImageSourceGP(PredictsVariance):
             stack = stack + self.edges.over_band(flat, tones, self.members[0].scene.transmitter)
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        loudness = (self.frame.carrier_hz / tones).float()
-        mean = (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
+        tone_scale = (self.frame.carrier_hz / tones).float()
+        mean = (mean * (tone_scale * self.frame.scale)).reshape(count, self.antennas, len(tones))
         variance, prior = (v.reshape(count, per).mean(1) for v in (variance, prior))
         return Prediction(
             mean,

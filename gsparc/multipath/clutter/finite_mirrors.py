@@ -148,7 +148,7 @@ def find_mirrors(
     wavelength = LIGHT / float(rows.frequency.mean())
     alpha, known = scorer.alpha, planes[numbers]
     found: list[SmallMirror] = []
-    scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # what a row knows, diagonal of K^-1
+    scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # of rows, diagonal of K^-1
     for normal in directions(planes, numbers):
         ends = (room.double() @ normal).sort().values
         offsets = torch.arange(

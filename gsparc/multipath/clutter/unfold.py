@@ -1,8 +1,8 @@
 """Unfold reflection words into the straight legs of their paths, from receiver to transmitter (image method).
 
-The path of word (i, j) leaves the receiver towards the image of the whole word, meets plane j there, goes on
-towards the image of (i,), and so on. Of perpendicular mirrors both orders have the same image; which of them
-a receiver sees follows from where the line to the image meets the planes first.
+The path of word (i, j) leaves the receiver towards the image of the whole word, meets plane j there,
+continues towards the image of (i,), and so on. Of perpendicular mirrors both orders have the same image;
+which of them a receiver sees follows from where the line to the image meets the planes first.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ class SourceSearch:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Gains of given sources, and the projected problem of their places (unit gains' columns made loud).
+    """Gains of given sources, and the projected problem of their places (columns of unit gains, scaled).
 
     Attributes:
         columns: atoms and slopes.
