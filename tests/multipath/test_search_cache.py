@@ -15,8 +15,7 @@ QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "clutter": False, "ed
 
 def _fit(data, fold, folder, resume=None, **more):
     method = ImageSourceGP(**{**QUICK, **more})
-    method.resume = resume
-    return method, method.fit(data, fold, FitContext(folder))
+    return method, method.fit(data, fold, FitContext(folder, resume=resume))
 
 
 @pytest.fixture()
