@@ -1,1 +1,1 @@
-"""Spectra of a static array while the transmitter moves: recovery, fields through the array, queries."""
+"""Spectra of an array: phase retrieval and a vector GP where it is static, image sources where it moves."""

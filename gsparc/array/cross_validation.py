@@ -1,8 +1,8 @@
-"""Length and noise of the vector process, chosen for queries near and far: leave-out with gaps.
+"""Kernel length and noise of the vector GP by cross-validation with a gap around each held-out sample.
 
-Plain leave-one-out sees neighbours millimetres away only and picks a length that knows nothing beyond them.
-Here each sample is predicted without all others within a gap, for several gaps; what counts is the PSNR of
-the spectra, averaged over samples and gaps.
+Plain leave-one-out tests interpolation over millimetres only and picks a length that fails beyond them. Here
+each sample is predicted without all others within a gap, for several gaps; the score is the PSNR of the
+spectra, averaged over samples and gaps.
 """
 
 from __future__ import annotations
@@ -13,44 +13,44 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-from gsparc.array.vector_gp import Kernel, align, settle
+from gsparc.array.vector_gp import Kernel, align, refine_alignment
 
-GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths
-PIXELS = 600  # drawn from the grid
-ROWS = 384  # neighbouring samples the choice is made on
+GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
+PIXELS = 600  # drawn from the grid: the score needs no more
+ROWS = 384  # neighbouring samples used: the inverse costs their cube
 CENTRES = 160  # of them predicted
-STEPS = 36
-LEAST_LEFT = 1e-3  # of the variance is always unknown: quantisation, recovery
+STEPS = 36  # evaluations of Nelder-Mead
+MIN_VARIANCE = 1e-3  # of the variance is always unknown: quantisation, recovery
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Training spectra predicted without their neighbours, for whoever wants to do better.
+    """Training spectra predicted without their neighbours.
 
     Attributes:
         positions: (n, 3) [m].
         images: (n, P) float64, some pixels of the spectra.
-        centres: (c,) rows that were predicted.
-        gaps: (g,) [m] within which their neighbours were left out.
-        drawn: (g, c, P) predicted; NaN where nothing was left.
+        centres: (c,) rows that were held out.
+        gaps: (g,) [m] within which their neighbours were held out, too.
+        predicted: (g, c, P); NaN where no sample was left.
     """
 
     positions: np.ndarray
     images: np.ndarray
     centres: np.ndarray
     gaps: np.ndarray
-    drawn: np.ndarray
+    predicted: np.ndarray
 
-    def mismatch_db(self, drawn: np.ndarray) -> float:
+    def mismatch_db(self, predicted: np.ndarray) -> float:
         """Minus the PSNR [dB] of predictions (g, c, P), averaged over samples and gaps."""
-        return 10 / np.log(10) * _mean_log(((drawn - self.images[self.centres]) ** 2).mean(-1))
+        return 10 / np.log(10) * _mean_log_error(((predicted - self.images[self.centres]) ** 2).mean(-1))
 
 
-def without(
+def predict_left_out(
     inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What a process says of samples without all others within a gap, and how much it does not know.
+    """Mean and variance of each sample given all others outside a gap around it.
 
     Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
     `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
@@ -84,7 +84,7 @@ def without(
     return mean, variance
 
 
-def _mean_log(error: np.ndarray) -> float:
+def _mean_log_error(error: np.ndarray) -> float:
     """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
     usable = ~np.isnan(error).all(1)
     return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
@@ -92,27 +92,27 @@ def _mean_log(error: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Tuned:
-    """The chosen kernel and how wrong it was.
+    """The chosen kernel and its held-out errors.
 
     Attributes:
         kernel: length and noise.
-        left: (k,) unknown share of the variance at each prediction made in passing.
+        unknown: (k,) posterior variance of each held-out prediction, as a share of the prior's.
         error: (k,) mean squared error of its spectrum.
-        left_out: those predictions; None for too few samples.
+        left_out: the held-out predictions; None for too few samples.
     """
 
     kernel: Kernel
-    left: np.ndarray
+    unknown: np.ndarray
     error: np.ndarray
     left_out: LeftOut | None = None
 
     def error_model(self) -> tuple[float, float]:
-        """(a, p): the expected squared error of a pixel is about `a (left + LEAST_LEFT)^p`.
+        """(a, p): the expected squared error of a pixel is about `a (unknown + MIN_VARIANCE)^p`.
 
         The likeliest for errors that are exponential about it, so that their mean is right at every level: a
-        line through logarithms would follow the many small errors and forget the few large ones.
+        line through logarithms would fit the many small errors and miss the few large ones.
         """
-        x, y = np.log(self.left + LEAST_LEFT), self.error + 1e-9
+        x, y = np.log(self.unknown + MIN_VARIANCE), self.error + 1e-9
 
         def deviance(parameters: np.ndarray) -> float:
             level = parameters[0] + np.clip(parameters[1], 0.0, 2.0) * x
@@ -134,7 +134,7 @@ def tune(
     """Choose a kernel.
 
     Args:
-        vectors: (n, M) complex, phases and twins arbitrary.
+        vectors: (n, M) complex, phases and twins unknown.
         positions: (n, 3) [m].
         images: (n, P) in [0, 1].
         matrix: (M, P) steering.
@@ -149,7 +149,7 @@ def tune(
         rows = np.argsort(np.linalg.norm(positions - centre, axis=1))[:ROWS]
         vectors, positions, images = vectors[rows], positions[rows], images[rows]
     pixels = rng.choice(images.shape[1], min(PIXELS, images.shape[1]), replace=False)
-    looks = _Looks(
+    samples = _Samples(
         positions=positions,
         images=images[:, pixels].astype(np.float64),
         matrix=matrix[:, pixels].conj(),
@@ -167,14 +167,14 @@ def tune(
     def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
         kernel = kernel_at(parameters)
         inverse = np.linalg.inv(kernel.gram(positions))
-        return looks.score(kernel, inverse, settle(start, inverse, partner, sweeps))
+        return samples.score(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))
 
     if len(positions) < 4:
         return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
     first = min((np.log(start) for start in STARTS), key=objective)
-    settled = settle(aligned, np.linalg.inv(kernel_at(first).gram(positions)), partner)
+    refined = refine_alignment(aligned, np.linalg.inv(kernel_at(first).gram(positions)), partner)
     found = minimize(
-        objective, first, args=(settled,), method="Nelder-Mead",
+        objective, first, args=(refined,), method="Nelder-Mead",
         options={
             "maxfev": STEPS, "xatol": 0.03, "fatol": 1e-3,
             "initial_simplex": first + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, -1.0]]),
@@ -182,15 +182,15 @@ def tune(
     )  # fmt: skip
     kernel = kernel_at(found.x)
     inverse = np.linalg.inv(kernel.gram(positions))
-    left, drawn = looks.predictions(kernel, inverse, settle(settled, inverse, partner))
-    error = looks.error(drawn)
+    unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
+    error = samples.error(predicted)
     seen = ~np.isnan(error)
-    left_out = LeftOut(positions, looks.images, looks.centres, looks.gaps, drawn)
-    return Tuned(kernel, left[seen], error[seen], left_out)
+    left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
+    return Tuned(kernel, unknown[seen], error[seen], left_out)
 
 
 @dataclass(frozen=True)
-class _Looks:
+class _Samples:
     positions: np.ndarray
     images: np.ndarray
     matrix: np.ndarray
@@ -202,16 +202,16 @@ class _Looks:
     def predictions(
         self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Unknown share (g, c) and spectra (g, c, P) of left-out predictions; NaN where nothing is left."""
-        mean, variance = without(inverse, vectors, self.distance, self.centres, self.gaps)
-        left = np.clip(variance - kernel.noise, 0.0, 1.0)
-        power = np.abs(mean @ self.matrix) ** 2 + left[..., None] * self.background
-        return left, np.sqrt(power)
+        """Posterior variance (g, c) and spectra (g, c, P) of held-out samples; NaN where no other is left."""
+        mean, variance = predict_left_out(inverse, vectors, self.distance, self.centres, self.gaps)
+        unknown = np.clip(variance - kernel.noise, 0.0, 1.0)
+        power = np.abs(mean @ self.matrix) ** 2 + unknown[..., None] * self.background
+        return unknown, np.sqrt(power)
 
-    def error(self, drawn: np.ndarray) -> np.ndarray:
+    def error(self, predicted: np.ndarray) -> np.ndarray:
         """(g, c) mean squared."""
-        return ((drawn - self.images[self.centres]) ** 2).mean(-1)
+        return ((predicted - self.images[self.centres]) ** 2).mean(-1)
 
     def score(self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray) -> float:
         """Mean over gaps and centres of the log of the squared error: up to a factor, minus the PSNR."""
-        return _mean_log(self.error(self.predictions(kernel, inverse, vectors)[1]))
+        return _mean_log_error(self.error(self.predictions(kernel, inverse, vectors)[1]))

@@ -1,4 +1,4 @@
-"""Spectra of a static array as a method: vectors recovered, a process taught, packets asked."""
+"""`model=array`, spectra of a static array: phase retrieval, Gaussian process, wave-packet query model."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.cross_validation import LEAST_LEFT, LeftOut, tune
+from gsparc.array.cross_validation import MIN_VARIANCE, LeftOut, tune
 from gsparc.array.image_gp import compared
 from gsparc.array.phase_retrieval import recover
 from gsparc.array.reduce import reduced
 from gsparc.array.vector_cache import recovered, report
-from gsparc.array.vector_gp import learn_process, mirror_elements
+from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
 from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements, Site
@@ -30,16 +30,16 @@ from gsparc.physics.bartlett import SpectrumRenderer
 log = logging.getLogger(__name__)
 
 ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
-QUERY_CHUNK = 4  # spectra drawn at a time: they stay in the cache
+QUERY_CHUNK = 4  # spectra rendered at a time: they stay in the CPU cache
 
 
 class ArrayField(PredictsVariance):
-    """The complex field at a static array, as wave packets of the transmitter's position.
+    """The complex field at a static array as a function of the transmitter's position.
 
     Args:
         packets: number and shape of the packets.
-        rows: largest number of training spectra whose vectors are learned from; drawn with the seed.
-        refit: learn from validation rows too (settings are chosen by leaving out samples, not on them).
+        rows: largest number of training spectra; more are subsampled with the seed.
+        refit: train on validation rows too (settings are chosen by cross-validation, not on them).
         cache: keep recovered vectors on disk.
         seed: of every random choice.
         name: as it appears in tables.
@@ -64,15 +64,15 @@ class ArrayField(PredictsVariance):
         self.background: Tensor | None = None
         self.error = (0.0, 0.0)
         self.seen = 0
-        self.left_out: LeftOut | None = None  # known after `fit`, not stored
+        self.left_out: LeftOut | None = None  # set by `fit`, not stored
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Recover the vectors of the training rows, learn them, distil.
+        """Retrieve the phases of the training rows, fit the vector GP, distil it into wave packets.
 
-        The seconds include the recovery, also when it was found on disk (then as it was first measured).
+        The seconds include phase retrieval, also when it is read from the cache (then as first measured).
 
         Raises:
-            ValueError: the site's spectra have no array to go through, or there is nothing to learn from.
+            ValueError: the site declares no usable array, or the training set is empty.
         """
         if data.site.array_problem is not None:
             raise ValueError(f"{self.name}: {data.site.array_problem}")
@@ -82,15 +82,15 @@ class ArrayField(PredictsVariance):
         begin = time.perf_counter()
         if len(rows) > self.rows:
             rows = np.sort(np.random.default_rng([self.seed, 5]).permutation(rows)[: self.rows])
-            log.info("%s: learning from %d of the training spectra", self.name, len(rows))
+            log.info("%s: training on %d of the spectra", self.name, len(rows))
         found, recovery_s = recovered(data, rows, platform_cache() if self.cache else None, self.seed)
-        waited = time.perf_counter() - begin
+        elapsed = time.perf_counter() - begin
         report(found, data, rows, context.run_dir / "array_recovery.csv")
         begin = time.perf_counter()
         self._learn(data, rows, found.vectors)
         seconds = recovery_s + time.perf_counter() - begin
         notes = [
-            f"{self.name}: recovery {recovery_s:.1f} s (this time {waited:.1f} s), learning "
+            f"{self.name}: phase retrieval {recovery_s:.1f} s (this run {elapsed:.1f} s), training "
             f"{seconds - recovery_s:.1f} s, {int(found.suspect.sum())} suspect spectra"
         ]
         return FitReport(seconds, tuple(notes))
@@ -106,7 +106,7 @@ class ArrayField(PredictsVariance):
             "%s: length %.3g m, noise %.2g of the field's variance",
             self.name, tuned.kernel.length, tuned.kernel.noise,
         )  # fmt: skip
-        teacher = learn_process(vectors, places, partner, tuned.kernel)
+        teacher = fit_vector_gp(vectors, places, partner, tuned.kernel)
         self.site, self.seen, self.error = site, len(rows), tuned.error_model()
         self.left_out = tuned.left_out
         self.field = distil(teacher, self.packets, site.wavelength, self.seed).requires_grad_(False)
@@ -126,15 +126,15 @@ class ArrayField(PredictsVariance):
         if self.field is None or self.renderer is None:
             raise RuntimeError(f"{self.name} has not been trained: call fit() or load a checkpoint")
         mean = torch.empty(len(tx), *self.renderer.square.shape)
-        left = torch.empty(len(tx))
+        unknown = torch.empty(len(tx))
         with torch.inference_mode():  # the results are ordinary tensors, made before
             for start in range(0, len(tx), QUERY_CHUNK):
                 part = slice(start, start + QUERY_CHUNK)
                 vectors = self.field(tx[part])
-                torch.square(vectors[:, -1].real, out=left[part])
+                torch.square(vectors[:, -1].real, out=unknown[part])
                 self.renderer.draw(vectors, mean[part])
-        share = ((left + LEAST_LEFT) / (1 + LEAST_LEFT)) ** self.error[1]
-        far = self.error[0] * (1 + LEAST_LEFT) ** self.error[1]
+        share = ((unknown + MIN_VARIANCE) / (1 + MIN_VARIANCE)) ** self.error[1]
+        far = self.error[0] * (1 + MIN_VARIANCE) ** self.error[1]
         return Prediction(mean, 1 - share, far * share)
 
     def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:

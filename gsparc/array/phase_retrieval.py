@@ -20,14 +20,14 @@ from gsparc.physics.array_response import lags
 
 log = logging.getLogger(__name__)
 
-SEEDED = 4  # one row in this many is solved from random starts, the others from their neighbours
-NEIGHBOURS = 4  # recovered neighbours a row is started from
+SEEDED = 4  # one row in this many starts at random, the others from their solved neighbours
+NEIGHBOURS = 4  # solved neighbours that a row starts from
 STARTS = (24, 48, 96, 384)  # random starts of the rows still unsolved, round by round
-SCREENING = 12  # iterations before the best eighth of the starts goes on
+SCREENING = 12  # iterations, after which only the best eighth of the starts continues
 ITERATIONS = 60
-POLISHING = 12  # iterations that every solution gets in the end
-ENOUGH = 1.0  # a residual within the lags this many quantisation errors large cannot be told from zero
-SUSPECT = 4.0  # an image whose whole misfit is this many times its quantisation error is named
+FINAL_ITERATIONS = 12  # from every solution
+ENOUGH = 1.0  # a residual within the lags this many quantisation errors large is consistent with zero
+SUSPECT = 4.0  # misfit over quantisation error above which an image is reported
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Recovered:
 
     @property
     def suspect(self) -> np.ndarray:
-        """(n,) bool: what the array cannot have measured, or a search that did not end."""
+        """(n,) bool: the array cannot have measured this image, or the solver did not converge."""
         return np.hypot(self.residual, self.floor) > SUSPECT * self.expected
 
 
@@ -64,8 +64,8 @@ def recover(
         images: (n, H, W) uint8 (255 = 1) or float.
         positions: (n, 3) [m] of the transmitter; neighbours start each other's search.
         seed: of the random starts.
-        budget_s: every row is tried once from its neighbours or from random starts; no row is tried again
-            after this many seconds (spectra of another array would be tried for ever) [s].
+        budget_s: every row is solved once from its neighbours or from random starts; no row is restarted
+            after this many seconds (spectra of another array never converge) [s].
     """
     begin = time.perf_counter()
     problem = _Problem.of(site, images)
@@ -102,7 +102,7 @@ def recover(
                 break
         log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
     for rows in every.split(512):
-        keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), POLISHING))
+        keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), FINAL_ITERATIONS))
     return problem.result(state, cost)
 
 
@@ -200,7 +200,7 @@ def _search(
     """Best of several starts per row: state (n, unknowns) and sum of squared errors (n,).
 
     Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the best eighth
-    goes on, and rows at the quantisation floor leave.
+    continues, and rows at the quantisation floor end.
     """
     n, starts = len(rows), len(start) // len(rows)
     best, best_cost = (

@@ -1,4 +1,4 @@
-"""What a field of wave packets can spare: packets and pixels."""
+"""Reductions of the array model: fewer packets, fewer pixels."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsparc.physics.bartlett import SpectrumRenderer
 if TYPE_CHECKING:
     from gsparc.array.method import ArrayField
 
-RIDGE = 1e-6  # relative to a feature's mean square, as when the packets were taught
+RIDGE = 1e-6  # relative to a feature's mean square, as in `distil`
 
 
 @torch.no_grad()
@@ -40,7 +40,7 @@ def reduced(method: ArrayField, settings: Settings, measured: dict[str, Tensor])
 
 
 def _fewer(field: WavePackets, share: float, measured: dict[str, Tensor]) -> WavePackets:
-    """The packets that contribute most, taught again what all of them together said around the samples."""
+    """The packets that contribute most, their gains fitted to the full model around the samples."""
     total = len(measured["contribution"])
     count = max(1, math.ceil(share * total))
     kept = measured["contribution"].topk(count).indices.sort().values
@@ -52,9 +52,9 @@ def _fewer(field: WavePackets, share: float, measured: dict[str, Tensor]) -> Wav
     widths = field.form[3, :total].neg().mul(2).rsqrt()  # of the window exp(-x^2 / 2 s^2)
     draws = torch.Generator().manual_seed(0)
     spread = widths.median() * torch.randn(8, *places.shape, generator=draws)
-    asked = torch.cat([places, (places + spread / 2).flatten(0, 1)])
-    features = few.features(asked).double()
-    wanted = (field.features(asked) @ field.gains).double()
+    queries = torch.cat([places, (places + spread / 2).flatten(0, 1)])
+    features = few.features(queries).double()
+    wanted = (field.features(queries) @ field.gains).double()
     gram = features.mT @ features
     gram.diagonal().add_(RIDGE * gram.diagonal().mean())
     few.gains.copy_(torch.linalg.solve(gram, features.mT @ wanted).float())

@@ -1,7 +1,7 @@
-"""Where a splatted field seen through an array starts: the array's complex vectors, in closed form.
+"""Initialise a splatted field with an array response from the array's complex vectors, in closed form.
 
-Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen view. Of
-the emissions that make a vector the shortest is taken; over positions, a ridge regression on kernel features.
+Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen plan.
+The minimum-norm emission of each vector is regressed on kernel features of the position.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import torch
 
 from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered, report
-from gsparc.array.vector_gp import learn_process, mirror_elements
+from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
@@ -27,56 +27,56 @@ from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
 
-RIDGE = 1e-3  # of the strongest direction of G: how short emissions are
-LEAST_NOISE = 1e-3
+RIDGE = 1e-3  # of the largest singular value of G: bounds the norm of emissions
+MIN_NOISE = 1e-3  # of the kernel's variance, for the ridge regression
 
 
 @dataclass(frozen=True)
 class Vectors:
-    """Array vectors of training spectra, phases and twins settled, and how smoothly they vary.
+    """Array vectors of training spectra, phases and twins aligned, and the kernel of their variation.
 
     Attributes:
         rows: (n,) of the dataset.
         vectors: (n, M) complex128.
         prior: features of the emission.
-        waited_s, billed_s: seconds the recovery took now, and when it was made [s].
+        elapsed_s, training_s: time of phase retrieval in this run, and when it was computed [s].
     """
 
     rows: np.ndarray
     vectors: np.ndarray
     prior: Prior
-    waited_s: float
-    billed_s: float
+    elapsed_s: float
+    training_s: float
 
 
 class ThroughArray:
-    """Gaussians whose emissions through the array make the recovered vectors; see `Initialiser`."""
+    """Gaussians whose emissions through the array give the retrieved vectors; see `Initialiser`."""
 
     def __call__(self, task: InitTask) -> Start:
-        """Recover the vectors of the training rows."""
+        """Retrieve the vectors of the training rows."""
         assert task.receiver is not None
-        found = settled_vectors(task.data, task.rows, task.anchors, task.seed, task.run_dir)
+        found = aligned_vectors(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         solve = partial(start, data=task.data, found=found, receiver=task.receiver)
-        return Start(found.prior, None, solve, found.billed_s, found.waited_s)
+        return Start(found.prior, None, solve, found.training_s, found.elapsed_s)
 
 
-def settled_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Vectors:
-    """Recover the vectors of the given rows (from disk where known) and agree on phases and twins."""
+def aligned_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Vectors:
+    """Retrieve the vectors of the given rows (cached where known) and align phases and twins."""
     site = data.site
     assert site.array is not None and site.grid is not None and site.wavelength is not None
     begin = time.perf_counter()
-    found, billed = recovered(data, rows, platform_cache(), seed)
-    waited = time.perf_counter() - begin
+    found, training_s = recovered(data, rows, platform_cache(), seed)
+    elapsed = time.perf_counter() - begin
     report(found, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(site.array, site.grid, site.wavelength).numpy()
     images = to_real(training_targets(data, rows), "spectrum")
     partner, places = mirror_elements(site.array), data.tx[rows]
     kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed).kernel
-    teacher = learn_process(found.vectors, places, partner, kernel)
+    process = fit_vector_gp(found.vectors, places, partner, kernel)
     if len(rows) > anchors:
         places = places[np.sort(np.random.default_rng(seed).choice(len(rows), anchors, replace=False))]
-    prior = Prior(torch.from_numpy(places.astype(np.float32)), kernel.length, max(kernel.noise, LEAST_NOISE))
-    return Vectors(rows, teacher.vectors, prior, waited, billed)
+    prior = Prior(torch.from_numpy(places.astype(np.float32)), kernel.length, max(kernel.noise, MIN_NOISE))
+    return Vectors(rows, process.vectors, prior, elapsed, training_s)
 
 
 @torch.no_grad()
@@ -84,7 +84,7 @@ def start(model: GaussianModel, data: Measurements, found: Vectors, receiver: Po
     """Set the emission's read-out so that the model's array vectors are those of the training spectra.
 
     Raises:
-        ValueError: the emission has hidden units, or follows the transmitter's distance.
+        ValueError: the emission has hidden units, or depends on the transmitter's distance.
     """
     if model.settings.emission.hidden or model.settings.attenuation.inverse_distance:
         raise ValueError(
@@ -101,7 +101,7 @@ def start(model: GaussianModel, data: Measurements, found: Vectors, receiver: Po
     gram.diagonal().add_(found.prior.noise)
     vectors = torch.from_numpy(found.vectors)
     readout = torch.linalg.solve(gram, features.mT @ vectors) @ shortest  # (width, N)
-    if data.site.normalisation != "none":  # any scale gives the same spectra: one at which steps are gentle
+    if data.site.normalisation != "none":  # spectra do not depend on the scale: unit emission power
         readout = readout / (features @ readout).abs().square().mean().sqrt()
     model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
     model.emission.bias2.zero_()

@@ -1,4 +1,4 @@
-"""Recovered vectors kept on disk by dataset: a sweep recovers each spectrum once."""
+"""Cache of retrieved array vectors on disk, by dataset: a sweep solves each spectrum once."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from gsparc.methods.target_rows import training_targets
 
 log = logging.getLogger(__name__)
 
-AT_ONCE = 1024  # rows recovered between two writes
-VERSION = 2  # raise it when the recovery changes its answers
+AT_ONCE = 1024  # rows solved between two writes
+VERSION = 2  # raise it when phase retrieval changes its results
 NAMED = 8  # suspect images named in a log line
 
 
 def recovered(
     data: Measurements, rows: np.ndarray, cache: Path | None, seed: int = 0
 ) -> tuple[Recovered, float]:
-    """Array vectors of the given rows, from disk where known, and the seconds they cost when made [s].
+    """Array vectors of the given rows, cached where known, and the seconds they took when computed [s].
 
-    Only the asked rows are looked at: vectors of a test set are never made for a training run. What is done
-    is on disk after every `AT_ONCE` rows, so that an interrupted run goes on there.
+    Only these rows are read: vectors of a test set are never computed for a training run. The cache is
+    written after every `AT_ONCE` rows, so that an interrupted run continues there.
 
     Args:
         data: spectra of a static array.
         rows: (n,) sorted.
-        cache: folder; None keeps nothing.
+        cache: folder; None for no cache.
         seed: of the random starts.
     """
     path = None if cache is None else Path(cache) / f"array-v{VERSION}" / f"{_key(data.site)}.npz"
@@ -56,7 +56,7 @@ def recovered(
 
 
 def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) -> None:
-    """Write the residual of each image as CSV and name the bad ones in the log."""
+    """Write the residual of each image as CSV and log the suspect ones."""
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -67,13 +67,13 @@ def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) 
             writer.writerow([row, names[row], *(f"{v:.3e}" for v in figures), int(result.suspect[i])])
     bad = rows[result.suspect]
     log.info(
-        "array vectors of %d spectra, residual %.1e (median) against %.1e of quantisation",
+        "array vectors of %d spectra: median residual %.1e, quantisation %.1e",
         len(rows), np.median(result.residual), np.median(result.expected),
     )  # fmt: skip
     if len(bad):
         more = f" and {len(bad) - NAMED} more" if len(bad) > NAMED else ""
         log.warning(
-            "%d spectra are not what this array measures (see %s): %s%s",
+            "%d spectra do not fit this array (see %s): %s%s",
             len(bad), path.name, ", ".join(names[i] for i in bad[:NAMED]), more,
         )  # fmt: skip
 
@@ -101,7 +101,7 @@ def _read(path: Path | None, count: int) -> dict[str, np.ndarray] | None:
         with np.load(path, allow_pickle=False) as file:
             known = {name: file[name] for name in (*(f.name for f in fields(Recovered)), "seconds")}
     except Exception as error:  # whatever a damaged archive raises: it is only a cache
-        log.warning("stored array vectors are not usable and are made anew: %s (%s)", path, error)
+        log.warning("cached array vectors are not readable and are computed anew: %s (%s)", path, error)
         return None
     return known if all(len(values) == count for values in known.values()) else None
 

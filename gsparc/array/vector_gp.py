@@ -1,10 +1,10 @@
-"""A complex Gaussian process on array vectors whose phases and twins are unknown; used while training only.
+"""A complex Gaussian process on array vectors whose phases and twins are unknown; used in training only.
 
-Each spectrum gives its vector up to a global phase and a twin. Both are free parameters of every sample: by
-turns each takes the value under which its vector is most likely given all others (coordinate ascent of the
-likelihood). The likely spectrum at a query is the mean amplitude of a Rice distribution, nearly the root of a
-coherent part `|A^H mu|^2` and an incoherent one that grows with the variance until, far from all data, the
-mean image is left.
+Each spectrum gives its vector up to a global phase and a twin. Both are free parameters of every sample, set
+in turn to the value under which its vector is most likely given all others (coordinate ascent of the
+likelihood). The expected spectrum at a query is the mean amplitude of a Rice distribution, nearly the root of
+a coherent part `|A^H mu|^2` plus an incoherent one that grows with the variance up to the mean image, far
+from all data.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-SHORT_SHARE = 0.15  # of the variance; least leave-out error on training spectra, flat from 0.1 to 0.3
+SHORT_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
 SHORT_RATIO = 1 / 3  # of the lengths
 SWEEPS = 30
-QUERIES = 2048  # answered at a time: bounds the memory for thousands of samples
-SETTLED = 1e-3  # mean change per vector and sweep, relative to its length
-TWIN_MARGIN = 1.02  # a twin must be this much likelier to be taken
+QUERIES = 2048  # at a time: bounds the memory for thousands of samples
+TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
+TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
 
 
 def mirror_elements(array: np.ndarray) -> np.ndarray | None:
-    """(M,) index of each element's reflection through the array's centre; None when the array has no such."""
+    """(M,) index of each element's reflection through the array's centre; None for an asymmetric array."""
     centred = array - array.mean(0)
     distance = cdist(centred, -centred)
     partner = distance.argmin(1)
@@ -74,7 +74,7 @@ def mirror_elements(array: np.ndarray) -> np.ndarray | None:
 
 
 def align(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
-    """Vectors (n, M) with twins chosen and phases turned to agree with their nearest neighbours, one by one.
+    """Vectors (n, M) with twins and phases chosen to match their nearest neighbours, one by one.
 
     Walks a minimum spanning tree of the positions (n, 3) [m]; each sample is compared with its four nearest
     predecessors.
@@ -120,13 +120,13 @@ def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray
 
 
 @dataclass(frozen=True)
-class VectorProcess:
+class VectorGP:
     """Posterior of the array vector as a function of the transmitter's position.
 
     Attributes:
         kernel: correlations of the field with itself.
         positions: (n, 3) [m].
-        vectors: (n, M) complex128, phases and twins settled.
+        vectors: (n, M) complex128, phases and twins aligned.
         inverse: (n, n) inverse of the correlation matrix with noise.
     """
 
@@ -136,16 +136,16 @@ class VectorProcess:
     inverse: np.ndarray
 
     def posterior(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (B, M) complex and remaining share of the variance (B,) in [0, 1] at (B, 3) [m]."""
+        """Mean (B, M) complex and variance (B,) in [0, 1], relative to the prior's, at (B, 3) [m]."""
         weights = self.inverse @ self.vectors
         mean = np.empty((len(queries), weights.shape[1]), dtype=np.complex128)
-        left = np.empty(len(queries))
+        unknown = np.empty(len(queries))
         for start in range(0, len(queries), QUERIES):
             part = slice(start, start + QUERIES)
             cross = self.kernel.cross(queries[part], self.positions)
             mean[part] = cross @ weights
-            left[part] = 1 - np.einsum("ij,ij->i", cross @ self.inverse, cross)
-        return mean, np.clip(left, 0.0, 1.0)
+            unknown[part] = 1 - np.einsum("ij,ij->i", cross @ self.inverse, cross)
+        return mean, np.clip(unknown, 0.0, 1.0)
 
     def at_samples(self) -> tuple[np.ndarray, np.ndarray]:
         """`posterior(positions)` from `K = (K + noise) - noise`, without products of n x n matrices."""
@@ -154,7 +154,7 @@ class VectorProcess:
         return mean, np.clip(noise - noise**2 * np.diag(self.inverse), 0.0, 1.0)
 
 
-def settle(
+def refine_alignment(
     vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
 ) -> np.ndarray:
     """Phases and twins (n, M) of largest likelihood, one sample at a time given all others.
@@ -162,43 +162,43 @@ def settle(
     The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams 2006,
     eq. 5.12).
     """
-    settled = np.ascontiguousarray(vectors, dtype=np.complex128)
-    settled = settled.copy() if settled is vectors else settled
-    parts = settled.view(np.float64)  # a real row times complex columns would be made complex first
+    aligned = np.ascontiguousarray(vectors, dtype=np.complex128)
+    aligned = aligned.copy() if aligned is vectors else aligned
+    parts = aligned.view(np.float64)  # a real row times complex columns would be made complex first
     diagonal = np.diag(inverse)
     size = np.linalg.norm(vectors, axis=1).sum()
     for _ in range(sweeps):
         change = 0.0
-        for i in range(len(settled)):
-            old = settled[i].copy()
+        for i in range(len(aligned)):
+            old = aligned[i].copy()
             expected = old - (inverse[i] @ parts).view(np.complex128) / diagonal[i]
             new, overlap = old, np.vdot(old, expected)
             if partner is not None:
                 other = twin(old, partner)
-                its = np.vdot(other, expected)
-                if abs(its) > TWIN_MARGIN * abs(overlap):
-                    new, overlap = other, its
+                other_overlap = np.vdot(other, expected)
+                if abs(other_overlap) > TWIN_MARGIN * abs(overlap):
+                    new, overlap = other, other_overlap
             if abs(overlap) > 0:
                 new = new * (overlap / abs(overlap))
             change += float(np.linalg.norm(new - old))
-            settled[i] = new
-        if change < SETTLED * size:
+            aligned[i] = new
+        if change < TOLERANCE * size:
             break
-    return settled
+    return aligned
 
 
-def learn_process(
+def fit_vector_gp(
     vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
-) -> VectorProcess:
-    """The process whose phases and twins agree with each other.
+) -> VectorGP:
+    """Align phases and twins, then fit the process.
 
     Args:
-        vectors: (n, M) complex, phases and twins arbitrary.
+        vectors: (n, M) complex, phases and twins unknown.
         positions: (n, 3) [m].
         partner: of `mirror_elements`.
         kernel: length and noise; its amplitude is set here.
     """
     inverse = np.linalg.inv(kernel.gram(positions))
-    settled = settle(align(vectors, positions, partner), inverse, partner)
-    amplitude = float(np.einsum("im,ij,jm->", settled.conj(), inverse, settled).real) / settled.size
-    return VectorProcess(replace(kernel, amplitude=amplitude), positions, settled, inverse)
+    aligned = refine_alignment(align(vectors, positions, partner), inverse, partner)
+    amplitude = float(np.einsum("im,ij,jm->", aligned.conj(), inverse, aligned).real) / aligned.size
+    return VectorGP(replace(kernel, amplitude=amplitude), positions, aligned, inverse)

@@ -1,9 +1,9 @@
-"""A field of wave packets around the transmitter: what a query evaluates.
+"""A field of wave packets in the transmitter's position: the query model distilled from the vector GP.
 
 `h(x) = sum_i G_i(x) (a_i cos w_i.x + b_i sin w_i.x)` with Gaussians G_i and complex a_i, b_i per element: a
-packet is what is left of a departing plane wave where it is seen and coherent. Away from all packets nothing
-of the field is known, and so the field says: every feature vanishes there. Centres, widths and wave vectors
-are drawn once; gains come from a teacher by ridge regression.
+packet is a departing plane wave within the region where it is visible and coherent. Away from all packets
+every feature vanishes and the unknown share is 1. Centres, widths and wave vectors are drawn once; gains come
+from the teacher by ridge regression.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.linalg.blas import dsyrk
 from torch import Tensor, nn
 
-from gsparc.array.vector_gp import VectorProcess
+from gsparc.array.vector_gp import VectorGP
 
-MOST_PACKETS = 2048
-FEWEST_PACKETS = 256
+MIN_PACKETS, MAX_PACKETS = 256, 2048  # of the default count: query time grows with it
 
 
 @dataclass(frozen=True)
 class PacketSettings:
-    """Number and shape of the packets, and where the teacher is asked. Lengths are in
-    units of the teacher's length, at most a wavelength.
+    """Number and shape of the packets, and where the teacher is evaluated.
+
+    Lengths are in units of the teacher's length, at most a wavelength.
 
     Attributes:
         count: number of packets; None takes 8 per sample, at least 256 and at most 2,048.
         widths: standard deviations of the Gaussians, in equal numbers.
         jitter: distance of centres from samples, in widths.
         pitch: wave vectors are of size `pitch / width`.
-        samples: queries put to the teacher besides its samples; `near` and `far` are their least and largest
-            distance from one.
+        samples: evaluations of the teacher beside its own samples; `near` and `far` are their least and
+            largest distance from one.
         ridge: relative to a feature's mean square.
     """
 
@@ -101,15 +101,15 @@ def student_t(count: int, rng: np.random.Generator) -> np.ndarray:
     return rng.standard_normal((count, 3)) / np.sqrt(rng.chisquare(3, (count, 1)) / 3)
 
 
-def distil(teacher: VectorProcess, settings: PacketSettings, wavelength: float, seed: int) -> WavePackets:
-    """The packets that answer like the teacher at and around its samples, by ridge regression.
+def distil(teacher: VectorGP, settings: PacketSettings, wavelength: float, seed: int) -> WavePackets:
+    """Packets fitted to the teacher at and around its samples, by ridge regression.
 
-    However far the teacher's correlations reach, no packet is larger for it than for one wavelength [m].
+    Widths scale with the teacher's correlation length, at most one `wavelength` [m].
     """
     rng = np.random.default_rng([seed, 7])
     places, length = teacher.positions, min(teacher.kernel.length, wavelength)
     n, m = teacher.vectors.shape
-    count = settings.count or int(np.clip(8 * n, FEWEST_PACKETS, MOST_PACKETS))
+    count = settings.count or int(np.clip(8 * n, MIN_PACKETS, MAX_PACKETS))
     widths = length * np.resize(settings.widths, count)
     centres = places[rng.integers(0, n, count)]
     centres = centres + settings.jitter * widths[:, None] * rng.standard_normal((count, 3))
@@ -118,15 +118,15 @@ def distil(teacher: VectorProcess, settings: PacketSettings, wavelength: float, 
     field = WavePackets(c, s, w, origin, m)
     reach = np.exp(rng.uniform(np.log(settings.near), np.log(settings.far), (settings.samples, 1))) * length
     around = places[rng.integers(0, n, settings.samples)] + reach * rng.standard_normal((settings.samples, 3))
-    asked = np.concatenate([places, around])
-    mean, left = (
+    queries = np.concatenate([places, around])
+    mean, unknown = (
         np.concatenate(p) for p in zip(teacher.at_samples(), teacher.posterior(around), strict=True)
     )
     # Pairs of real and imaginary parts; the unknown share is learned as its distance from 1.
-    wanted = np.concatenate([mean, np.sqrt(left)[:, None] - 1], 1).view(np.float64)
-    weight = np.where(np.arange(len(asked)) < n, 2.0**0.5, 1.0)[:, None]  # the samples themselves count twice
+    wanted = np.concatenate([mean, np.sqrt(unknown)[:, None] - 1], 1).view(np.float64)
+    weight = np.where(np.arange(len(queries)) < n, 2.0**0.5, 1.0)[:, None]  # samples count twice
     with torch.no_grad():
-        features = weight * field.features(torch.from_numpy(asked)).numpy()
+        features = weight * field.features(torch.from_numpy(queries)).numpy()
         gram = dsyrk(1.0, features.T, lower=1)  # one triangle: half the work
         gram[np.diag_indices_from(gram)] += settings.ridge * np.trace(gram) / len(gram)
         gains = cho_solve(cho_factor(gram, lower=True, overwrite_a=True), features.T @ (weight * wanted))

@@ -203,9 +203,7 @@ class Gsparc(LearnedField):
                 raise
             return Decision("directions", False, str(error))
         nmse = left_out_nmse(self._directional, data)
-        reason = (
-            f"{self._directional.size()} sources where rays meet leave NMSE {nmse:.3f} of left-out channels"
-        )
+        reason = f"{self._directional.size()} triangulated sources leave a leave-one-out NMSE of {nmse:.3f}"
         return Decision("directions", wanted or nmse < 1, reason, report.seconds)
 
     # -- answering ---------------------------------------------------------------------------------

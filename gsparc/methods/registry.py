@@ -29,10 +29,10 @@ METHODS = {
     "fire": "gsparc.peers.fire.Fire",
     "uplink": "gsparc.multipath.uplink.method.UplinkField",
     "complex_gp": "gsparc.multipath.complex_gp.ComplexGP",
-    "image_source_gp": "gsparc.multipath.image_source_gp.VirtualSourceGP",
-    "directional_gp": "gsparc.multipath.directional_gp.DirectedSources",
+    "image_source_gp": "gsparc.multipath.image_source_gp.ImageSourceGP",
+    "directional_gp": "gsparc.multipath.directional_gp.DirectionalGP",
     "array": "gsparc.array.method.ArrayField",
-    "moving_array": "gsparc.array.moving.method.BearingField",
+    "moving_array": "gsparc.array.moving.method.MovingArrayField",
     "gsparc": "gsparc.auto.method.Gsparc",
 }
 

@@ -1,1 +1,1 @@
-"""Coherent effects when the receiver moves: sources whose position explains phase, amplitude and delay."""
+"""Multipath models with carrier phase: image sources, diffraction, clutter and uplink extrapolation."""

@@ -1,10 +1,10 @@
-"""Where would one more source explain most of what is left? Back-projection over a box, then polish.
+"""Find the source that would explain most of the residual: back-projection over a box, then gradient ascent.
 
 The gain in log likelihood of a source at p, its amplitude free, grows with the matched filter
 
     score(p) = |a(p)^H K^-1 y|^2 / (a(p)^H K^-1 a(p))
 
-summed over outputs; K holds what is already explained, so the residual need not be formed.
+summed over outputs; K is the covariance of the sources found so far, so that the residual need not be formed.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BLOCK = 1024  # candidates at a time, so that a block stays in cache
 
 
 @dataclass(frozen=True)
-class Found:
+class Detections:
     """New sources, best first: position (m, 3) float64 [m], score (m,), amplitude (m,)."""
 
     position: Tensor
@@ -62,7 +62,7 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Effort:
-    """How hard to look.
+    """Effort of a search.
 
     Attributes:
         candidates: random points in the box.
@@ -83,12 +83,12 @@ def search_box(
     rows: Rows,
     factor: Factor,
     box: Tensor,
-    apart: float,
-    most: int,
+    min_distance: float,
+    limit: int,
     generator: torch.Generator,
     effort: Effort = Effort(),
-) -> Found:
-    """The best `most` new sources in a box (2, 3) float64 [m], at least `apart` [m] from each other."""
+) -> Detections:
+    """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart."""
     drawn = torch.rand(effort.candidates, 3, generator=generator, dtype=torch.float64)
     candidates = box[0] + (box[1] - box[0]) * drawn
     rough = quick_score(rows, candidates, factor.alpha)
@@ -96,12 +96,12 @@ def search_box(
     exact = torch.cat([score(rows, part, factor)[0] for part in candidates.split(512)])
     polished = polish(rows, candidates[exact.topk(min(effort.polished, len(exact))).indices], factor, effort)
     scores, amplitude = score(rows, polished, factor)
-    chosen = pick_apart(polished, scores, apart, most)
-    return Found(polished[chosen], scores[chosen], amplitude[chosen])
+    chosen = pick_apart(polished, scores, min_distance, limit)
+    return Detections(polished[chosen], scores[chosen], amplitude[chosen])
 
 
 def polish(rows: Rows, candidates: Tensor, factor: Factor, effort: Effort) -> Tensor:
-    """Candidates (m, 3) moved uphill; each climbs its own hill, so the sum of logarithms is ascended."""
+    """Candidates (m, 3) after gradient ascent on the sum of log scores, each to its own maximum."""
     position = candidates.clone().requires_grad_()
     optimizer = torch.optim.Adam([position], lr=effort.step_m, betas=(0.8, 0.95))
     for step in range(effort.steps):
@@ -112,12 +112,14 @@ def polish(rows: Rows, candidates: Tensor, factor: Factor, effort: Effort) -> Te
     return position.detach()
 
 
-def pick_apart(position: Tensor, scores: Tensor, apart: float, most: int, least: float = 0.0) -> list[int]:
-    """Rows of the best scores (n,) of at least `least`, places (n, 3) pairwise `apart` [m] or more apart."""
+def pick_apart(
+    position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0
+) -> list[int]:
+    """Indices of the best scores (n,) of at least `threshold`, positions (n, 3) `min_distance` [m] apart."""
     chosen: list[int] = []
     for i in scores.argsort(descending=True).tolist():
-        if scores[i] < least or len(chosen) == most:
+        if scores[i] < threshold or len(chosen) == limit:
             break
-        if all((position[i] - position[j]).norm() > apart for j in chosen):
+        if all((position[i] - position[j]).norm() > min_distance for j in chosen):
             chosen.append(i)
     return chosen

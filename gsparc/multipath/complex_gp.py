@@ -1,8 +1,9 @@
-"""`model=complex_gp`: a Gaussian process on complex channels that knows the carrier but no sources.
+"""`model=complex_gp`: a Gaussian process on complex channels from the carrier alone, without sources.
 
 Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al., "Measurement
-of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2 law
-over distance lets it fade. Real and imaginary parts share one kernel: the circular complex process.
+of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2
+envelope over distance bounds the correlation. Real and imaginary parts share one kernel: the circular complex
+process.
 """
 
 from __future__ import annotations
@@ -21,8 +22,8 @@ from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
 
-LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, tried for the envelope
-NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, tried
+LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
+NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
 
 
 class ComplexGP(PredictsVariance):
@@ -34,7 +35,7 @@ class ComplexGP(PredictsVariance):
         self.site: Site | None = None
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Learn from `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
+        """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
         started = time.monotonic()
         if data.site.kind != "csi" or data.site.wavelength is None:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
@@ -82,11 +83,11 @@ class ComplexGP(PredictsVariance):
         with torch.no_grad():
             cross = self._cross(tx, rx)
         known = torch.linalg.solve_triangular(self.factor, cross.T, upper=False).square().sum(0)
-        left = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
+        variance = (1 + self.noise - known).clamp_min(0) / (1 + self.noise)
         return Prediction(
             self._mean(cross),
-            confidence=(1 - left).float().clamp(0, 1),
-            variance=(self.power * left).float(),
+            confidence=(1 - variance).float().clamp(0, 1),
+            variance=(self.power * variance).float(),
         )
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:

@@ -1,4 +1,4 @@
-"""Edges: sources whose diffraction point slides along a straight edge as the receiver moves.
+"""Diffracting edges: the diffraction point moves along a straight edge with the receiver.
 
 The ray of J. B. Keller (1962) reaches a receiver after s' + s metres, both legs measured along the straight
 line that is left when the half planes through transmitter and receiver are unfolded about the edge, with
@@ -17,22 +17,21 @@ from torch import Tensor
 from gsparc.multipath.gp_likelihood import JITTER, Factor, Posterior, Scene
 from gsparc.multipath.refine import refine
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.source_types import about_edge
 from gsparc.physics.waves import NEAR_M, reduced_phase
 
 BLOCK = 512  # candidates at a time
-GIVING_WAY = 12  # steps of refinement after an edge
+REFINE_STEPS = 12  # of the sources after each edge
 
 
 @dataclass(frozen=True)
 class EdgeSearch:
-    """When an edge is worth having, and how hard to look.
+    """Acceptance threshold and effort of the edge search.
 
     Attributes:
-        most: edges in all.
-        least_nats: gain of log likelihood below which there is none: an edge is four numbers and a gain.
+        most: edges in total.
+        least_nats: least gain of log likelihood: an edge has four parameters and a gain.
         candidates: drawn in the box; axes along x, y or z, tilted a little.
-        polished: best of them, moved uphill.
+        polished: best of them, refined by gradient ascent.
         steps: of the ascent.
         step_m: its step size [m]; axes turn by as many radians.
         tilt: standard deviation of an axis' departure from x, y or z [rad].
@@ -71,7 +70,7 @@ class Edges:
         return len(self.point)
 
     def field(self, places: Tensor, frequency_hz: Tensor, transmitter: Tensor) -> Tensor:
-        """What they add (n, R) complex64 at places (n, 3) [m] and frequencies (n,) [Hz]."""
+        """Field of the edges (n, R) complex64 at places (n, 3) [m] and frequencies (n,) [Hz]."""
         if not len(self):
             return torch.zeros(len(places), 1, dtype=torch.complex64)
         return edge_wave(places, self.point, self.axis, transmitter, frequency_hz) @ self.gain
@@ -91,11 +90,18 @@ def diffracted(places: Tensor, edges: Edges, transmitter: Tensor) -> tuple[Tenso
 
 def _unfolded(places: Tensor, point: Tensor, axis: Tensor, transmitter: Tensor) -> tuple[Tensor, ...]:
     """Length of the straight line, distance of the place and of both ends from the edge, and along it."""
-    along_rx, across_rx = about_edge(places, point, axis)
-    along_tx, across_tx = about_edge(transmitter[None], point, axis)
+    along_rx, across_rx = _cylindrical(places, point, axis)
+    along_tx, across_tx = _cylindrical(transmitter[None], point, axis)
     across = across_rx + across_tx
     length = ((along_rx - along_tx).square() + across.square() + NEAR_M**2).sqrt()
     return length, across_rx, across, along_rx, along_tx
+
+
+def _cylindrical(places: Tensor, points: Tensor, axes: Tensor) -> tuple[Tensor, Tensor]:
+    """Cylindrical coordinates (n, K) [m] of places (n, 3) about each edge: along it, and distance from it."""
+    offset = places.double()[:, None, :] - points.double()[None]
+    along = (offset * axes).sum(-1)
+    return along, (offset - along[..., None] * axes).square().sum(-1).add(NEAR_M**2).sqrt()
 
 
 def edge_wave(
@@ -123,10 +129,10 @@ def propose(
     generator: torch.Generator,
     search: EdgeSearch,
 ) -> tuple[Tensor, Tensor] | None:
-    """Point and axis (3,) of the edge that explains most beside what `factor` holds; None when none pays.
+    """Point and axis (3,) of the edge of largest gain given the sources of `factor`, or None.
 
     Args:
-        rows: what the sources are confronted with.
+        rows: measurements.
         factor: of the covariance of the sources found so far.
         transmitter: (3,) float64 [m].
         box: (2, 3) float64 [m] where edges may pass.
@@ -145,7 +151,7 @@ def propose(
     point, axis = _polished(rows, point[top], axis[top], transmitter, factor, search)
     gained = _score(rows, point, axis, transmitter, factor)
     best = int(gained.argmax())
-    # A free complex gain that explains nothing but noise is worth one nat.
+    # A free complex gain on pure noise gains one nat.
     if float(gained[best] - gained[best].log() - 1) < search.least_nats:
         return None
     return point[best], axis[best]
@@ -159,7 +165,7 @@ def find_edges(
     noise_floor: float = JITTER,
     search: EdgeSearch = EdgeSearch(),
 ) -> Edges:
-    """Edges one by one, as long as the marginal likelihood wants another; the sources give way in between.
+    """Edges one by one, as long as the marginal likelihood accepts another; sources are refined in between.
 
     Args:
         rows: a few hundred.
@@ -169,25 +175,27 @@ def find_edges(
         noise_floor: known variance of the noise, in units of the rows' power.
         search: effort and threshold.
     """
-    edges, left = Edges.none(), rows
+    edges, residual = Edges.none(), rows
     while len(edges) < search.most:
-        factor = Posterior(left, scene, noise_floor).factor
-        found = propose(left, factor, scene.transmitter, box, generator, search)
+        factor = Posterior(residual, scene, noise_floor).factor
+        found = propose(residual, factor, scene.transmitter, box, generator, search)
         if found is None:
             break
         point, axis = (torch.cat([a, b[None]]) for a, b in zip((edges.point, edges.axis), found, strict=True))
-        edges = with_gains(rows, point, axis, scene, noise_floor)
-        left = without(rows, edges, scene.transmitter)
-        scene = refine(left, scene, GIVING_WAY, noise_floor=noise_floor)
+        edges = fit_edge_gains(rows, point, axis, scene, noise_floor)
+        residual = subtract_edges(rows, edges, scene.transmitter)
+        scene = refine(residual, scene, REFINE_STEPS, noise_floor=noise_floor)
     return edges
 
 
-def without(rows: Rows, edges: Edges, transmitter: Tensor) -> Rows:
-    """The rows less what the edges explain."""
+def subtract_edges(rows: Rows, edges: Edges, transmitter: Tensor) -> Rows:
+    """The rows minus the field of the edges."""
     return replace(rows, target=rows.target - edges.field(rows.position, rows.frequency, transmitter))
 
 
-def with_gains(rows: Rows, point: Tensor, axis: Tensor, scene: Scene, noise_floor: float = JITTER) -> Edges:
+def fit_edge_gains(
+    rows: Rows, point: Tensor, axis: Tensor, scene: Scene, noise_floor: float = JITTER
+) -> Edges:
     """Gains by generalised least squares beside the scene's sources: `(W^H K^-1 W)^-1 W^H K^-1 y`."""
     if not len(point):
         return Edges.none()
@@ -219,7 +227,7 @@ def _score(rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor:
 def _polished(
     rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor, search: EdgeSearch
 ) -> tuple[Tensor, Tensor]:
-    """Points and axes moved uphill, each on its own hill."""
+    """Points and axes after gradient ascent on the sum of log scores."""
     point, axis = point.clone().requires_grad_(), axis.clone().requires_grad_()
     optimizer = torch.optim.Adam([point, axis], lr=search.step_m, betas=(0.8, 0.95))
     for step in range(search.steps):

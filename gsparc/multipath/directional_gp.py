@@ -1,12 +1,13 @@
-"""`model=directed`: sources where measured directions of arrival meet; channels by one regression, no search.
+"""`model=directional_gp`: sources triangulated from directions of arrival, channels by one regression.
 
-Rays of several receivers meet at images of the transmitter, and who has a ray to which says who sees which.
-With both known a channel is linear in the sources' gains:
+Rays of several receivers intersect at images of the transmitter, and the receivers with a ray to an image are
+those that see it. With positions and visibility known a channel is linear in the sources' gains:
 
     h(x, f) = sum_k m_k(x) g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   m_k(x) in {0, 1}
 
-with m known at the receivers. The gains are Gaussian processes as in `process.py`, nearly constant over
-places; each source's power, and what all share, come by marginal likelihood. At a query m_k is a probability.
+with m known at the receivers. The gains are Gaussian processes as in `gp_likelihood.py`, nearly constant over
+places; each source's power and the shared kernel maximise the marginal likelihood. At a query m_k is a
+probability.
 """
 
 from __future__ import annotations
@@ -24,32 +25,32 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
 from gsparc.multipath.frame import Frame, frame_of, refuse
-from gsparc.multipath.gp_likelihood import JITTER, Factor, steering
-from gsparc.multipath.position_refine import Pinning
-from gsparc.multipath.position_uncertainty import Open, coherence
+from gsparc.multipath.gp_likelihood import Factor, steering
+from gsparc.multipath.position_refine import PositionRefinement
+from gsparc.multipath.position_uncertainty import UncertainPositions, coherence
 from gsparc.multipath.rows import Rows, gather, query_elements
-from gsparc.multipath.triangulation import Rays, meet
-from gsparc.multipath.visibility_gp import Sightings
+from gsparc.multipath.triangulation import Rays, triangulate
+from gsparc.multipath.visibility_gp import VisibilityGP
 from gsparc.multipath.visibility_kernel import matern32
-from gsparc.multipath.visibility_update import Rates, flips
+from gsparc.multipath.visibility_update import RayErrorRates, flips
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT, ranges, wave, wave_over_band
 
-# Receivers whose rays meet in a source; of more sources the most seen are kept.
-LEAST_SEEN, MOST_SOURCES = 2, 60
-MOST_RECEIVERS = 1000  # of more some are drawn: intersections and sightings grow faster than what they tell
+# Receivers with a ray to a source; of more sources those seen by most are kept.
+MIN_SEEN, MAX_SOURCES = 2, 60
+MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
 CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
 NOISES = (0.001, 0.01, 0.05)  # of the rows' power
-ROUNDS = 4  # of powers and shared numbers in turn
-PINNED = 400  # rows that places are pinned by
-REVOTES, RELEARNT = 9, 3  # rounds in which each channel changes one sighting at most
-JUDGED = 700  # rows that the shared numbers are chosen on
+ROUNDS = 4  # of expectation maximisation of powers, and choice of the kernel
+REFINEMENT_ROWS = 400  # rows used for position refinement
+VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entry per receiver at most
+SELECTION_ROWS = 700  # rows that the kernel is chosen on
 
 
 @dataclass(frozen=True)
-class Law:
-    """How gains vary.
+class GainKernel:
+    """Covariance of gains over places.
 
     Attributes:
         constant: share of the variance that is the same everywhere.
@@ -68,38 +69,36 @@ class Law:
 
 
 @dataclass(frozen=True)
-class Query:
-    """Places that channels are asked for, `count` receivers of some antennas.
+class QueryGeometry:
+    """Query places, `count` receivers times their antennas, and what depends on geometry alone.
 
     Attributes:
         places: (m, 3) float64 [m].
         count: of the receivers.
         away: (m, K) float64 [m], ranges to the sources.
-        likely: (m, K), probabilities to see them.
-        alike: (m, n), the law's correlation with the rows.
-        left: (K', m, n), what open places leave of it.
+        probability: (m, K), of seeing them.
+        correlation: (m, n), of gains with the rows'.
+        retained: (K', m, n), coherence retained under position uncertainty, of uncertain sources.
     """
 
     places: Tensor
     count: int
     away: Tensor
-    likely: Tensor
-    alike: Tensor
-    left: Tensor
+    probability: Tensor
+    correlation: Tensor
+    retained: Tensor
 
 
-LAWS = tuple(Law(c, length, noise) for c in CONSTANTS for length in LENGTHS_M for noise in NOISES)
+KERNELS = tuple(GainKernel(c, length, noise) for c in CONSTANTS for length in LENGTHS_M for noise in NOISES)
+REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # during position refinement
 
 
-PINNING = Law(0.97, 2.0, 0.01)  # while places are pinned
-
-
-class DirectedSources(PredictsVariance):
-    """Channels of a moving receiver whose directions of arrival were measured; queries need none.
+class DirectionalGP(PredictsVariance):
+    """Gaussian process on channels of a moving receiver with measured directions; queries need none.
 
     Args:
-        rows: receivers times tones that the regression holds.
-        seed: of which, where there are more.
+        rows: largest number of receivers times tones in the regression.
+        seed: of the subsample.
     """
 
     name = "directional_gp"
@@ -110,143 +109,155 @@ class DirectedSources(PredictsVariance):
         self.row_limit, self.seed = rows, seed
         self.site: Site | None = None
 
-    # ---- learning ----
+    # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Learn from `train` and `val`.
 
         Raises:
-            ValueError: no channels of a moving receiver, no directions, or they meet nowhere.
+            ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
         """
         started = time.monotonic()
         refuse(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
-        known = _some(np.concatenate([fold.train, fold.val]), self.seed)
+        known = _subsample(np.concatenate([fold.train, fold.val]), self.seed)
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
         found = Rays.of(places, rays)
-        bundles = meet(found, self.seed)
-        seen = torch.from_numpy(bundles.seen(found))
-        often = torch.nonzero(seen.sum(0) >= LEAST_SEEN).flatten()
-        if not len(often):
-            raise ValueError("directional_gp: the directions of arrival meet nowhere")
-        often = often[seen[:, often].sum(0).argsort(descending=True, stable=True)[:MOST_SOURCES]]
+        clusters = triangulate(found, self.seed)
+        seen = torch.from_numpy(clusters.seen(found))
+        kept = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
+        if not len(kept):
+            raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
+        kept = kept[seen[:, kept].sum(0).argsort(descending=True, stable=True)[:MAX_SOURCES]]
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
-        points, covariance = (torch.from_numpy(v)[often] for v in (bundles.points, bundles.covariance))
-        self.open = Open(points - self.frame.middle, covariance)
-        self.sightings = Sightings.of(torch.from_numpy(places) - self.frame.middle, seen[:, often])
+        points, covariance = (torch.from_numpy(v)[kept] for v in (clusters.points, clusters.covariance))
+        self.positions = UncertainPositions(points - self.frame.middle, covariance)
+        self.visibility = VisibilityGP.of(torch.from_numpy(places) - self.frame.middle, seen[:, kept])
         self.rows = self.frame.inside(everything)
         at = {int(row): k for k, row in enumerate(known)}
         self.observer = torch.tensor([at[int(row)] for row in everything.receiver])
-        self._pin()
-        self._relearn()
-        changed = self._revote()
+        self._refine_positions()
+        self._refit()
+        changed = self._update_visibility()
         note = (
-            f"directional_gp: {len(self.sources)} sources where rays meet, their directions' error "
-            f"{math.degrees(bundles.error):.2g} degrees; "
-            f"{changed} sightings by the channels; {self.law.constant:.1%} of a gain is the same everywhere"
+            f"directional_gp: {len(self.sources)} triangulated sources, direction error "
+            f"{math.degrees(clusters.error):.2g} degrees; {changed} visibility entries changed by channels; "
+            f"constant share of the gains' variance {self.kernel.constant:.1%}"
         )
         return FitReport(time.monotonic() - started, (note,))
 
     @property
     def sources(self) -> Tensor:
         """Places (K, 3) float64 [m] in the regression's frame."""
-        return self.open.points
+        return self.positions.points
 
-    def _pin(self) -> None:
-        """Places by the phases of the channels, where directions leave them open."""
-        step = max(1, -(-len(self.rows) // PINNED))
+    def _refine_positions(self) -> None:
+        """Refine positions by the phases of the channels, where directions leave them uncertain."""
+        step = max(1, -(-len(self.rows) // REFINEMENT_ROWS))
         some = torch.arange(0, len(self.rows), step)
         rows = self.rows.take(some)
-        alike = PINNING.correlation(rows.position, rows.position)
-        self.open = Pinning(rows, self.sightings.seen[self.observer[some]].float(), self.open, alike).run()
+        correlation = REFINEMENT_KERNEL.correlation(rows.position, rows.position)
+        self.positions = PositionRefinement(
+            rows, self.visibility.seen[self.observer[some]].float(), self.positions, correlation
+        ).run()
 
-    def _relearn(self) -> None:
+    def _refit(self) -> None:
         self._learn()
         self._prepare()
 
     def _learn(self) -> None:
-        """Powers and the law of gains in turn: expectation maximisation, and likelihood on a grid."""
-        step = max(1, -(-len(self.rows) // JUDGED))
+        """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
+        step = max(1, -(-len(self.rows) // SELECTION_ROWS))
         some = torch.arange(0, len(self.rows), step)
         rows, observer = self.rows.take(some), self.observer[some]
-        waves, blurred = self._seen(rows, observer), self.open.blurred(rows.position, rows.frequency)
-        loud = float(waves.abs().square().sum(1).mean())
-        self.power = torch.full((len(self.sources),), 1 / max(loud, 1e-30))
-        alike = {law: law.correlation(rows.position, rows.position) for law in LAWS}
-        turns = self.open.only(blurred).turns(rows.position, rows.frequency)
-        left = coherence(turns, turns)
+        waves = self._visible_waves(rows, observer)
+        uncertain = self.positions.uncertain(rows.position, rows.frequency)
+        mean_power = float(waves.abs().square().sum(1).mean())
+        self.power = torch.full((len(self.sources),), 1 / max(mean_power, 1e-30))
+        correlation = {kernel: kernel.correlation(rows.position, rows.position) for kernel in KERNELS}
+        phase_vectors = self.positions.only(uncertain).phase_vectors(rows.position, rows.frequency)
+        retained = coherence(phase_vectors, phase_vectors)
         for _ in range(ROUNDS):
-            shared = _shared(waves, waves, self.power, blurred, left)
-            tried = [(_factor(shared * alike[law], rows, law), law) for law in LAWS]
-            factor, self.law = min(tried, key=lambda one: one[0].nll)
+            covariance = _covariance(waves, waves, self.power, uncertain, retained)
+            tried = [
+                (Factor.with_noise(covariance * correlation[kernel], kernel.noise, rows.target), kernel)
+                for kernel in KERNELS
+            ]
+            factor, self.kernel = min(tried, key=lambda one: one[0].nll)
             # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
-            prior = self.power * self.law.constant
+            prior = self.power * self.kernel.constant
             mean = prior[:, None] * (waves.mH @ factor.alpha)
             known = (factor.root @ waves).abs().square().sum(0)
             self.power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
 
     def _prepare(self) -> None:
-        """What queries need beyond the state."""
+        """Quantities derived from the state that queries need."""
         rows = self.rows
-        self.waves = self._seen(rows, self.observer)
-        self.blurred = self.open.blurred(rows.position, rows.frequency)
-        self.turns = self.open.only(self.blurred).turns(rows.position, rows.frequency)
-        alike = self.law.correlation(rows.position, rows.position)
-        shared = _shared(self.waves, self.waves, self.power, self.blurred, coherence(self.turns, self.turns))
-        self.factor = _factor(shared * alike, rows, self.law)
+        self.waves = self._visible_waves(rows, self.observer)
+        self.uncertain = self.positions.uncertain(rows.position, rows.frequency)
+        self.phase_vectors = self.positions.only(self.uncertain).phase_vectors(rows.position, rows.frequency)
+        correlation = self.kernel.correlation(rows.position, rows.position)
+        covariance = _covariance(
+            self.waves,
+            self.waves,
+            self.power,
+            self.uncertain,
+            coherence(self.phase_vectors, self.phase_vectors),
+        )
+        self.factor = Factor.with_noise(covariance * correlation, self.kernel.noise, rows.target)
 
         # (n, K, R), real and imaginary: what each row adds to each source's gain
-        pulled = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
-        self.pulled = [part.contiguous() for part in (pulled.real, pulled.imag)]
+        dual_weights = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
+        self.dual_weights = [part.contiguous() for part in (dual_weights.real, dual_weights.imag)]
 
-    def _revote(self) -> int:
-        """Let channels vote on who sees what; returns how many sightings changed.
+    def _update_visibility(self) -> int:
+        """Update visibility by the channels (`visibility_update.py`); returns how many entries changed.
 
-        Where each receiver has one row: more of them tell the gains of their own receiver.
+        Only with one row per receiver: more of them determine the gains of their own receiver.
         """
         if len(self.observer.unique()) < len(self.observer):
             return 0
-        rays = self.sightings.seen.float()
-        likely = self.sightings.left_out.float()
-        rates, rows = Rates.first(rays), self.observer
-        for turn in range(REVOTES):
-            if turn % RELEARNT == RELEARNT - 1:
-                self._relearn()
+        rays = self.visibility.seen.float()
+        probability = self.visibility.left_out.float()
+        rates, rows = RayErrorRates.first(rays), self.observer
+        for turn in range(VISIBILITY_UPDATES):
+            if turn % REFIT_EVERY == REFIT_EVERY - 1:
+                self._refit()
             places, known = self.rows.position, self.factor.inverse.diagonal().real
-            query = Query(
+            query = QueryGeometry(
                 places,
                 len(rows),
                 ranges(places, self.sources),
-                likely[rows],
-                self.law.correlation(places, places),
-                coherence(self.turns, self.turns),
+                probability[rows],
+                self.kernel.correlation(places, places),
+                coherence(self.phase_vectors, self.phase_vectors),
             )
             one = self._gains(query) * steering(self.rows, self.sources)[:, :, None]
-            seen, odds = self.sightings.seen.float(), rates.odds(rays, likely)
-            left = self.factor.alpha / known[:, None]  # eq. 5.12
-            flip = flips(seen[rows], odds[rows], left, 1 / known, one)
+            seen, odds = self.visibility.seen.float(), rates.odds(rays, probability)
+            residual = self.factor.alpha / known[:, None]  # leave-one-out, eq. 5.12
+            flip = flips(seen[rows], odds[rows], residual, 1 / known, one)
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])
-            rates = Rates.of(rays, seen)
-            self.sightings = replace(self.sightings, seen=seen.double())
+            rates = RayErrorRates.of(rays, seen)
+            self.visibility = replace(self.visibility, seen=seen.double())
             self._prepare()
-        changed = int((self.sightings.seen.float() != rays).sum())
+        changed = int((self.visibility.seen.float() != rays).sum())
         if changed:
-            self.sightings = Sightings.of(self.sightings.places, self.sightings.seen)
-            self._relearn()
+            self.visibility = VisibilityGP.of(self.visibility.places, self.visibility.seen)
+            self._refit()
         return changed
 
-    def _seen(self, rows: Rows, observer: Tensor) -> Tensor:
-        """Waves (n, K) complex64 of the sources at every row, of those that its receiver sees."""
-        return steering(rows, self.sources) * self.sightings.seen[observer].float()
+    def _visible_waves(self, rows: Rows, observer: Tensor) -> Tensor:
+        """Waves (n, K) complex64 of the sources at every row, zero where its receiver does not see them."""
+        return steering(rows, self.sources) * self.visibility.seen[observer].float()
 
     # ---- predicting ----
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`; the variance counts gains, noise and who is seen."""
+        """See `Method.predict`; the variance includes gains, noise and visibility."""
         query = self._query(tx, rx)
         variance, prior = self._variance(query)
         variance, prior = (v.reshape(query.count, -1).mean(1) for v in (variance, prior))
@@ -260,18 +271,18 @@ class DirectedSources(PredictsVariance):
         """The mean alone (B, A, K) complex64."""
         return self._sum(self._query(tx, rx))
 
-    def _sum(self, query: Query) -> Tensor:
-        """Of the waves that a query's places receive, as channels of its receivers."""
+    def _sum(self, query: QueryGeometry) -> Tensor:
+        """Predicted mean channels (B, A, K) of a query's receivers."""
         tones = torch.from_numpy(self._fitted().tones())
-        gains = query.likely[:, :, None] * self._gains(query)
+        gains = query.probability[:, :, None] * self._gains(query)
         mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(query.away, tones))
-        loudness = (self.frame.carrier_hz / tones).float()
-        return (mean * (loudness * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
+        tone_scale = (self.frame.carrier_hz / tones).float()
+        return (mean * (tone_scale * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
-        """What `predict` sums, one path a source: see `VirtualSourceGP.paths`."""
+        """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
         query = self._query(tx, rx)
-        gain = query.likely * wave(query.away, self.frame.carrier_hz)
+        gain = query.probability * wave(query.away, self.frame.carrier_hz)
         gain = self._gains(query) * gain[:, :, None]
         gain = (gain * self.frame.scale).movedim(1, -1).reshape(query.count, self.antennas, -1)
         away = query.away.view(query.count, -1, len(self.sources))
@@ -280,39 +291,43 @@ class DirectedSources(PredictsVariance):
         towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
         return gain, delay, towards, self.frame.carrier_hz
 
-    def _query(self, tx: Tensor, rx: Pose) -> Query:
-        """What the regression needs to know of places, antennas of the receivers in its frame."""
+    def _query(self, tx: Tensor, rx: Pose) -> QueryGeometry:
+        """Query geometry of receivers, their antennas in the regression's frame."""
         places = query_elements(self._fitted(), rx, len(tx), self.antennas)
         flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
-        turns = self.open.only(self.blurred).turns(flat, torch.tensor(self.frame.carrier_hz))
-        return Query(
+        phase_vectors = self.positions.only(self.uncertain).phase_vectors(
+            flat, torch.tensor(self.frame.carrier_hz)
+        )
+        return QueryGeometry(
             flat,
             len(places),
             ranges(flat, self.sources),
-            self.sightings.likely(flat).float(),
-            self.law.correlation(flat, self.rows.position),
-            coherence(turns, self.turns),
+            self.visibility.probability(flat).float(),
+            self.kernel.correlation(flat, self.rows.position),
+            coherence(phase_vectors, self.phase_vectors),
         )
 
-    def _gains(self, query: Query) -> Tensor:
+    def _gains(self, query: QueryGeometry) -> Tensor:
         """Posterior mean gains (m, K, R) at a query's places."""
         parts = []
-        for part in self.pulled:
-            gain = (query.alike @ part.flatten(1)).unflatten(1, part.shape[1:])
-            if len(self.blurred):
-                left = query.left * query.alike
-                gain[:, self.blurred] = torch.einsum("kmn,nkr->mkr", left, part[:, self.blurred])
+        for part in self.dual_weights:
+            gain = (query.correlation @ part.flatten(1)).unflatten(1, part.shape[1:])
+            if len(self.uncertain):
+                retained = query.retained * query.correlation
+                gain[:, self.uncertain] = torch.einsum("kmn,nkr->mkr", retained, part[:, self.uncertain])
             parts.append(gain)
         return torch.complex(*parts)
 
-    def _variance(self, query: Query) -> tuple[Tensor, Tensor]:
-        """Expected squared error and expected power (m,) of what a query's places receive."""
-        likely, arriving = query.likely, wave(query.away, self.frame.carrier_hz)
-        loud = arriving.abs().square() * self.power
-        cross = _shared(arriving * likely, self.waves, self.power, self.blurred, query.left) * query.alike
-        gains = (loud * likely.square()).sum(1) - (self.factor.root @ cross.mH).abs().square().sum(0)
-        doubt = (loud * likely * (1 - likely)).sum(1)
-        return gains.clamp_min(0) + doubt + self.law.noise, (loud * likely).sum(1) + self.law.noise
+    def _variance(self, query: QueryGeometry) -> tuple[Tensor, Tensor]:
+        """Expected squared error and expected power (m,) at a query's places."""
+        probability, arriving = query.probability, wave(query.away, self.frame.carrier_hz)
+        powers = arriving.abs().square() * self.power
+        cross = _covariance(arriving * probability, self.waves, self.power, self.uncertain, query.retained)
+        cross = cross * query.correlation
+        gains = (powers * probability.square()).sum(1) - (self.factor.root @ cross.mH).abs().square().sum(0)
+        visibility_variance = (powers * probability * (1 - probability)).sum(1)
+        power = (powers * probability).sum(1)
+        return gains.clamp_min(0) + visibility_variance + self.kernel.noise, power + self.kernel.noise
 
     def leave_one_out(self) -> LeftOut:
         """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`.
@@ -320,33 +335,33 @@ class DirectedSources(PredictsVariance):
         A receiver's own visibility of the sources is left out, too.
         """
         self._fitted()
-        likely = self.sightings.left_out[self.observer].float()
-        expected = steering(self.rows, self.sources) * likely
-        left = coherence(self.turns, self.turns)
-        cross = _shared(expected, self.waves, self.power, self.blurred, left)
-        cross = cross * self.law.correlation(self.rows.position, self.rows.position)
-        said = cross @ self.factor.alpha
+        probability = self.visibility.left_out[self.observer].float()
+        expected = steering(self.rows, self.sources) * probability
+        retained = coherence(self.phase_vectors, self.phase_vectors)
+        cross = _covariance(expected, self.waves, self.power, self.uncertain, retained)
+        cross = cross * self.kernel.correlation(self.rows.position, self.rows.position)
+        predicted = cross @ self.factor.alpha
         for one in self.observer.unique():
             group = torch.nonzero(self.observer == one).flatten()
             own = torch.linalg.solve(self.factor.inverse[group[:, None], group], self.factor.alpha[group])
-            said[group] -= cross[group] @ (self.factor.inverse[:, group] @ own)
-        loud = (self.frame.carrier_hz / self.rows.frequency).float()[:, None] * self.frame.scale
-        return LeftOut(self.rows.receiver.numpy(), (self.rows.target - said) * loud)
+            predicted[group] -= cross[group] @ (self.factor.inverse[:, group] @ own)
+        scale = (self.frame.carrier_hz / self.rows.frequency).float()[:, None] * self.frame.scale
+        return LeftOut(self.rows.receiver.numpy(), (self.rows.target - predicted) * scale)
 
-    # ---- keeping ----
+    # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         self._fitted()
-        rows, seen = self.rows, self.sightings
+        rows, seen = self.rows, self.visibility
         return {
             "antennas": self.antennas,
             "frame": [self.frame.middle, self.frame.scale, self.frame.carrier_hz],
             "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
             "observer": self.observer,
             "sources": self.sources,
-            "open": self.open.covariance,
+            "open": self.positions.covariance,
             "power": self.power,
-            "law": [self.law.constant, self.law.length, self.law.noise],
+            "law": [self.kernel.constant, self.kernel.length, self.kernel.noise],
             "sightings": [seen.places, seen.seen, seen.length, seen.weights, seen.left_out],
         }
 
@@ -355,9 +370,11 @@ class DirectedSources(PredictsVariance):
         self.site, self.antennas = site, int(state["antennas"])
         self.frame, self.rows = Frame(*state["frame"]), Rows(*state["rows"])
         self.observer, self.power, points = state["observer"], state["power"], state["sources"]
-        # checkpoints of before directions had errors have no covariances
-        self.open = Open(points, state.get("open", torch.zeros(len(points), 3, 3, dtype=torch.float64)))
-        self.law, self.sightings = Law(*state["law"]), Sightings(*state["sightings"])
+        # older checkpoints have exact directions and no covariances
+        self.positions = UncertainPositions(
+            points, state.get("open", torch.zeros(len(points), 3, 3, dtype=torch.float64))
+        )
+        self.kernel, self.visibility = GainKernel(*state["law"]), VisibilityGP(*state["sightings"])
         self._prepare()
 
     def size(self) -> int:
@@ -370,25 +387,18 @@ class DirectedSources(PredictsVariance):
         return self.site
 
 
-def _some(known: np.ndarray, seed: int) -> np.ndarray:
-    """At most `MOST_RECEIVERS` of them."""
-    if len(known) <= MOST_RECEIVERS:
+def _subsample(known: np.ndarray, seed: int) -> np.ndarray:
+    """At most `MAX_RECEIVERS` rows."""
+    if len(known) <= MAX_RECEIVERS:
         return known
-    return np.sort(np.random.default_rng(seed).choice(known, MOST_RECEIVERS, replace=False))
+    return np.sort(np.random.default_rng(seed).choice(known, MAX_RECEIVERS, replace=False))
 
 
-def _factor(covariance: Tensor, rows: Rows, law: Law) -> Factor:
-    """Of the covariance (n, n) of the rows' channels, with the law's noise."""
-    loud = max(1.0, float(covariance.diagonal().real.mean()))
-    covariance.diagonal().add_(law.noise + JITTER * loud)
-    return Factor.of(covariance, rows.target)
-
-
-def _shared(first: Tensor, second: Tensor, power: Tensor, blurred: Tensor, left: Tensor) -> Tensor:
-    """Covariance (m, n) by sources seen as waves (m, K) and (n, K), of which (K',) keep `left` (K', m, n)."""
-    loud = power.clone()
-    loud[blurred] = 0
-    total = (first * loud) @ second.mH
-    for k, coherent in zip(blurred.tolist(), left, strict=True):
+def _covariance(first: Tensor, second: Tensor, power: Tensor, uncertain: Tensor, retained: Tensor) -> Tensor:
+    """Covariance (m, n) of waves (m, K) and (n, K); (K',) uncertain sources have coherence (K', m, n)."""
+    exact = power.clone()
+    exact[uncertain] = 0
+    total = (first * exact) @ second.mH
+    for k, coherent in zip(uncertain.tolist(), retained, strict=True):
         total += (power[k] * first[:, k])[:, None] * second[:, k].conj() * coherent
     return total

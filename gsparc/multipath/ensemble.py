@@ -1,4 +1,4 @@
-"""Several searches within a time budget, side by side on the threads there are."""
+"""Ensemble of searches within a time budget, in parallel on the available threads."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.multipath.clutter.search import furnish
+from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.multipath.refine_phase import settle
+from gsparc.multipath.refine_phase import fit_phases
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.search import Search, SearchSettings
-from gsparc.multipath.search_cache import Shelf
+from gsparc.multipath.search_cache import SearchCache
 
 log = logging.getLogger(__name__)
 
-TURNING = 0.4  # share of a gain's variation that is not along its phase, before it is learned
-SHARPNESS = 4  # weight of a search = (left-out error)^-4: half the error again counts a fifth
-ENOUGH = 0.004  # left-out error of two searches below which no third is started: 24 dB
+QUADRATURE = 0.4  # initial `PhasedScene.quadrature`
+SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
+CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
 LAST_START, ROUNDS_END = 0.6, 0.8  # of the budget: no search starts, no search adds sources after
 
 
@@ -46,7 +46,7 @@ class Budget:
 
 @dataclass(frozen=True)
 class Member:
-    """What one search found.
+    """Result of one search.
 
     Attributes:
         phased: the scene.
@@ -58,81 +58,81 @@ class Member:
 
 
 def search_many(
-    draw: list[Rows],
+    row_sets: list[Rows],
     transmitter: Tensor,
     settings: SearchSettings,
     seed: int,
     noise_floor: float,
     budget: Budget,
-    furniture: bool = False,
-    shelf: Shelf | None = None,
+    clutter: bool = False,
+    cache: SearchCache | None = None,
     stage: str = "search",
 ) -> list[Member]:
-    """One search on each of the drawn rows, best first; at least one, others while the budget lasts.
+    """One search per set of rows, best first; at least one, others while the budget lasts.
 
-    None is started any more once two have ended at the noise floor: they would say the same.
+    No further search starts once two have reached the noise floor.
 
     Args:
-        draw: rows of each search, unit mean power, about the middle of the scene.
+        row_sets: rows of each search, unit mean power, about the middle of the scene.
         transmitter: (3,) float64 [m], in the same frame.
         settings: of every search.
         seed: of the first search; the others count on.
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: of all together.
-        furniture: whether boxes and small mirrors are looked for, too.
-        shelf: where finished searches are kept, under the name of `stage`; None keeps none.
-        stage: tells searches of one fit apart.
+        clutter: search for occluding boxes and finite mirrors, too.
+        cache: of finished searches, under the name of `stage`; None for no cache.
+        stage: distinguishes searches of one fit.
     """
     threads = torch.get_num_threads()
     errors: list[float] = []
 
     def search(number: int) -> Member | None:
-        done = None if shelf is None else shelf.find(f"{stage} {number}")
+        done = None if cache is None else cache.find(f"{stage} {number}")
         if done is not None:
             return done
         if number > 0 and budget.spent > LAST_START * budget.seconds:
             return None
-        if agreed(errors, noise_floor):
+        if at_noise_floor(errors, noise_floor):
             return None
-        rows = draw[number]
+        rows = row_sets[number]
         deadline = budget.started + ROUNDS_END * budget.seconds
         scene = Search(rows, transmitter, settings, seed + number, deadline).run()
-        phased = settle(
-            rows, PhasedScene.of(rows, scene, TURNING), settings.visibility, noise_floor=noise_floor
+        phased = fit_phases(
+            rows, PhasedScene.of(rows, scene, QUADRATURE), settings.visibility, noise_floor=noise_floor
         )
-        if furniture and phased.turning < 1:
+        if clutter and phased.quadrature < 1:
             generator = torch.Generator().manual_seed(seed + number)
             latest = budget.started + budget.seconds
-            phased = furnish(rows, phased, generator, deadline=latest, noise_floor=noise_floor)
+            phased = find_clutter(rows, phased, generator, deadline=latest, noise_floor=noise_floor)
         error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
         left_out = float(error.abs().square().sum() / rows.target.abs().square().sum())
         log.info(
             "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
-            number + 1, len(draw), len(scene.words), len(scene.planes), left_out,
+            number + 1, len(row_sets), len(scene.words), len(scene.planes), left_out,
             budget.spent, budget.seconds,
         )  # fmt: skip
         member = Member(phased, left_out)
         errors.append(left_out)
-        if shelf is not None:
-            shelf.put(f"{stage} {number}", member)
+        if cache is not None:
+            cache.put(f"{stage} {number}", member)
         return member
 
-    # Matrices of a few hundred rows gain little from two threads; two searches do.
+    # Parallel searches scale better than threaded factorisations of a few hundred rows.
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(max(1, min(threads, len(draw)))) as pool:
-            found = [member for member in pool.map(search, range(len(draw))) if member is not None]
+        with ThreadPoolExecutor(max(1, min(threads, len(row_sets)))) as pool:
+            found = [member for member in pool.map(search, range(len(row_sets))) if member is not None]
     finally:
         torch.set_num_threads(threads)
     return sorted(found, key=lambda member: member.left_out)
 
 
-def agreed(left_out: Sequence[float], noise_floor: float) -> bool:
-    """Whether two searches ended at the noise floor, so that another one would say the same."""
-    return sum(error < max(ENOUGH, 2 * noise_floor) for error in left_out) > 1
+def at_noise_floor(left_out: Sequence[float], noise_floor: float) -> bool:
+    """Whether two searches have reached the noise floor."""
+    return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) > 1
 
 
-def weights(members: list[Member]) -> Tensor:
-    """What each search counts in the average, (M,) float32 of sum 1."""
+def ensemble_weights(members: list[Member]) -> Tensor:
+    """Weights of the searches in the average, (M,) float32 of sum 1."""
     error = torch.tensor([max(member.left_out, 1e-6) for member in members])
     return torch.softmax(-SHARPNESS * error.log(), 0)

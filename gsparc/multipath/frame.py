@@ -1,4 +1,4 @@
-"""From local metres and stored units to those that sources are found in, and back."""
+"""Normalisation of positions and targets for fitting, and back."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from gsparc.multipath.rows import Rows
 
 @dataclass(frozen=True)
 class Frame:
-    """How local metres and stored units become the search's.
+    """Offset and scale between local metres and stored units, and those of the fit.
 
     Attributes:
-        middle: (3,) float64 [m], local; the search works about it.
-        scale: stored target = scale * search target.
+        middle: (3,) float64 [m], local; origin of the fit.
+        scale: stored target = scale * normalised target.
         carrier_hz: amplitude goes with wavelength, so targets are multiplied by f / carrier first [Hz].
     """
 
@@ -26,27 +26,27 @@ class Frame:
     carrier_hz: float
 
     def inside(self, rows: Rows) -> Rows:
-        """Rows in local metres and stored units, as the search wants them."""
+        """Rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
         return replace(rows.moved(-self.middle), target=flat)
 
 
 def frame_of(site: Site, rows: Rows) -> Frame:
-    """Where these rows have their middle and unit power.
+    """Frame in which these rows have zero mean position and unit power.
 
     Raises:
-        ValueError: every channel is silent.
+        ValueError: every channel is zero.
     """
     frequency = site.tones()
     carrier = float(frequency.mean()) if site.carrier_hz is None else float(site.carrier_hz)
     power = (rows.target * (rows.frequency / carrier)[:, None].float()).abs().square().mean()
     if not power > 0:
-        raise ValueError(f"{site.name}: every channel to learn from is silent, no source can be found")
+        raise ValueError(f"{site.name}: every training channel is zero, no source can be found")
     return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 
 def refuse(site: Site, name: str, antennas: int = 1) -> None:
-    """ValueError, in the name of a method, where sources with carrier phase explain nothing."""
+    """`ValueError`, in the name of a method, for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:

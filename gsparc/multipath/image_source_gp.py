@@ -1,4 +1,4 @@
-"""`model=vsgp`: channels from virtual sources found by search, averaged over searches, with a variance."""
+"""`model=image_source_gp`: channels from an ensemble of image-source searches, with a variance."""
 
 from __future__ import annotations
 
@@ -18,8 +18,15 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction, PredictsVariance
 from gsparc.methods.pareto import Settings
 from gsparc.multipath.clutter.blocking import Clutter
-from gsparc.multipath.diffraction import Edges, diffracted, edge_wave, find_edges, with_gains, without
-from gsparc.multipath.ensemble import Budget, Member, agreed, search_many, weights
+from gsparc.multipath.diffraction import (
+    Edges,
+    diffracted,
+    edge_wave,
+    find_edges,
+    fit_edge_gains,
+    subtract_edges,
+)
+from gsparc.multipath.ensemble import Budget, Member, at_noise_floor, ensemble_weights, search_many
 from gsparc.multipath.frame import Frame, frame_of, refuse
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
@@ -28,7 +35,7 @@ from gsparc.multipath.query import Query
 from gsparc.multipath.reduce import reduced
 from gsparc.multipath.rows import Rows, elements, gather, query_elements
 from gsparc.multipath.search import SearchSettings
-from gsparc.multipath.search_cache import Shelf
+from gsparc.multipath.search_cache import SearchCache
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.ops import Pose
@@ -36,28 +43,26 @@ from gsparc.physics.waves import LIGHT, ranges, wave, wave_over_band
 
 log = logging.getLogger(__name__)
 
-SECONDS = 0.02  # times measurements^1.5: a conference room of 350 gets 130 s, 700 get 370
-LEAST_BUDGET_S, MOST_BUDGET_S = 120.0, 400.0
-CLEARLY = 0.8  # left-out error beside edges over that without, for edges to stay
-AGAIN = 0.2  # of the budget, at least, for searching again beside edges
-ALIGNING = (8, 20)  # sources of the searches that offsets are estimated against
-ALIGNMENTS = 3  # estimates of offsets and gains in turn, after each
+SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
+MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
+MAX_EDGE_ERROR = 0.8  # leave-one-out error with edges over that without, above which edges are dropped
+EDGE_BUDGET = 0.2  # least share of the budget for the search with edges
+ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
+ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
 
 
-class VirtualSourceGP(PredictsVariance):
-    """The virtual-source Gaussian process for a moving receiver, or for a transmitter before one antenna.
+class ImageSourceGP(PredictsVariance):
+    """Image-source Gaussian process for a moving receiver, or a moving transmitter and one antenna.
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
-        budget_s: what all searches may take, about; None: 120 to 400 s, growing with the
-            measurements.
-        search_rows: receivers times tones that a search looks at.
-        rows: receivers times tones that the final process holds.
+        budget_s: approximate time of all searches [s]; None: 120 to 400 s by the number of measurements.
+        search_rows: receivers times tones of a search.
+        rows: receivers times tones of the final process.
         margin, max_sources, order: see `SearchSettings`.
-        offsets: what every snapshot has of its own: `none`, `phase`, or `phase_timing`; it is estimated.
-        clutter: look for occluding boxes and finite mirrors, shared by all sources.
-        edges: look for edges, whose diffraction point slides with the receiver; kept when the likelihood
-            wants them.
+        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
+        clutter: search for occluding boxes and finite mirrors, shared by all sources.
+        edges: search for diffracting edges; kept when the likelihood gains.
         seed: of everything random.
 
     Raises:
@@ -94,7 +99,7 @@ class VirtualSourceGP(PredictsVariance):
         self.site: Site | None = None
         self.members: list[PhasedPosterior] = []
 
-    # ---- learning ----
+    # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
         started = time.monotonic()
@@ -108,26 +113,30 @@ class VirtualSourceGP(PredictsVariance):
         held = self.frame.inside(everything)
         notes = []
         if self.offsets != "none":
-            data = self._aligned(data, known)
+            data = self._without_offsets(data, known)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-            notes.append(f"{self.name}: {self.offsets} of every snapshot estimated; predictions have none")
-        shelf = Shelf(context.run_dir, context.resume, self._key(data, known), _scene_state, _scene)
-        started -= shelf.spent_s
+            notes.append(
+                f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
+            )
+        cache = SearchCache(context.run_dir, context.resume, self._key(data, known), _scene_state, _scene)
+        started -= cache.spent_s
         budget = Budget(started, self._budget(len(known), context.budget_s))
-        found = self._search(data, known, self.settings, self.searches, budget, self.clutter, shelf)
+        found = self._search(data, known, self.settings, self.searches, budget, self.clutter, cache)
         if self.look_for_edges:
-            found, held = self._beside_edges(data, known, found, held, shelf, budget)
-        self.weights = weights(found)
+            found, held = self._search_with_edges(data, known, found, held, cache, budget)
+        self.weights = ensemble_weights(found)
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
-        agree = agreed([member.left_out for member in found], self.noise_floor)
-        ended = "more would agree" if agree else f"within {budget.seconds:.0f} s"
+        agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
+        ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
         notes.append(f"{self.name}: {len(found)} of {self.searches} searches ({ended}), {counts} sources")
         scene = self.members[0].scene
-        told = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
-        told[SourceKind.EDGE] = len(self.edges)
-        notes.append(f"{self.name}: the best search has " + ", ".join(f"{told[k]} {k}s" for k in SourceKind))
+        counted = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
+        counted[SourceKind.EDGE] = len(self.edges)
+        notes.append(
+            f"{self.name}: the best search has " + ", ".join(f"{counted[k]} {k}s" for k in SourceKind)
+        )
         clutter = scene.clutter
         if len(clutter):
             these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
@@ -135,7 +144,7 @@ class VirtualSourceGP(PredictsVariance):
         return FitReport(time.monotonic() - started, tuple(notes))
 
     def _key(self, data: Measurements, known: np.ndarray) -> str:
-        """What searches depend on; how long they may take and how many there are is not part of it."""
+        """Hash of what a search depends on; neither the budget nor the number of searches."""
         facts = (data.site.sha256, self.search_rows, self.row_limit, self.offsets, self.clutter, self.seed)
         return sha256(f"{facts} {self.settings} ".encode() + known.tobytes()).hexdigest()[:24]
 
@@ -144,7 +153,7 @@ class VirtualSourceGP(PredictsVariance):
             return given_s
         if self.budget_s is not None:
             return self.budget_s
-        return min(max(SECONDS * measurements**1.5, LEAST_BUDGET_S), MOST_BUDGET_S)
+        return min(max(SECONDS_PER_ROW * measurements**1.5, MIN_BUDGET_S), MAX_BUDGET_S)
 
     def _search(
         self,
@@ -153,68 +162,72 @@ class VirtualSourceGP(PredictsVariance):
         settings: SearchSettings,
         count: int,
         budget: Budget,
-        furniture: bool = False,
-        shelf: Shelf | None = None,
+        clutter: bool = False,
+        cache: SearchCache | None = None,
     ) -> list[Member]:
-        draw = [self._inside(data, known, self.search_rows, self.seed + i) for i in range(count)]
-        start = self._start(data.site)
-        return search_many(draw, start, settings, self.seed, self.noise_floor, budget, furniture, shelf)
+        row_sets = [self._rows(data, known, self.search_rows, self.seed + i) for i in range(count)]
+        transmitter = self._transmitter(data.site)
+        return search_many(
+            row_sets, transmitter, settings, self.seed, self.noise_floor, budget, clutter, cache
+        )
 
-    def _beside_edges(
+    def _search_with_edges(
         self,
         data: Measurements,
         known: np.ndarray,
         found: list[Member],
         held: Rows,
-        shelf: Shelf,
+        cache: SearchCache,
         budget: Budget,
     ) -> tuple[list[Member], Rows]:
-        """Searches and rows without the edges that the likelihood wants; as they were when it wants none."""
-        scene, rows = found[0].phased.scene, self._inside(data, known, self.search_rows, self.seed)
-        start, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
-        edges = find_edges(rows, scene, box_of(rows, start), generator, self.noise_floor)
+        """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
+        scene, rows = found[0].phased.scene, self._rows(data, known, self.search_rows, self.seed)
+        transmitter, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
+        edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor)
         if not len(edges):
             return found, held
-        log.info("%d edges; searching again without what they explain", len(edges))
-        remaining = max(budget.seconds - budget.spent, AGAIN * budget.seconds)
+        log.info("%d edges; searching again on the residual", len(edges))
+        remaining = max(budget.seconds - budget.spent, EDGE_BUDGET * budget.seconds)
         budget = Budget(time.monotonic(), remaining)
-        draw = [self._inside(data, known, self.search_rows, self.seed + i) for i in range(self.searches)]
-        draw = [without(part, edges, start) for part in draw]
-        again = search_many(
-            draw, self._start(data.site), self.settings, self.seed, self.noise_floor, budget,
-            self.clutter, shelf, "beside edges",
+        row_sets = [self._rows(data, known, self.search_rows, self.seed + i) for i in range(self.searches)]
+        row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
+        with_edges = search_many(
+            row_sets, self._transmitter(data.site), self.settings, self.seed, self.noise_floor, budget,
+            self.clutter, cache, "beside edges",
         )  # fmt: skip
-        power = float(draw[0].target.abs().square().mean())  # left-out errors are shares of it
-        # the edges' own gains saw every row: only a clear gain counts
-        if again[0].left_out * power > CLEARLY * found[0].left_out:
+        power = float(row_sets[0].target.abs().square().mean())  # leave-one-out errors are relative to it
+        # the edges' gains were fitted to every row: ask for a clear margin
+        if with_edges[0].left_out * power > MAX_EDGE_ERROR * found[0].left_out:
             return found, held
-        scene = again[0].phased.scene
-        self.edges = with_gains(held, edges.point, edges.axis, scene, self.noise_floor)
-        return again, without(held, self.edges, scene.transmitter)
+        scene = with_edges[0].phased.scene
+        self.edges = fit_edge_gains(held, edges.point, edges.axis, scene, self.noise_floor)
+        return with_edges, subtract_edges(held, self.edges, scene.transmitter)
 
-    def _inside(self, data: Measurements, known: np.ndarray, limit: int, seed: int) -> Rows:
+    def _rows(self, data: Measurements, known: np.ndarray, limit: int, seed: int) -> Rows:
         return self.frame.inside(gather(data, known, limit, seed))
 
-    def _start(self, site: Site) -> Tensor:
+    def _transmitter(self, site: Site) -> Tensor:
         assert site.static_position is not None
         return torch.from_numpy(np.asarray(site.static_position, np.float64)) - self.frame.middle
 
-    def _aligned(self, data: Measurements, known: np.ndarray) -> Measurements:
-        """Offsets against the line of sight, then against ever more sources."""
-        start = self._start(data.site)
-        aligned = self._against(data, known, start[None], torch.ones(1, self.antennas))
-        for sources in ALIGNING:
+    def _without_offsets(self, data: Measurements, known: np.ndarray) -> Measurements:
+        """Estimate offsets against the line of sight, then against more and more sources."""
+        transmitter = self._transmitter(data.site)
+        aligned = self._remove_offsets(data, known, transmitter[None], torch.ones(1, self.antennas))
+        for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
-            now = Budget(time.monotonic(), LEAST_BUDGET_S)
+            now = Budget(time.monotonic(), MIN_BUDGET_S)
             phased = self._search(aligned, known, few, 1, now)[0].phased
-            for _ in range(ALIGNMENTS):
-                rows = self._inside(aligned, known, self.search_rows, self.seed)
+            for _ in range(ALIGNMENT_ROUNDS):
+                rows = self._rows(aligned, known, self.search_rows, self.seed)
                 gains = PhasedPosterior(rows, phased, self.noise_floor).mean_gains
-                aligned = self._against(data, known, phased.scene.sources, gains)
+                aligned = self._remove_offsets(data, known, phased.scene.sources, gains)
         return aligned
 
-    def _against(self, data: Measurements, known: np.ndarray, sources: Tensor, gains: Tensor) -> Measurements:
-        """Targets of the known rows without the offsets they have against sources of constant gains."""
+    def _remove_offsets(
+        self, data: Measurements, known: np.ndarray, sources: Tensor, gains: Tensor
+    ) -> Measurements:
+        """Targets of the known rows without their offsets against sources of constant gains."""
         frequency = data.site.tones()
         places = elements(data.site, data.moving[known], data.rx_rotation[known], self.antennas)
         flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
@@ -236,8 +249,8 @@ class VirtualSourceGP(PredictsVariance):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`.
 
-        The variance is the posterior's plus the searches' spread; the confidence is the share of the power
-        expected there that is known.
+        The variance is the posterior's plus that of the ensemble; the confidence is the explained share of
+        the expected power.
         """
         site = self._fitted()
         flat, count = self._places(tx, rx)
@@ -249,8 +262,8 @@ class VirtualSourceGP(PredictsVariance):
             stack = stack + self.edges.over_band(flat, tones, self.members[0].scene.transmitter)
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        loudness = (self.frame.carrier_hz / tones).float()
-        mean = (mean * (loudness * self.frame.scale)).reshape(count, self.antennas, len(tones))
+        tone_scale = (self.frame.carrier_hz / tones).float()
+        mean = (mean * (tone_scale * self.frame.scale)).reshape(count, self.antennas, len(tones))
         variance, prior = (v.reshape(count, per).mean(1) for v in (variance, prior))
         return Prediction(
             mean,
@@ -259,7 +272,7 @@ class VirtualSourceGP(PredictsVariance):
         )
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
-        """What `predict` sums: one path a source of every search, weighted as the searches are, and edges.
+        """The paths that `predict` sums: one per source of every search, with the search's weight, and edges.
 
         Returns:
             Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
@@ -267,19 +280,19 @@ class VirtualSourceGP(PredictsVariance):
             the carrier [Hz].
         """
         flat, count = self._places(tx, rx)
-        start, carrier = self.members[0].scene.transmitter, self.frame.carrier_hz
+        transmitter, carrier = self.members[0].scene.transmitter, self.frame.carrier_hz
         middle = flat.view(count, -1, 3).mean(1)
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
         away = ranges(flat, self.query.pack.sources)
         gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
         towards = self.query.pack.sources - middle[:, None]
         if len(self.edges):
-            length, met = diffracted(flat, self.edges, start)
+            length, met = diffracted(flat, self.edges, transmitter)
             hertz = torch.full((len(flat),), carrier, dtype=torch.float64)
-            waves = edge_wave(flat, self.edges.point, self.edges.axis, start, hertz)
+            waves = edge_wave(flat, self.edges.point, self.edges.axis, transmitter, hertz)
             gain = torch.cat([gain, waves.T[..., None] * self.edges.gain[:, None]])
             away = torch.cat([away, length], 1)
-            # every element meets an edge elsewhere: the middle of where they do
+            # elements differ in diffraction points: their mean
             met = met.view(count, -1, len(self.edges), 3).mean(1)
             towards = torch.cat([towards, met - middle[:, None]], 1)
         gain = (gain * self.frame.scale).movedim(0, -1).reshape(count, self.antennas, -1)
@@ -287,7 +300,7 @@ class VirtualSourceGP(PredictsVariance):
         return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True), carrier
 
     def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
-        """Antennas of the moving end (B E, 3) float64 in the search's frame, and B."""
+        """Antennas of the moving end (B E, 3) float64 in the normalised frame, and B."""
         site = self._fitted()
         if site.moving_end == "rx":
             places = query_elements(site, rx, len(tx), self.antennas)
@@ -299,11 +312,11 @@ class VirtualSourceGP(PredictsVariance):
         """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
         self._fitted()
         rows, weight = self.members[0].rows, self.weights[:, None, None]
-        said = (weight * torch.stack([member.left_out() for member in self.members])).sum(0)
-        loud = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
-        return LeftOut(rows.receiver.numpy(), (rows.target - said) * loud, self.offsets != "none")
+        predicted = (weight * torch.stack([member.left_out() for member in self.members])).sum(0)
+        scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
+        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale, self.offsets != "none")
 
-    # ---- what it can do besides ----
+    # ---- resume and reductions ----
     def resume_problem(self) -> str | None:
         """None: finished searches are kept in `last.ckpt`."""
         return None
@@ -323,7 +336,7 @@ class VirtualSourceGP(PredictsVariance):
         """See `Reducible`."""
         return reduced(self, settings, measured)
 
-    # ---- keeping ----
+    # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         self._fitted()
@@ -361,17 +374,16 @@ class VirtualSourceGP(PredictsVariance):
 
 def _scene_state(phased: PhasedScene) -> dict[str, Any]:
     scene = phased.scene
-    law = scene.visibility
-    assert isinstance(law, KernelVisibility)
+    kernel = scene.visibility
     return {
         "transmitter": scene.transmitter,
         "planes": scene.planes,
         "words": [list(word) for word in scene.words],
         "log_amplitude": scene.log_amplitude,
         "log_noise": scene.log_noise,
-        "visibility": [float(law.constant), float(law.angle), float(law.length)],
+        "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
         "phase": phased.phase,
-        "turning": phased.turning,
+        "turning": phased.quadrature,
         "boxes": scene.clutter.boxes,
         "patches": scene.clutter.patches,
         "patched": list(scene.clutter.plane),

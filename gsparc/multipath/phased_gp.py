@@ -1,11 +1,11 @@
-"""Gains that keep their phase: the final process, once the sources are known.
+"""Gains of constant phase: the final process, once the sources are known.
 
-A mirror turns the phase the same way wherever it is seen from; what varies from place to place is how much of
-a source is seen. So `g_k(x) = exp(j phi_k) (u_k(x) + j v_k(x))` with real Gaussian processes u_k and v_k, and
-nearly all the variance in u_k: a share `turning / 2` is left to v_k (1 / 2 would be the circular process of
+The phase of a reflection is the same at all places; what varies is the visible share of a source. So `g_k(x)
+= exp(j phi_k) (u_k(x) + j v_k(x))` with real Gaussian processes u_k and v_k, and nearly all the variance in
+u_k: a share `quadrature / 2` is in v_k (1 / 2 would be the circular process of
 `gsparc.multipath.gp_likelihood`). In real and imaginary parts, n complex rows are 2 n real numbers of
 covariance
-    sum_k s_k^2 C_k * [(1 - turning / 2) p p^T + turning / 2 q q^T] + noise / 2
+    sum_k s_k^2 C_k * [(1 - quadrature / 2) p p^T + quadrature / 2 q q^T] + noise / 2
 
 with p = (Re w_k, Im w_k), q = (-Im w_k, Re w_k), w_k = a_k exp(j phi_k). It halves what must be learned of
 each source's visibility; the phases must be known first, so the search itself stays circular.
@@ -22,36 +22,37 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, View
+from gsparc.multipath.visibility_kernel import View
 
 
 @dataclass(frozen=True)
 class PhasedScene:
-    """A scene whose sources have phases.
+    """A scene whose gains have fixed phases.
 
     Attributes:
         scene: positions, amplitudes, visibility, noise.
         phase: (K,) float32 [rad], phi_k.
-        turning: in (0, 1]; 1 with several outputs, which have no common phase.
+        quadrature: in (0, 1], twice the share of a gain's variance in quadrature to its phase; 1 with several
+            outputs, which have no common phase.
     """
 
     scene: Scene
     phase: Tensor
-    turning: float
+    quadrature: float
 
     @staticmethod
-    def of(rows: Rows, scene: Scene, turning: float) -> PhasedScene:
-        """Phases as the circular process sees them: those of each source's mean gain."""
+    def of(rows: Rows, scene: Scene, quadrature: float) -> PhasedScene:
+        """Phases of each source's mean gain under the circular process."""
         posterior = Posterior(rows, scene)
         gain = (posterior.waves.mH @ posterior.factor.alpha).sum(1)
-        return PhasedScene(scene, gain.angle(), turning if rows.target.shape[1] == 1 else 1.0)
+        return PhasedScene(scene, gain.angle(), quadrature if rows.target.shape[1] == 1 else 1.0)
 
     def waves(self, rows: Rows) -> Tensor:
         """w_k at the rows, (n, K) complex64."""
         return self.scene.waves(rows) * torch.polar(torch.ones(()), self.phase)
 
-    def unshaded(self, rows: Rows) -> Tensor:
-        """The same as if the clutter were not there."""
+    def unobstructed(self, rows: Rows) -> Tensor:
+        """The same without clutter."""
         return steering(rows, self.scene.sources) * torch.polar(torch.ones(()), self.phase)
 
 
@@ -60,16 +61,16 @@ def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
     return torch.cat([waves.real, waves.imag]), torch.cat([-waves.imag, waves.real])
 
 
-def shares(turning: float) -> Tensor:
+def shares(quadrature: float) -> Tensor:
     """Variance along and across a gain's phase, (2,)."""
-    return torch.tensor([1 - turning / 2, turning / 2])
+    return torch.tensor([1 - quadrature / 2, quadrature / 2])
 
 
-def add_source(covariance: Tensor, wave: Tensor, turning: float, correlation: Tensor) -> None:
+def add_source(covariance: Tensor, wave: Tensor, quadrature: float, correlation: Tensor) -> None:
     """Add one source to a covariance (2, n, 2, n); `wave` (n,) complex is s_k w_k."""
     pair = torch.stack(stacked(wave), 1)
     covariance.addcmul_(
-        ((pair * shares(turning)) @ pair.T).view_as(covariance), correlation[None, :, None, :]
+        ((pair * shares(quadrature)) @ pair.T).view_as(covariance), correlation[None, :, None, :]
     )
 
 
@@ -115,7 +116,7 @@ class RealFactor:
 
 
 class PhasedPosterior:
-    """A phased scene confronted with rows."""
+    """Posterior of a phased scene's gains given rows."""
 
     def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
         self.rows, self.phased, self.noise_floor = rows, phased, noise_floor
@@ -134,39 +135,43 @@ class PhasedPosterior:
         for k, source in enumerate(scene.sources):
             view = View.of(self.rows.position, source)
             scaled = self.waves[:, k] * scene.log_amplitude[k].exp()
-            add_source(covariance, scaled, self.phased.turning, scene.visibility.correlation(view, view))
+            add_source(covariance, scaled, self.phased.quadrature, scene.visibility.correlation(view, view))
         noise = math.exp(scene.log_noise) + self.noise_floor
         covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)
         return RealFactor.of(covariance, self.rows.target)
 
     @property
-    def pulled(self) -> Tensor:
-        """What each row adds to u_k + j v_k (K, n, R) complex64, before the correlation over places."""
-        n, (along, across) = len(self.rows), shares(self.phased.turning)
+    def dual_weights(self) -> Tensor:
+        """Dual weights of u_k + j v_k (K, n, R) complex64, before the correlation over places."""
+        n, (along, across) = len(self.rows), shares(self.phased.quadrature)
         alpha = torch.complex(self.factor.alpha[:n], self.factor.alpha[n:])
         power = self.scene.log_amplitude.mul(2).exp()
-        raw = (self.waves.conj() * power).T[:, :, None] * alpha
-        return torch.complex(along * raw.real, across * raw.imag)
+        circular = (self.waves.conj() * power).T[:, :, None] * alpha
+        return torch.complex(along * circular.real, across * circular.imag)
 
     @property
     def mean_gains(self) -> Tensor:
-        """Each source's gain (K, R) complex64 as far as it is the same everywhere."""
-        law = self.scene.visibility
-        share = float(law.constant) if isinstance(law, KernelVisibility) else 1.0
-        return share * self.pulled.sum(1) * torch.polar(torch.ones(()), self.phased.phase)[:, None]
+        """Constant part of each source's gain (K, R) complex64."""
+        return (
+            float(self.scene.visibility.constant)
+            * self.dual_weights.sum(1)
+            * torch.polar(torch.ones(()), self.phased.phase)[:, None]
+        )
 
     def gains(self, places: Tensor) -> Tensor:
-        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], as far as seen."""
-        pulled, per_source = self.pulled, []
+        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], attenuated by clutter."""
+        dual_weights, per_source = self.dual_weights, []
         for k, source in enumerate(self.scene.sources):
             here, there = View.of(places, source), View.of(self.rows.position, source)
             correlation = self.scene.visibility.correlation(here, there)
-            per_source.append(torch.complex(correlation @ pulled[k].real, correlation @ pulled[k].imag))
-        turn = torch.polar(self.scene.shade(places), self.phased.phase.expand(1, -1))
+            per_source.append(
+                torch.complex(correlation @ dual_weights[k].real, correlation @ dual_weights[k].imag)
+            )
+        turn = torch.polar(self.scene.visible_share(places), self.phased.phase.expand(1, -1))
         return torch.stack(per_source, 1) * turn[:, :, None]
 
     def left_out(self) -> Tensor:
-        """Each row predicted from the rows of all other receivers (n, R) complex64.
+        """Leave-one-receiver-out predictions (n, R) complex64.
 
         Rasmussen and Williams (2006), eq. 5.12, in blocks.
         """

@@ -1,7 +1,8 @@
-"""What a source's place that is known only to within a covariance leaves of its coherence.
+"""Loss of coherence between receivers by uncertainty of a source's position.
 
-To receivers far apart a source at an uncertain place has an unknown phase. Averaged over a place with
-covariance S, what receivers in directions u and u' hear of it has the covariance of a sharp source times
+A source at an uncertain position has an unknown relative phase at receivers far apart. Averaged over a
+position of covariance S, signals received in directions u and u' have the covariance of a known position
+times
 
     exp(-|L^T (v - v')|^2 / 2),   v = 2 pi f u / c,   S = L L^T .
 """
@@ -17,12 +18,12 @@ from torch import Tensor
 
 from gsparc.physics.waves import LIGHT
 
-SHARP_RAD = 0.1  # standard deviation of relative phases below which a place counts as exact
+SHARP_RAD = 0.1  # standard deviation of relative phases below which a position counts as exact
 
 
 @dataclass(frozen=True)
-class Open:
-    """K sources whose places are known to within covariances.
+class UncertainPositions:
+    """K sources with Gaussian position uncertainty.
 
     Attributes:
         points: (K, 3) float64 [m].
@@ -37,24 +38,24 @@ class Open:
         """(K, 3, 3), Cholesky factors of the covariances."""
         return torch.linalg.cholesky(self.covariance + 1e-14 * torch.eye(3, dtype=torch.float64))
 
-    def turns(self, places: Tensor, frequency: Tensor) -> Tensor:
+    def phase_vectors(self, places: Tensor, frequency: Tensor) -> Tensor:
         """(K, n, 3) float32 [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
-        slope = slopes(self.points, places, frequency)
+        slope = wave_vectors(self.points, places, frequency)
         return (slope @ self.lower).float()
 
-    def only(self, kept: Tensor) -> Open:
-        """Some of the sources."""
-        return Open(self.points[kept], self.covariance[kept])
+    def only(self, kept: Tensor) -> UncertainPositions:
+        """A subset of the sources."""
+        return UncertainPositions(self.points[kept], self.covariance[kept])
 
-    def blurred(self, places: Tensor, frequency: Tensor) -> Tensor:
-        """Numbers of the sources that are not sharp to these places."""
-        turns = self.turns(places, frequency)
-        spread = (turns - turns.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
+    def uncertain(self, places: Tensor, frequency: Tensor) -> Tensor:
+        """Indices of the sources that are not coherent over these places."""
+        phase_vectors = self.phase_vectors(places, frequency)
+        spread = (phase_vectors - phase_vectors.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
         return torch.nonzero(spread > SHARP_RAD).flatten()
 
 
-def slopes(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
-    """(K, n, 3) float64 [rad/m], how fast phases that places receive turn with the points, up to a sign."""
+def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
+    """(K, n, 3) float64 [rad/m], gradients of the received phases by the sources' positions, up to a sign."""
     towards = points[:, None] - places[None]
     away = torch.linalg.vector_norm(towards, dim=-1, keepdim=True).clamp_min(1e-3)
     hertz = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1, 1)
@@ -62,7 +63,7 @@ def slopes(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
 
 
 def coherence(first: Tensor, second: Tensor) -> Tensor:
-    """(K, m, n) float32, of `turns` (K, m, 3) and (K, n, 3)."""
-    # differences of products would lose what keeps covariances positive definite
+    """(K, m, n) float32, of `phase_vectors` (K, m, 3) and (K, n, 3)."""
+    # rounding of expanded squares would make covariances indefinite
     apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
     return apart.square_().mul_(-0.5).exp_()

@@ -1,4 +1,4 @@
-"""Fitted processes packed for queries: the sources of all searches side by side, rows of one place summed."""
+"""Batched queries of an ensemble: sources of all searches concatenated, rows of one place summed."""
 
 from __future__ import annotations
 
@@ -8,60 +8,60 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.multipath.clutter.blocking import Screens
+from gsparc.multipath.clutter.blocking import Obstacles
 from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, shares, stacked
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, matern32
+from gsparc.multipath.visibility_kernel import matern32
 from gsparc.physics.waves import ranges, wave_over_band
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 
 
 @dataclass(frozen=True)
-class Pack:
+class PackedSources:
     """Sources of one or more processes over the same n places.
 
     Attributes:
         sources: (K, 3) float64 [m].
-        law: (K, 3) float32: constant, 1 / angle^2, 1 / length^2 of each source's visibility.
+        kernel: (K, 3) float32: constant, 1 / angle^2, 1 / length^2 of each source's visibility.
         places: (n, 3) float64 [m].
         directions: (K, n, 3) float32, unit vectors from source to place.
-        unfolding, screens: paths of the K sources and what they must pass; None when nothing is in the way.
+        unfolding, obstacles: paths of the K sources and what occludes them; None without clutter.
     """
 
     sources: Tensor
-    law: Tensor
+    kernel: Tensor
     places: Tensor
     directions: Tensor
     unfolding: Unfolding | None
-    screens: Screens | None
+    obstacles: Obstacles | None
 
     @staticmethod
-    def of(scenes: list[Scene], places: Tensor) -> Pack:
+    def of(scenes: list[Scene], places: Tensor) -> PackedSources:
         """All sources of the scenes, in order."""
         sources = torch.cat([scene.sources for scene in scenes])
-        laws, directions = torch.cat([_numbers(s) for s in scenes]), _directions(sources, places)
+        kernels, directions = torch.cat([_kernel_parameters(s) for s in scenes]), _directions(sources, places)
         if not any(len(scene.clutter) for scene in scenes):
-            return Pack(sources, laws, places, directions, None, None)
+            return PackedSources(sources, kernels, places, directions, None, None)
         first = torch.tensor([0] + [len(scene.planes) for scene in scenes]).cumsum(0).tolist()
-        unfolding = Unfolding.beside(
-            [scene.unfolding.numbered_from(start) for scene, start in zip(scenes, first, strict=False)]
+        unfolding = Unfolding.concatenate(
+            [scene.unfolding.with_offset(start) for scene, start in zip(scenes, first, strict=False)]
         )
-        screens = Screens.beside([Screens.of(s.clutter, s.planes, len(s.words)) for s in scenes])
-        return Pack(sources, laws, places, directions, unfolding, screens)
+        obstacles = Obstacles.concatenate([Obstacles.of(s.clutter, s.planes, len(s.words)) for s in scenes])
+        return PackedSources(sources, kernels, places, directions, unfolding, obstacles)
 
-    def shade(self, queries: Tensor) -> Tensor:
-        """How much of each source is seen from queries (m, 3) [m]: (K, m), or (1, 1) for all."""
-        if self.unfolding is None or self.screens is None:
+    def visible_share(self, queries: Tensor) -> Tensor:
+        """Visible share of each source from queries (m, 3) [m]: (K, m), or (1, 1) for all."""
+        if self.unfolding is None or self.obstacles is None:
             return torch.ones(1, 1)
-        return self.screens.shade(self.unfolding.paths(queries))
+        return self.obstacles.visible_share(self.unfolding.paths(queries))
 
     def correlation(self, queries: Tensor) -> Tensor:
         """Visibility correlations (K, m, n) between queries (m, 3) float64 [m] and the places."""
         cosine = torch.bmm(_directions(self.sources, queries), self.directions.mT)
-        constant, by_angle, by_length = (self.law[:, i, None, None] for i in range(3))
+        constant, by_angle, by_length = (self.kernel[:, i, None, None] for i in range(3))
         apart = torch.cdist(queries, self.places).square().float()
         squared = (2 - 2 * cosine).clamp_min(0) * by_angle + apart * by_length
         return constant + (1 - constant) * matern32(squared)
@@ -72,19 +72,19 @@ class Query:
 
     Args:
         members: processes over the same rows.
-        variance_rows: of the process whose variance is given: fewer rows know less, so it errs high.
+        variance_rows: rows that the variance is computed from: fewer overestimate it.
     """
 
     def __init__(self, members: list[PhasedPosterior], variance_rows: int = 350) -> None:
         rows, scenes = members[0].rows, [member.scene for member in members]
         places, self.place_of = torch.unique(rows.position, dim=0, return_inverse=True)
-        self.pack = Pack.of(scenes, places)
+        self.pack = PackedSources.of(scenes, places)
         self.counts = [len(scene.words) for scene in scenes]
-        pulled = [member.pulled for member in members]
+        dual_weights = [member.dual_weights for member in members]
         phases = torch.cat([member.phased.phase for member in members])
-        self.turn = torch.polar(torch.ones(()), phases)[:, None, None]
+        self.phasor = torch.polar(torch.ones(()), phases)[:, None, None]
         weight = torch.zeros(sum(self.counts), len(places), rows.target.shape[1], dtype=torch.complex64)
-        weight.index_add_(1, self.place_of, torch.cat(pulled))
+        weight.index_add_(1, self.place_of, torch.cat(dual_weights))
         self.real, self.imag = weight.real.contiguous(), weight.imag.contiguous()
         few = torch.linspace(0, len(rows) - 1, min(variance_rows, len(rows))).long()
         self.first = members[0]
@@ -112,26 +112,26 @@ class Query:
         return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
 
     def gains(self, queries: Tensor) -> Tensor:
-        """Complex gains (K, m, R) of the sources of all processes, one after another, as queries see them."""
+        """Complex gains (K, m, R) of the sources of all processes at queries."""
         return torch.cat([self._gains(part)[0] for part in queries.split(CHUNK)], 1)
 
     def _gains(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Gains (K, m, R), visibility correlations (K, m, n), and how much is seen (K, m)."""
-        correlation, seen = self.pack.correlation(part), self.pack.shade(part)
-        gains = torch.complex(correlation @ self.real, correlation @ self.imag) * self.turn
+        """Gains (K, m, R), visibility correlations (K, m, n), and visible shares (K, m)."""
+        correlation, seen = self.pack.correlation(part), self.pack.visible_share(part)
+        gains = torch.complex(correlation @ self.real, correlation @ self.imag) * self.phasor
         return gains * seen[:, :, None], correlation, seen
 
     def _variance(
-        self, part: Tensor, tone: Tensor, correlation: Tensor, shade: Tensor
+        self, part: Tensor, tone: Tensor, correlation: Tensor, visible_share: Tensor
     ) -> tuple[Tensor, Tensor]:
         phased, count = self.first.phased, len(part)
         power = phased.scene.log_amplitude.mul(2).exp()
         rows = Rows(part, tone.expand(count), torch.empty(count, 0), torch.arange(count))
-        waves = phased.unshaded(rows) * shade
+        waves = phased.unobstructed(rows) * visible_share
         seen = correlation[:, :, self.place_of[self.few]]
-        # What a query and a row share: along the gain's own phase, and across it.
+        # Covariance of queries and rows, in phase with the gain and in quadrature.
         here, there = torch.stack(stacked(waves * power), -1), torch.stack(stacked(self.first.waves), -1)
-        here = here * shares(phased.turning)
+        here = here * shares(phased.quadrature)
         cross = torch.zeros(2 * count, 2 * len(self.few))
         for k in range(len(power)):
             cross += (here[:, k] @ there[:, k].T) * seen[k].repeat(2, 2)
@@ -140,11 +140,9 @@ class Query:
         return (prior - known[:count] - known[count:]).clamp_min(0), prior
 
 
-def _numbers(scene: Scene) -> Tensor:
-    law = scene.visibility
-    if not isinstance(law, KernelVisibility):
-        raise TypeError(f"queries know KernelVisibility, not {type(law).__name__}")
-    numbers = [float(law.constant), float(law.angle) ** -2, float(law.length) ** -2]
+def _kernel_parameters(scene: Scene) -> Tensor:
+    kernel = scene.visibility
+    numbers = [float(kernel.constant), float(kernel.angle) ** -2, float(kernel.length) ** -2]
     return torch.tensor(numbers).expand(len(scene.words), 3)
 
 

@@ -1,4 +1,4 @@
-"""What a virtual-source process can spare: searches, sources, its variance."""
+"""Reductions of the image-source model: fewer searches, fewer sources, no variance."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
 
 if TYPE_CHECKING:
-    from gsparc.multipath.image_source_gp import VirtualSourceGP
+    from gsparc.multipath.image_source_gp import ImageSourceGP
 
 
 @torch.no_grad()
-def reduced(method: VirtualSourceGP, settings: Settings, measured: dict[str, Tensor]) -> Method:
-    """The process with fewer `searches` (the heaviest), fewer sources (`keep`, a share), no variance.
+def reduced(method: ImageSourceGP, settings: Settings, measured: dict[str, Tensor]) -> Method:
+    """The process with fewer `searches` (of largest weight), fewer sources (`keep`, a share), no variance.
 
-    Fewer sources explain the measured rows anew, which costs a factorisation here and nothing later.
+    The gains of the remaining sources are fitted anew: one factorisation here, nothing at queries.
     """
     twin = copy.copy(method)
     count = min(int(settings.get("searches", len(method.members))), len(method.members))
@@ -45,14 +45,14 @@ def reduced(method: VirtualSourceGP, settings: Settings, measured: dict[str, Ten
 def _fewer(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
     count = max(1, math.ceil(share * len(contribution)))
     loudest = set(contribution.topk(count).indices.tolist())
-    kept = sorted(loudest | {0})  # the transmitter itself names the words of all others
+    kept = sorted(loudest | {0})  # the words of all others start at the transmitter
     phased = member.phased
-    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.turning)
+    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.quadrature)
     return PhasedPosterior(member.rows, scene, member.noise_floor)
 
 
 class MeanQuery(Query):
-    """Means alone: the variance is most of a query's work."""
+    """Means alone: the variance is most of a query's time."""
 
     def _variance(self, part: Tensor, *unused: Tensor) -> tuple[Tensor, Tensor]:
         return torch.zeros(len(part)), torch.ones(len(part))

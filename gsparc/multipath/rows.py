@@ -39,10 +39,6 @@ class Rows:
         """The same rows with (3,) [m] added to every place."""
         return Rows(self.position + shift, self.frequency, self.target, self.receiver)
 
-    def scaled(self, factor: float) -> Rows:
-        """The same rows with targets times `factor`."""
-        return Rows(self.position, self.frequency, self.target * factor, self.receiver)
-
 
 def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
     """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""
@@ -62,8 +58,8 @@ def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> np.ndarra
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
     """At most `limit` rows from the given measurements.
 
-    Every measurement gives as many tones as fit, as a comb over the band that starts elsewhere for each,
-    so that together they see all of it. When even one each is too much, some measurements stay out.
+    Every measurement gives the same number of tones, a comb over the band with a random start, so that
+    together they cover it. When one tone each exceeds the limit, measurements are subsampled.
 
     Args:
         data: kind csi; a transmitter that moves before one antenna is, by reciprocity, a moving receiver.

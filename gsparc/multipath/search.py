@@ -1,4 +1,4 @@
-"""Finding the sources: greedy back-projection over free space and over words of planes found so far."""
+"""Search for image sources: greedy, over reflections in known planes first, over free space second."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 from gsparc.multipath.backprojection import Effort, pick_apart, score, search_box
 from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
 from gsparc.multipath.refine import learn_visibility, refine
-from gsparc.multipath.reflection_orders import prune, respell, upright, vote, without_planes
+from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogonal_walls, prune, reassign
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
@@ -24,12 +24,12 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """When a source is worth having, and how long to look.
+    """Acceptance thresholds and effort of a search.
 
     Attributes:
-        margin: the box of receivers and transmitter is enlarged by this on every side [m].
-        order: most reflections of a word.
-        max_sources: the search ends there.
+        margin: of the search box around receivers and transmitter [m].
+        order: largest reflection order of a source.
+        max_sources: that end the search.
         word_score: least score of a word over known planes.
         free_score: least score of a source with a plane of its own.
         words_per_round, free_per_round: most new sources in a round.
@@ -40,8 +40,8 @@ class SearchSettings:
         progress: [nats].
         learn_visibility_from: sources from which on the visibility's lengths are learned.
         noise: variance at the start, of unit signal power.
-        visibility: the law at the start and the centre of its prior.
-        effort: of each look at free space.
+        visibility: initial kernel and centre of its prior.
+        effort: of each search in free space.
     """
 
     margin: float = 8.0
@@ -63,7 +63,7 @@ class SearchSettings:
 
 
 class Search:
-    """One search over one set of rows (unit mean power, places about the middle of the scene).
+    """One search over one set of normalised rows (`Frame`).
 
     Args:
         rows: a few hundred.
@@ -93,21 +93,21 @@ class Search:
         )
 
     def run(self) -> Scene:
-        """Search until nothing more pays, then settle."""
+        """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
         self._refine(s.steps)
         for number in range(60):
-            grown = self._grow_words()
-            free = not grown
+            added = self._add_words()
+            free = not added
             if free:
-                grown = self._grow_free()
-            if not grown or time.monotonic() > self.deadline:
+                added = self._add_free()
+            if not added or time.monotonic() > self.deadline:
                 break
             self._refine(s.steps)
             if free or number % 2:
-                self.scene = without_planes(self.rows, self.scene, 2 * self.wavelength)
+                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength)
             if number >= 4 and number % 3 == 1:
-                self._revote()
+                self._find_walls()
             if number % 2:
                 self.scene = prune(self.rows, self.scene, s.prune)
             if number % 3 == 2:
@@ -122,15 +122,15 @@ class Search:
             stale, best = (0, nll) if nll < best - s.progress else (stale + 1, best)
             if stale >= s.patience:
                 break
-        return self._settle()
+        return self._finish()
 
-    def _settle(self) -> Scene:
+    def _finish(self) -> Scene:
         s = self.settings
         self._refine(20)
-        self._revote()
-        self._respell(upright(self.scene))
-        self.scene = without_planes(self.rows, self.scene, 3 * self.wavelength)
-        self._grow_words()
+        self._find_walls()
+        self._reassign(orthogonal_walls(self.scene))
+        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength)
+        self._add_words()
         self._refine(s.steps)
         self.scene = prune(self.rows, self.scene, s.prune)
         self._learn_visibility(10)
@@ -145,8 +145,8 @@ class Search:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
             self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
 
-    def _grow_words(self, most: int | None = None) -> int:
-        """Add the best words over the planes there are; returns how many."""
+    def _add_words(self, most: int | None = None) -> int:
+        """Add the best reflections in known planes; returns how many."""
         s, scene = self.settings, self.scene
         letters = list(range(len(scene.planes)))
         longer: list[Word] = [
@@ -166,7 +166,7 @@ class Search:
             self.scene = scene.with_words([words[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
-    def _grow_free(self) -> int:
+    def _add_free(self) -> int:
         """Add the best sources anywhere in the box, each with a plane of its own; returns how many."""
         s, posterior = self.settings, Posterior(self.rows, self.scene)
         found = search_box(
@@ -185,7 +185,7 @@ class Search:
         return added
 
     def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Word, Tensor]:
-        """The known source whose bisector with a new one, as a mirror, would explain most of what is left."""
+        """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
         scene = posterior.scene
         able = [i for i, word in enumerate(scene.words) if len(word) < self.settings.order]
         planes = bisector(scene.sources[able], position)
@@ -199,21 +199,21 @@ class Search:
         best = int(gain.argmax())
         return scene.words[able[best]], planes[best]
 
-    def _revote(self) -> None:
-        """Find the walls among all pairs of sources and spell every source over them, if that is shorter."""
+    def _find_walls(self) -> None:
+        """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
         if len(self.scene.words) < 6:
             return
-        self._respell(vote(self.scene.sources))
+        self._reassign(find_walls(self.scene.sources))
 
-    def _respell(self, walls: Tensor | None) -> None:
-        """Spell every source over these walls, if that is shorter."""
+    def _reassign(self, walls: Tensor | None) -> None:
+        """Reassign every source to these walls, if the likelihood allows."""
         if walls is None:
             return
         before = self.scene
-        self.scene = respell(before, walls)
+        self.scene = reassign(before, walls)
         self._refine(20)
         for _ in range(2):
-            if self._grow_words(6):
+            if self._add_words(6):
                 self._refine(self.settings.steps)
         saved = len(before.planes) - len(self.scene.planes)
         allowed = Posterior(self.rows, before).nll + 4 * saved

@@ -1,4 +1,4 @@
-"""Finished searches of a run, on disk as soon as they are done: an interrupted run goes on after them."""
+"""Cache of finished searches on disk, from which an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ log = logging.getLogger(__name__)
 FILE = "last.ckpt"
 
 
-class Shelf:
-    """Searches by name.
+class SearchCache:
+    """Finished searches by name.
 
     Args:
-        folder: of the run; None or an empty path keeps nothing.
-        resume: the file an interrupted run has left; None starts anew.
-        key: what the searches depend on; those of another key are refused.
-        pack, unpack: a scene as plain containers, and back.
+        folder: of the run; None or an empty path for no cache.
+        resume: file of an interrupted run, or None.
+        key: hash of what searches depend on; a file of another key is refused.
+        pack, unpack: convert a scene to plain containers, and back.
 
     Attributes:
-        spent_s: seconds that the interrupted run had spent when its last search was done [s].
+        spent_s: training time of the interrupted run up to its last finished search [s].
 
     Raises:
         ValueError: `resume` holds no searches, or those of other data or settings.
@@ -60,17 +60,17 @@ class Shelf:
         try:
             stored = torch.load(file, weights_only=True)
             key, kept, spent = str(stored["key"]), dict(stored[SEARCHES]), float(stored["spent_s"])
-        except Exception as error:  # whatever another or a damaged file raises
+        except Exception as error:  # any error of a damaged or foreign file
             raise ValueError(
                 f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"
             ) from error
         if key != self._key:
             raise ValueError(f"ckpt_path={file}: is of other data, rows or settings; start without it")
         self._kept, self.spent_s = kept, spent
-        log.info("%d finished searches are found again, %.0f s of the bill", len(kept), spent)
+        log.info("reusing %d cached searches (%.0f s of training time)", len(kept), spent)
 
     def find(self, name: str) -> Member | None:
-        """The search of this name, when it is done."""
+        """The finished search of this name, or None."""
         from gsparc.multipath.ensemble import Member
 
         with self._lock:
@@ -78,7 +78,7 @@ class Shelf:
         return None if kept is None else Member(self._unpack(kept["scene"]), float(kept["left_out"]))
 
     def put(self, name: str, member: Member) -> None:
-        """Keep a finished search; the file is written atomically."""
+        """Store a finished search; the file is written atomically."""
         with self._lock:
             self._kept[name] = {"scene": self._pack(member.phased), "left_out": member.left_out}
             if self._path is None:

@@ -1,29 +1,19 @@
-"""Who sees which source: laws of how a source's gain varies from place to place.
+"""Visibility kernel: covariance of a source's gain over places.
 
-A law is anything with `correlation`; the process and the search know nothing else of it. Sources never hide
-each other: each has its own visibility, and all share the law's few numbers.
+Sources do not occlude each other: each has its own gain process, and all share the kernel's parameters.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
 
-class Visibility(Protocol):
-    """How strongly the gains of one source at two places are correlated."""
-
-    def correlation(self, first: View, second: View) -> Tensor:
-        """(n, m) float32 in [0, 1], one where both places are the same."""
-        ...
-
-
 @dataclass(frozen=True)
 class View:
-    """How n places look at one source.
+    """Places and their directions from one source.
 
     Attributes:
         place: (n, 3) float64 [m], relative to the middle of the scene.
@@ -41,12 +31,12 @@ class View:
         return View(places, (offset / length).float())
 
 
-ROUNDED = 1e-3  # of a squared length that rounding may take from a covariance
+ROUNDED = 1e-3  # of a squared length, largest rounding error of a squared distance
 
 
 @dataclass(frozen=True)
 class KernelVisibility:
-    """`c + (1 - c) Matern-3/2(direction, place)`: seen from everywhere, plus what comes and goes smoothly.
+    """`c + (1 - c) Matern-3/2(direction, place)`: a constant gain plus one that varies smoothly.
 
     Attributes:
         constant: share of the gain's variance that is the same everywhere.
@@ -59,22 +49,13 @@ class KernelVisibility:
     length: float | Tensor = 2.0
 
     def correlation(self, first: View, second: View) -> Tensor:
-        """See `Visibility`."""
+        """(n, m) float32 in [0, 1], one where both places are the same."""
         squared = _squared(first.direction, second.direction) / self.angle**2
         places = (first.place, second.place)
         if not _is_wide(*places, float(torch.as_tensor(self.length).detach())):
             places = (first.place.float(), second.place.float())
         squared = squared + _squared(*places).float() / self.length**2
         return self.constant + (1 - self.constant) * matern32(squared)
-
-
-@dataclass(frozen=True)
-class SeenByAll:
-    """Every source is seen from everywhere with one gain: the empty room."""
-
-    def correlation(self, first: View, second: View) -> Tensor:
-        """See `Visibility`."""
-        return first.direction.new_ones(len(first.place), len(second.place))
 
 
 def matern32(squared: Tensor) -> Tensor:
@@ -84,9 +65,9 @@ def matern32(squared: Tensor) -> Tensor:
 
 
 def _is_wide(first: Tensor, second: Tensor, length: float) -> bool:
-    """Whether squares in float32 would be no covariance: of 5 km they are a square metre off.
+    """Whether squared distances need float64: of 5 km those in float32 are off by a square metre.
 
-    Elsewhere float64 would only cost: it doubles the time of a search.
+    Elsewhere float64 would only double the time of a search.
     """
     reach = max(float(places.abs().max()) if places.numel() else 0.0 for places in (first, second))
     return torch.finfo(torch.float32).eps * reach**2 > ROUNDED * length**2

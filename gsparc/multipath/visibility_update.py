@@ -1,9 +1,8 @@
-"""Who sees which source when rays are missing or mean nothing: rays, neighbours and channels vote together.
+"""Update visibility by channels, where rays may be missing or spurious.
 
-A ray that was not measured says little against a source that all neighbours see and that the channel lacks,
-and a ray says little for one that the channel knows nothing of. Each receiver's channel, predicted from all
-others, is held against itself with one source more or less; the odds before that are those of the neighbours'
-sightings and of how often rays are missed or mistaken, which the votes tell in turn.
+Each receiver's leave-one-out residual is compared with one source more or less. The prior odds that it sees a
+source come from its own ray, the rates of missed and spurious rays, and the leave-one-out visibility of its
+neighbours; the rates are estimated anew from the result.
 """
 
 from __future__ import annotations
@@ -14,57 +13,57 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-MISTAKEN = 0.003  # share of the pairs without a path that have a ray, at first
-LEAST = 1e-3  # of either rate
-MOST = 0.2  # share of the paths without a ray, at most, at first
-LIKELY = 0.02  # the neighbours are never surer than by this
+SPURIOUS = 0.003  # initial share of the pairs without a path that have a ray
+MIN_RATE = 1e-3  # lower bound of either rate
+MAX_MISSED = 0.2  # upper bound of the initial share of paths without a ray
+MIN_PROBABILITY = 0.02  # bound of the neighbours' probabilities
 
 
 @dataclass(frozen=True)
-class Rates:
-    """How far rays are to be trusted.
+class RayErrorRates:
+    """Error rates of measured rays.
 
     Attributes:
         missed: share of the paths that have no ray.
-        mistaken: share of the pairs without a path that have one.
+        spurious: share of the pairs without a path that have one.
     """
 
     missed: float
-    mistaken: float
+    spurious: float
 
     @staticmethod
-    def first(rays: Tensor) -> Rates:
-        """From who has rays (n, K), as if everybody saw the source of most."""
-        return Rates(min(max(1 - float(rays.mean(0).max()), LEAST), MOST), MISTAKEN)
+    def first(rays: Tensor) -> RayErrorRates:
+        """Initial rates from rays (n, K), as if all receivers saw the source with most rays."""
+        return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
 
     @staticmethod
-    def of(rays: Tensor, seen: Tensor) -> Rates:
-        """From who has rays and who sees what, both (n, K) of zeros and ones."""
+    def of(rays: Tensor, seen: Tensor) -> RayErrorRates:
+        """From rays and visibility, both (n, K) of zeros and ones."""
         missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
-        mistaken = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
-        return Rates(max(missed, LEAST), max(mistaken, LEAST))
+        spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
+        return RayErrorRates(max(missed, MIN_RATE), max(spurious, MIN_RATE))
 
-    def odds(self, rays: Tensor, likely: Tensor) -> Tensor:
-        """Log odds (n, K) that a source is seen, by rays and by how likely it is to the neighbours."""
-        likely = (likely / (1 - self.missed)).clamp(LIKELY, 1 - LIKELY)
-        told = math.log((1 - self.missed) / self.mistaken)
-        untold = math.log(self.missed / (1 - self.mistaken))
-        return torch.where(rays > 0, told, untold) + likely.log() - (1 - likely).log()
+    def odds(self, rays: Tensor, probability: Tensor) -> Tensor:
+        """Log odds (n, K) that a source is seen, by rays and the neighbours' probability (n, K)."""
+        probability = (probability / (1 - self.missed)).clamp(MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+        detected = math.log((1 - self.missed) / self.spurious)
+        undetected = math.log(self.missed / (1 - self.spurious))
+        return torch.where(rays > 0, detected, undetected) + probability.log() - (1 - probability).log()
 
 
-def flips(seen: Tensor, odds: Tensor, left: Tensor, variance: Tensor, one: Tensor) -> Tensor:
-    """(n, K) bool, at most one source of each receiver that is to change.
+def flips(seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor) -> Tensor:
+    """(n, K) bool, at most one visibility entry to change per receiver.
 
     Args:
         seen: (n, K) of zeros and ones.
-        odds: (n, K), log odds that it is seen, without the channel.
-        left: (n, R), channel less its prediction from all others.
+        odds: (n, K), prior log odds that it is seen.
+        residual: (n, R), leave-one-out residual of the channels.
         variance: (n,), expected |left|^2.
-        one: (n, K, R), what each source adds where it is seen.
+        contribution: (n, K, R), what each source adds where it is seen.
     """
-    sign = (1 - 2 * seen).to(one.real.dtype)
-    after = (left[:, None] - sign[:, :, None] * one).abs().square().sum(2)
-    before = left.abs().square().sum(1)[:, None]
+    sign = (1 - 2 * seen).to(contribution.real.dtype)
+    after = (residual[:, None] - sign[:, :, None] * contribution).abs().square().sum(2)
+    before = residual.abs().square().sum(1)[:, None]
     gain = (before - after) / variance[:, None] + sign * odds
     best = gain.argmax(1, keepdim=True)
     return torch.zeros_like(seen, dtype=torch.bool).scatter(1, best, gain.gather(1, best) > 0)

@@ -7,10 +7,11 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.physics.rays import closest_approach
+
 MISS = 0.01  # [m], two rays that pass this close to each other meet
 MERGE = 0.05  # [m], meeting points this close are one virtual transmitter
 NEIGHBOURS = 8  # receivers whose rays are intersected with those of one receiver
-LEAST_ANGLE = 0.02  # [rad], more parallel rays meet nowhere in particular
 
 
 def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -30,7 +31,7 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
         for j in row:
             if j == i:
                 continue
-            along, miss = _closest(places[i], rays[i], places[j], rays[j])
+            along, _, miss = closest_approach(places[i], rays[i], places[j], rays[j])
             a, b = np.nonzero(miss < MISS)
             for p, q in zip(a, b, strict=True):
                 meetings[i][p].append(float(along[p, q]))
@@ -48,23 +49,6 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
     rows = np.full(len(flat), -1)
     rows[met] = labels
     return centres, [rows[owner == i] for i in range(len(points))]
-
-
-def _closest(
-    a: np.ndarray, along_a: np.ndarray, b: np.ndarray, along_b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where each ray of `a` passes each ray of `b`: distance along it, and by how much it misses, (P, Q) [m].
-
-    Rays that meet behind their receivers, or are nearly parallel, miss by infinity.
-    """
-    offset = b - a
-    cosine = along_a @ along_b.T
-    first, second = (along_a @ offset)[:, None], (along_b @ offset)[None, :]
-    sine2 = np.maximum(1 - cosine**2, LEAST_ANGLE**2)
-    s, t = (first - cosine * second) / sine2, (cosine * first - second) / sine2
-    gap = offset + t[..., None] * along_b[None] - s[..., None] * along_a[:, None]
-    miss = np.linalg.norm(gap, axis=-1)
-    return s, np.where((s > 0) & (t > 0) & (1 - cosine**2 > LEAST_ANGLE**2), miss, np.inf)
 
 
 def _merged(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

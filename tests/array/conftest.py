@@ -1,4 +1,4 @@
-"""A campaign at an array whose vectors are known."""
+"""Spectra of an array whose vectors are known."""
 
 from __future__ import annotations
 

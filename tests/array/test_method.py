@@ -1,4 +1,4 @@
-"""The array methods end to end: renderer, packets, process, tuning, storing, queries."""
+"""The static-array model end to end: renderer, packets, Gaussian process, kernel choice, state, queries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from known_arrays import array_site, measure, spectra, walk
 
 from gsparc.array.cross_validation import tune
 from gsparc.array.method import ArrayField
-from gsparc.array.vector_gp import Kernel, learn_process, mirror_elements, settle, twin
+from gsparc.array.vector_gp import Kernel, fit_vector_gp, mirror_elements, refine_alignment, twin
 from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.load import load, split_for
 from gsparc.data.rfid import planar_array
@@ -54,12 +54,12 @@ def test_renderer_equals_the_plain_beamformer(grid, height):
     extended = torch.cat([h, share.to(h.dtype)], 1).to(torch.complex64)
     assert renderer.half_turn == (grid.width == 10 and height == 0)
     torch.testing.assert_close(renderer(extended).double(), expected, atol=2e-4, rtol=1e-4)
-    drawn = torch.empty(3, grid.height, grid.width)
-    renderer.draw(extended, drawn)
-    torch.testing.assert_close(drawn, renderer(extended).clamp(max=1))
+    predicted = torch.empty(3, grid.height, grid.width)
+    renderer.draw(extended, predicted)
+    torch.testing.assert_close(predicted, renderer(extended).clamp(max=1))
 
 
-def test_renderer_slopes():
+def test_renderer_gradient():
     site = array_site(SphereGrid.hemisphere(4, 6), planar_array(2, 2))
     renderer = SpectrumRenderer(*site.array_geometry(), torch.rand(4, 6)).double()
     h = torch.randn(2, 5, dtype=torch.complex128)
@@ -67,7 +67,7 @@ def test_renderer_slopes():
     assert torch.autograd.gradcheck(lambda v: renderer(torch.view_as_complex(v)), [real])
 
 
-def test_packets_know_nothing_far_away():
+def test_packets_vanish_far_away():
     packets = WavePackets(torch.rand(20, 3), torch.full((20,), 0.1), torch.randn(20, 3), torch.zeros(3), 4)
     with torch.no_grad():
         packets.gains.normal_()
@@ -99,7 +99,7 @@ def test_antennas_at_one_place_are_no_array(tmp_path):
         ArrayField(cache=False).fit(data, _fold(12), FitContext(tmp_path))
 
 
-def test_packets_slopes():
+def test_packets_gradient():
     c, w = torch.rand(6, 3).double(), torch.randn(6, 3).double()
     packets = WavePackets(c, torch.full((6,), 0.3).double(), w, torch.zeros(3), 2).double()
     with torch.no_grad():
@@ -110,7 +110,7 @@ def test_packets_slopes():
     assert torch.autograd.gradcheck(lambda v: torch.view_as_real(packets(v)), [x])
 
 
-def test_settling_undoes_phases_and_twins(known_campaign):
+def test_alignment_undoes_phases_and_twins(known_campaign):
     """Scrambled vectors of a smooth field predict each other again."""
     data, truth = known_campaign
     partner, rng = mirror_elements(data.site.array), np.random.default_rng(1)
@@ -119,15 +119,15 @@ def test_settling_undoes_phases_and_twins(known_campaign):
     mixed[::3] = twin(mixed[::3], partner)
     kernel = Kernel(0.2, 1e-3)
     inverse = np.linalg.inv(kernel.gram(data.tx))
-    process = learn_process(mixed, data.tx, partner, kernel)
+    process = fit_vector_gp(mixed, data.tx, partner, kernel)
     left_out = process.vectors - (inverse @ process.vectors) / np.diag(inverse)[:, None]
-    agree = np.abs((left_out.conj() * process.vectors).sum(1)) / np.linalg.norm(left_out, axis=1)
-    assert np.median(agree) > 0.99
-    assert np.allclose(settle(process.vectors, inverse, partner, 1), process.vectors, atol=0.02)
+    overlap = np.abs((left_out.conj() * process.vectors).sum(1)) / np.linalg.norm(left_out, axis=1)
+    assert np.median(overlap) > 0.99
+    assert np.allclose(refine_alignment(process.vectors, inverse, partner, 1), process.vectors, atol=0.02)
 
 
-def test_leave_out_with_gaps_equals_refitting(known_campaign):
-    """The small systems of the tuning give what a process without those samples gives."""
+def test_cross_validation_with_gaps_equals_refitting(known_campaign):
+    """The block formula gives what a process fitted without those samples gives."""
     from gsparc.array import cross_validation
 
     data, truth = known_campaign
@@ -135,32 +135,32 @@ def test_leave_out_with_gaps_equals_refitting(known_campaign):
     kernel = Kernel(0.15, 0.01)
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
-    looks = cross_validation._Looks(
+    samples = cross_validation._Samples(
         x, np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
     )
-    left, drawn = looks.predictions(kernel, np.linalg.inv(kernel.gram(x)), v)
-    error = looks.error(drawn)
+    unknown, predicted = samples.predictions(kernel, np.linalg.inv(kernel.gram(x)), v)
+    error = samples.error(predicted)
     far = distance[7] > 0.03
     weights = np.linalg.solve(kernel.gram(x[far]), kernel.cross(x[far], x[7:8]))[:, 0]
-    assert left[0, 0] == pytest.approx(1 - weights @ kernel.cross(x[far], x[7:8])[:, 0], rel=1e-6)
+    assert unknown[0, 0] == pytest.approx(1 - weights @ kernel.cross(x[far], x[7:8])[:, 0], rel=1e-6)
     assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
 
 
 @pytest.mark.parametrize("length", [0.15, 1.5])
-def test_packets_answer_like_their_teacher(known_campaign, length):
-    """Also a teacher that remembers over metres: its packets stay as small as the waves."""
+def test_packets_match_their_teacher(known_campaign, length):
+    """Also a teacher of long correlation: its packets stay within a wavelength."""
     data, truth = known_campaign
     scale = truth / np.abs(truth).max()
-    teacher = learn_process(scale, data.tx, None, Kernel(length, 1e-3))
+    teacher = fit_vector_gp(scale, data.tx, None, Kernel(length, 1e-3))
     packets = distil(teacher, PacketSettings(count=600, samples=2500), 0.3259, seed=0)
     for quick, whole in zip(teacher.at_samples(), teacher.posterior(data.tx), strict=True):
         np.testing.assert_allclose(quick, whole, atol=1e-8)
     asked = data.tx[::7] + 0.01
-    mean, left = teacher.posterior(asked)
+    mean, unknown = teacher.posterior(asked)
     with torch.no_grad():
         out = packets(torch.from_numpy(asked).float()).numpy()
     assert np.linalg.norm(out[:, :-1] - mean) < 0.03 * np.linalg.norm(mean)
-    assert np.abs(out[:, -1].real - np.sqrt(left)).max() < 0.1
+    assert np.abs(out[:, -1].real - np.sqrt(unknown)).max() < 0.1
 
 
 def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
@@ -171,7 +171,7 @@ def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
     chosen = tune(scaled, data.tx, images, matrix, data.site.wavelength, mirror_elements(data.site.array))
     a, b = chosen.error_model()
     assert 0.05 < chosen.kernel.length < 1.0 and a > 0 and b > 0
-    assert np.corrcoef(chosen.left, np.log(chosen.error))[0, 1] > 0.5
+    assert np.corrcoef(chosen.unknown, np.log(chosen.error))[0, 1] > 0.5
 
 
 def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):

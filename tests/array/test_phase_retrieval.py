@@ -1,4 +1,4 @@
-"""Array vectors recovered from published spectra: residuals, ambiguities, other normalisations, the store."""
+"""Array vectors recovered from published spectra: residuals, ambiguities, other normalisations, the cache."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_a_subtracted_minimum_is_found():
     assert np.median(np.abs(found.offset - low / (high - low))) < 2e-3
 
 
-def test_what_no_array_measures_is_suspect(known_campaign):
+def test_an_image_that_the_array_cannot_measure_is_suspect(known_campaign):
     data, _ = known_campaign
     images = data.target[:8].copy()
     images[5] = np.random.default_rng(0).integers(0, 256, images[5].shape)
@@ -60,7 +60,7 @@ def test_what_no_array_measures_is_suspect(known_campaign):
     assert np.flatnonzero(found.suspect).tolist() == [5]
 
 
-def test_silent_spectrum_is_no_crash(known_campaign):
+def test_a_zero_spectrum_gives_a_zero_vector(known_campaign):
     data, _ = known_campaign
     images = np.concatenate([data.target[:4], np.zeros_like(data.target[:1])])
     found = recover(data.site, images, data.tx[:5])
@@ -86,7 +86,7 @@ def test_mirror_elements():
     assert mirror_elements(np.array([[0.0, 0, 0], [0.16, 0, 0], [0.48, 0, 0]])) is None
 
 
-def test_only_asked_rows_are_recovered_and_kept(known_campaign, tmp_path, monkeypatch):
+def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, monkeypatch):
     data, _ = known_campaign
     asked = []
     inner = vector_cache.recover
@@ -100,7 +100,7 @@ def test_only_asked_rows_are_recovered_and_kept(known_campaign, tmp_path, monkey
     assert asked == [10, 5, 3]
 
 
-def test_an_interrupted_recovery_goes_on(known_campaign, tmp_path, monkeypatch):
+def test_an_interrupted_recovery_resumes(known_campaign, tmp_path, monkeypatch):
     data, _ = known_campaign
     asked, whole = [], vector_cache.recover
 
@@ -118,16 +118,16 @@ def test_an_interrupted_recovery_goes_on(known_campaign, tmp_path, monkeypatch):
     assert asked == [5, 5, 5, 5, 5] and len(found.vectors) == 20
 
 
-def test_damaged_store_is_made_anew(known_campaign, tmp_path, caplog):
+def test_a_damaged_cache_is_computed_anew(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
     vector_cache.recovered(data, np.arange(4), tmp_path)
     file = next(tmp_path.rglob("*.npz"))
     file.write_bytes(file.read_bytes()[:100])
     found, _ = vector_cache.recovered(data, np.arange(4), tmp_path)
-    assert np.isfinite(found.vectors).all() and "made anew" in caplog.text
+    assert np.isfinite(found.vectors).all() and "computed anew" in caplog.text
 
 
-def test_report_names_bad_images(known_campaign, tmp_path, caplog):
+def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     data, _ = known_campaign
     images = data.target.copy()
     images[2] = np.random.default_rng(0).integers(0, 256, images[2].shape)

@@ -1,4 +1,4 @@
-"""Splat, then A, on spectra whose array vectors are known: the closed-form start and what training adds."""
+"""Splatted field with an array response on known array vectors: closed-form start, then training."""
 
 from __future__ import annotations
 

@@ -27,19 +27,19 @@ from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitContext
 from gsparc.methods.method import LeftOut as LeaveOneOutResidual
 from gsparc.methods.registry import build
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 
 NONE = Fold(*[np.zeros(0, np.int64)] * 3)
 QUICK = {"searches": 1, "search_rows": 220, "margin": 4.0, "clutter": False, "edges": False}
 
 
-def _physics(data, fold) -> VirtualSourceGP:
-    method = VirtualSourceGP(**QUICK)
+def _physics(data, fold) -> ImageSourceGP:
+    method = ImageSourceGP(**QUICK)
     method.fit(data, fold, FitContext(Path()))
     return method
 
 
-class Known(VirtualSourceGP):
+class Known(ImageSourceGP):
     """Sources that explain the direct path and nothing else."""
 
     def __init__(self, left) -> None:

@@ -11,7 +11,7 @@ from known_arrays import array_site, measure, room_vectors
 from rooms import directed
 
 from gsparc.array.method import ArrayField
-from gsparc.array.moving.method import BearingField
+from gsparc.array.moving.method import MovingArrayField
 from gsparc.auto.decide import (
     contest_array,
     decide_array,
@@ -128,7 +128,7 @@ def test_a_moving_array_is_answered_by_bearings() -> None:
     assert decide_array("auto", data.site, None).on
     with pytest.raises(ValueError, match="splat then A"):
         decide_array("splat", data.site, None)
-    rows, moving = np.arange(len(data)), BearingField()
+    rows, moving = np.arange(len(data)), MovingArrayField()
     fold = Fold(rows[:-8], rows[:0], rows[-8:])
     assert probe_array(moving, data, fold, seed=0).on
     turned = replace(data, rx_rotation=data.rx_rotation.copy())

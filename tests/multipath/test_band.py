@@ -1,4 +1,4 @@
-"""A quarter of the band is measured; delays come from positions, so the rest of it is known too."""
+"""A quarter of the band is measured; delays from positions extrapolate to the rest."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from rooms import nmse, shoebox
 
 from gsparc.methods.method import FitContext
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 
 QUARTERS = 4
 log = logging.getLogger(__name__)  # `pytest -o log_cli=true -o log_cli_level=INFO` shows the figures
@@ -24,12 +24,12 @@ def test_the_whole_band_from_its_lowest_quarter(tones, width_hz, tmp_path):
     _, data, fold = shoebox(450, pillar=True, frequency_hz=frequency)
     mask = np.zeros(data.target.shape, bool)
     mask[..., : tones // QUARTERS] = True
-    method = VirtualSourceGP(searches=1, clutter=False)
+    method = ImageSourceGP(searches=1, clutter=False)
     report = method.fit(replace(data, mask=mask), fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
-    said, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
+    predicted, true = method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()
     parts = np.array_split(np.arange(tones), QUARTERS)
-    errors = [nmse(said[..., part], true[..., part]) for part in parts]
+    errors = [nmse(predicted[..., part], true[..., part]) for part in parts]
     log.info("%d tones: NMSE %s by quarter of the band, %.0f s", tones, np.round(errors, 4), report.seconds)
     assert max(errors) < 0.06
     assert max(errors) < 1.5 * errors[0]  # as good where nothing was measured

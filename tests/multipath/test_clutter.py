@@ -8,12 +8,12 @@ import torch
 from rooms import PILLAR, WAVELENGTH, shoebox
 
 from gsparc.multipath.clutter import finite_mirrors
-from gsparc.multipath.clutter.blocking import Clutter, Screens, shade, tangents
+from gsparc.multipath.clutter.blocking import Clutter, Obstacles, tangents, visible_share
 from gsparc.multipath.clutter.boxes import find_box
 from gsparc.multipath.clutter.finite_mirrors import find_mirrors, find_patch, walls
-from gsparc.multipath.clutter.refine import Accord
+from gsparc.multipath.clutter.refine import ReflectionPhasePrior
 from gsparc.multipath.clutter.residual import Residual
-from gsparc.multipath.clutter.search import Furnishing, furnish
+from gsparc.multipath.clutter.search import ClutterSearch, find_clutter
 from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
@@ -72,14 +72,14 @@ def test_a_box_hides_what_the_exact_simulator_says():
     told, _, _ = shoebox(150, pillar=True, snr_db=60.0)
     scene = _scene(_boxed(_box()), order=2)
     places = torch.from_numpy(told.rx.copy())
-    seen = shade(scene.unfolding.paths(places), scene.clutter, scene.planes, soft=1e-4).T.numpy()
+    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes, soft=1e-4).T.numpy()
     true = told.images.of(told.tx[0])
-    agreed = 0.0
+    at_noise_floor = 0.0
     for k, source in enumerate(scene.sources.numpy()):
         image = np.linalg.norm(true - source, axis=1).argmin()
         assert np.linalg.norm(true[image] - source) < 1e-6
-        agreed += ((seen[:, k] > 0.5) == told.visible[:, image]).mean() / len(scene.words)
-    assert agreed > 0.98  # the rest are chords shorter than the margin
+        at_noise_floor += ((seen[:, k] > 0.5) == told.visible[:, image]).mean() / len(scene.words)
+    assert at_noise_floor > 0.98  # the rest are chords shorter than the margin
 
 
 def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
@@ -106,23 +106,25 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     above_middle = [2.5, 1.9, 1.0]
     above_beside = [3.9, 2.9, 0.8]  # the reflection would lie beyond the edge
     under = [2.4, 1.8, 0.2]
-    seen = scene.shade(torch.tensor([above_middle, above_beside, under], dtype=torch.float64))
+    seen = scene.visible_share(torch.tensor([above_middle, above_beside, under], dtype=torch.float64))
     assert (seen[:, 1] > 0.5).tolist() == [True, False, False]
     assert (seen[:, 0] > 0.5).tolist() == [True, True, False]
 
 
-def test_many_scenes_side_by_side_are_each_alone():
+def test_concatenated_scenes_do_not_interact():
     planes, clutter = _table()
     places = _rows(15).position
     one = Scene(TRANSMITTER, planes, ((), (6,), (6, 0)), torch.zeros(3), 0.0, clutter=clutter)
     two = _scene(_boxed(_box()))
-    unfolding = Unfolding.beside([one.unfolding, two.unfolding.numbered_from(len(planes))])
-    screens = Screens.beside([Screens.of(s.clutter, s.planes, len(s.words)) for s in (one, two)])
-    together = screens.shade(unfolding.paths(places))
-    torch.testing.assert_close(together, torch.cat([one.shade(places), two.shade(places)], 1).T)
+    unfolding = Unfolding.concatenate([one.unfolding, two.unfolding.with_offset(len(planes))])
+    obstacles = Obstacles.concatenate([Obstacles.of(s.clutter, s.planes, len(s.words)) for s in (one, two)])
+    together = obstacles.visible_share(unfolding.paths(places))
+    torch.testing.assert_close(
+        together, torch.cat([one.visible_share(places), two.visible_share(places)], 1).T
+    )
 
 
-def test_packed_queries_and_variance_know_the_furniture():
+def test_batched_queries_and_variance_include_clutter():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
     phased = [PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2)]
     phased.append(PhasedScene(_scene(Clutter.none()), torch.arange(7.0), 0.2))
@@ -132,7 +134,7 @@ def test_packed_queries_and_variance_know_the_furniture():
     means, variance, _ = Query(members).means(queries, tone)
     for member, mean in zip(members, means, strict=True):
         asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
-        waves = member.phased.unshaded(asked) * torch.polar(torch.ones(()), -member.phased.phase)
+        waves = member.phased.unobstructed(asked) * torch.polar(torch.ones(()), -member.phased.phase)
         expected = (waves[:, :, None] * member.gains(queries)).sum(1)
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
     bare = Query(members[1:]).means(queries, tone)[1]
@@ -143,10 +145,10 @@ def test_residual_is_the_same_likelihood():
     rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
     residual = Residual(rows, PhasedScene(_scene(_boxed(_box())), torch.arange(7.0), 0.2))
     scene = residual.phased.scene
-    seen = scene.shade(rows.position).T
+    seen = scene.visible_share(rows.position).T
     expected = PhasedPosterior(rows, residual.phased).factor.nll
     assert residual.nll(seen, scene.log_amplitude).item() == pytest.approx(expected, rel=1e-4)
-    gains = residual.gains_of_each(seen, scene.log_amplitude)
+    gains = residual.nats_per_source(seen, scene.log_amplitude)
     quiet = scene.log_amplitude.clone()
     quiet[2] = -30.0  # as if its constant part were not there
     lost = residual.nll(seen, quiet) - residual.nll(seen, scene.log_amplitude)
@@ -158,9 +160,9 @@ def test_score_is_what_the_best_multiple_gains():
     phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
     residual = Residual(rows, phased)
     seen, log_amplitude = torch.ones(7, 20), residual.phased.scene.log_amplitude
-    explained = residual.explained(seen, log_amplitude)
+    scorer = residual.scorer(seen, log_amplitude)
     change = torch.randn(20, 8, dtype=torch.complex64)
-    score, multiple = explained.score_positive(change)
+    score, multiple = scorer.score_positive(change)
     best = int(score.argmax())
     moved = rows.target[:, 0] - multiple[best] * change[:, best]
     posterior = [
@@ -183,9 +185,9 @@ def test_the_pillar_is_found_by_its_shadow():
     phased = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
     residual = Residual(rows, phased)
     scene = residual.phased.scene
-    explained = residual.explained(torch.ones(7, 150), scene.log_amplitude)
+    scorer = residual.scorer(torch.ones(7, 150), scene.log_amplitude)
     box, score = find_box(
-        explained, scene.unfolding.paths(rows.position), phased.unshaded(rows), _room(),
+        scorer, scene.unfolding.paths(rows.position), phased.unobstructed(rows), _room(),
         torch.Generator().manual_seed(0), draws=500,
     )  # fmt: skip
     assert score > 20
@@ -201,13 +203,13 @@ def _beside_a_table(count: int) -> tuple:
     rows = _truth(true, _rows(count))
     residual = Residual(rows, PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2))
     scene = residual.phased.scene
-    explained = residual.explained(torch.ones(7, count), scene.log_amplitude)
-    return rows, explained, clutter, walls(scene.planes, scene.words)
+    scorer = residual.scorer(torch.ones(7, count), scene.log_amplitude)
+    return rows, scorer, clutter, walls(scene.planes, scene.words)
 
 
 def test_a_table_top_is_found_by_its_reflections():
-    rows, explained, clutter, numbers = _beside_a_table(200)
-    best = find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, _room(), 3)[0]
+    rows, scorer, clutter, numbers = _beside_a_table(200)
+    best = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)[0]
     assert best.plane[2].abs() == 1
     assert (best.plane[3] * best.plane[2] - 0.75).abs() < WAVELENGTH
     assert best.score > 15
@@ -218,19 +220,19 @@ def test_a_table_top_is_found_by_its_reflections():
     )
 
 
-def test_mirrors_of_a_wide_site_are_not_looked_for(monkeypatch, caplog):
+def test_a_wide_site_is_not_searched_for_mirrors(monkeypatch, caplog):
     """A raster of 35 cm cells over 40 km asked for six terabytes."""
-    rows, explained, _, numbers = _beside_a_table(60)
-    whole = find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, _room(), 3)
+    rows, scorer, _, numbers = _beside_a_table(60)
+    whole = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)
     monkeypatch.setattr(finite_mirrors, "BLOCK_CELLS", 2e4)  # the raster in parts is the same
-    parts = find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, _room(), 3)
+    parts = find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, _room(), 3)
     assert len(whole) > 0 and [m.score for m in parts] == [m.score for m in whole]
     with caplog.at_level("INFO"):
-        assert find_mirrors(rows, explained, TRANSMITTER, WALLS, numbers, 1e4 * _room(), 3) == []
-    assert "not looked for" in caplog.text
+        assert find_mirrors(rows, scorer, TRANSMITTER, WALLS, numbers, 1e4 * _room(), 3) == []
+    assert "no search for small mirrors" in caplog.text
 
 
-def test_an_endless_mirror_gets_its_ends():
+def test_an_infinite_mirror_becomes_finite():
     planes, clutter = _table()
     words = (*_words(1), (6,), (6, 5), (2, 6))
     true = Scene(TRANSMITTER, planes, words, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
@@ -238,39 +240,39 @@ def test_an_endless_mirror_gets_its_ends():
     phased = PhasedScene(replace(true, clutter=Clutter.none()), torch.zeros(10), 0.2)
     residual = Residual(rows, phased)
     scene, paths = residual.phased.scene, true.unfolding.paths(rows.position)
-    explained = residual.explained(torch.ones(10, 250), scene.log_amplitude)
+    scorer = residual.scorer(torch.ones(10, 250), scene.log_amplitude)
     generator = torch.Generator().manual_seed(0)
     patch, score = find_patch(
-        explained, paths, words, 6, TABLE, phased.unshaded(rows), _room(), generator
+        scorer, paths, words, 6, TABLE, phased.unobstructed(rows), _room(), generator
     )  # fmt: skip
     assert score > 10
     learned, told = (
-        shade(paths.take([7]), Clutter(clutter.boxes, each[None], (6,)), planes) > 0.5
+        visible_share(paths.take([7]), Clutter(clutter.boxes, each[None], (6,)), planes) > 0.5
         for each in (patch, clutter.patches[0])
     )
     assert (learned == told).float().mean() > 0.85
 
 
-def test_furnishing_explains_a_pillar_and_leaves_an_empty_room_empty():
+def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room():
     generator = torch.Generator().manual_seed(0)
-    few = Furnishing(epochs=1, boxes=2, mirrors=1)
+    few = ClutterSearch(epochs=1, boxes=2, mirrors=1)
     for clutter, boxes in ((_boxed(_box()), True), (Clutter.none(), False)):
         rows = _truth(_scene(clutter), _rows(150))
         start = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
-        found = furnish(rows, start, generator, few)
+        found = find_clutter(rows, start, generator, few)
         assert bool(len(found.scene.clutter.boxes)) == boxes
         bare, learned = (PhasedPosterior(rows, each).factor.nll for each in (start, found))
         assert learned <= bare
     assert not len(found.scene.clutter)
 
 
-def test_walls_that_turn_alike_foretell_phases():
+def test_walls_of_equal_phase_shift_give_a_phase_prior():
     scene = _scene(Clutter.none())
     phase = torch.tensor([0.3, *[0.3 + np.pi] * 6]) + 0.1 * torch.tensor([0.0, 1, -1, 1, -1, 1, -1])
-    accord = Accord.of(PhasedScene(scene, phase, 0.2))
-    assert accord.turn == pytest.approx(np.pi)
-    assert accord.concentration > 3
-    expected = accord.expected(phase[0], ((0, 1),))
+    phase_prior = ReflectionPhasePrior.of(PhasedScene(scene, phase, 0.2))
+    assert phase_prior.turn == pytest.approx(np.pi)
+    assert phase_prior.concentration > 3
+    expected = phase_prior.expected(phase[0], ((0, 1),))
     assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
     scattered = PhasedScene(scene, torch.arange(7.0) * 2.1, 0.2)
-    assert Accord.of(scattered).concentration < accord.concentration
+    assert ReflectionPhasePrior.of(scattered).concentration < phase_prior.concentration

@@ -12,7 +12,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
 from gsparc.methods.method import FitContext
 from gsparc.multipath.diffraction import Edges, diffracted, edge_wave
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
 
 EDGE = torch.tensor([[1.9, 1.3, 1.0]], dtype=torch.float64)
@@ -45,7 +45,7 @@ def _scattered(tx, rx):
 
 
 def _fit(data, fold, tmp_path, **more):
-    method = VirtualSourceGP(**QUICK, **more)
+    method = ImageSourceGP(**QUICK, **more)
     report = method.fit(data, fold, FitContext(tmp_path))
     batch = data.batch(fold.test)
     error = nmse(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy())
@@ -78,7 +78,7 @@ def test_an_edge_is_found_where_it_is_and_explains_what_no_point_can(tmp_path):
     assert error < 0.01 < 0.05 < without
     assert "1 edges" in " ".join(report.notes)
     state = method.state()
-    again = VirtualSourceGP()
+    again = ImageSourceGP()
     again.restore(data.site, state)
     batch = data.batch(fold.test[:4])
     torch.testing.assert_close(

@@ -1,4 +1,4 @@
-"""Sources where measured rays meet, who sees them, and channels from both."""
+"""Triangulated sources, their visibility, and channels from both."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scenes import error
 from gsparc.data.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.methods.method import FitContext
-from gsparc.multipath.directional_gp import DirectedSources
+from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import steering
-from gsparc.multipath.image_source_gp import VirtualSourceGP
-from gsparc.multipath.visibility_gp import Sightings
-from gsparc.multipath.visibility_update import Rates, flips
+from gsparc.multipath.image_source_gp import ImageSourceGP
+from gsparc.multipath.visibility_gp import VisibilityGP
+from gsparc.multipath.visibility_update import RayErrorRates, flips
 from gsparc.studies.study.sensitivity import turned
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
@@ -27,28 +27,28 @@ REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.
 @pytest.fixture(scope="module")
 def pillar():
     data, fold, sources = directed(150, pillar=True)
-    method = DirectedSources()
+    method = DirectionalGP()
     method.fit(data, fold, FitContext(Path()))
     return data, fold, sources, method
 
 
-def test_few_receivers_are_enough_where_rays_say_where_sources_are():
+def test_few_receivers_are_enough_with_directions():
     data, _, sources = directed(60)
     rows = np.arange(60)
     fold = Fold(rows[:12], rows[12:14], rows[14:])
-    method = DirectedSources()
+    method = DirectionalGP()
     report = method.fit(data, fold, FitContext(Path()))
     found = method.sources + method.frame.middle
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == len(sources) == 7 and float(apart.max()) < 0.02
     assert error(method, data, fold.test) < 0.02
-    assert "7 sources where rays meet" in report.notes[0]
+    assert "7 triangulated sources" in report.notes[0]
 
 
-def test_who_is_hidden_by_a_pillar_is_learned(pillar):
+def test_occlusion_by_a_pillar_is_learned(pillar):
     data, fold, sources, method = pillar
-    assert bool((method.sightings.seen == 0).any())
-    blind = DirectedSources()
+    assert bool((method.visibility.seen == 0).any())
+    blind = DirectionalGP()
     blind.fit(replace(data, directions=towards(sources, data.rx_position)), fold, FitContext(Path()))
     assert error(method, data, fold.test) < 0.5 * error(blind, data, fold.test)
 
@@ -62,105 +62,107 @@ def towards(sources: np.ndarray, places: np.ndarray) -> list[np.ndarray]:
 def test_errors_are_as_large_as_expected(pillar):
     data, fold, _, method = pillar
     batch = data.batch(fold.test)
-    said = method.predict(batch.tx, batch.rx)
-    missed = (said.mean - batch.target).abs().square().mean((1, 2))
-    assert 0.2 < float(missed.mean() / said.variance.mean()) < 5
-    assert bool(((said.confidence >= 0) & (said.confidence <= 1)).all())
+    predicted = method.predict(batch.tx, batch.rx)
+    missed = (predicted.mean - batch.target).abs().square().mean((1, 2))
+    assert 0.2 < float(missed.mean() / predicted.variance.mean()) < 5
+    assert bool(((predicted.confidence >= 0) & (predicted.confidence <= 1)).all())
 
 
-def test_left_over_is_what_a_regression_without_the_receiver_leaves():
+def test_leave_one_out_residuals_equal_refitting_without_the_receiver():
     data, fold, _ = directed(40, pillar=True, tones=3)
-    method = DirectedSources(rows=96)
+    method = DirectionalGP(rows=96)
     method.fit(data, fold, FitContext(Path()))
-    receivers, left = method.leave_one_out()
-    assert len(receivers) == 96  # three tones each
+    left = method.leave_one_out()
+    assert len(left.rows) == 96  # three tones each
     rows, waves, k = method.rows, method.waves, 7
     kept = torch.nonzero(method.observer != k).flatten()
     out = torch.nonzero(method.observer == k).flatten()
     shared = (waves[kept] * method.power) @ waves[kept].mH
-    shared *= method.law.correlation(rows.position[kept], rows.position[kept])
-    shared.diagonal().add_(method.law.noise + 1e-5)
-    likely = steering(rows.take(out), method.sources) * method.sightings.left_out[k].float()
-    cross = (likely * method.power) @ waves[kept].mH
-    cross *= method.law.correlation(rows.position[out], rows.position[kept])
-    said = cross @ torch.linalg.solve(shared, rows.target[kept])
+    shared *= method.kernel.correlation(rows.position[kept], rows.position[kept])
+    shared.diagonal().add_(method.kernel.noise + 1e-5)
+    probability = steering(rows.take(out), method.sources) * method.visibility.left_out[k].float()
+    cross = (probability * method.power) @ waves[kept].mH
+    cross *= method.kernel.correlation(rows.position[out], rows.position[kept])
+    predicted = cross @ torch.linalg.solve(shared, rows.target[kept])
     loud = (method.frame.carrier_hz / rows.frequency[out]).float()[:, None] * method.frame.scale
-    torch.testing.assert_close(left[out], (rows.target[out] - said) * loud, atol=1e-4, rtol=1e-2)
+    torch.testing.assert_close(
+        left.residual[out], (rows.target[out] - predicted) * loud, atol=1e-4, rtol=1e-2
+    )
 
 
-def test_sightings_are_left_out_as_if_taught_without_them():
+def test_visibility_is_predicted_without_the_receiver():
     rng = np.random.default_rng(0)
     places = torch.from_numpy(rng.uniform(0, 4, (30, 3)))
     seen = torch.stack([(places[:, 0] < 2).double(), torch.ones(30, dtype=torch.float64)], 1)
-    taught = Sightings.of(places, seen)
-    assert torch.equal(taught.left_out[:, 1], torch.ones(30, dtype=torch.float64))
-    right = (taught.left_out[:, 0].round() == seen[:, 0]).double().mean()
+    fitted = VisibilityGP.of(places, seen)
+    assert torch.equal(fitted.left_out[:, 1], torch.ones(30, dtype=torch.float64))
+    right = (fitted.left_out[:, 0].round() == seen[:, 0]).double().mean()
     assert float(right) > 0.85
     query = torch.tensor([[0.5, 2.0, 2.0], [3.5, 2.0, 2.0]], dtype=torch.float64)
-    likely = taught.likely(query)[:, 0]
-    assert float(likely[0]) > 0.8 and float(likely[1]) < 0.2
+    probability = fitted.probability(query)[:, 0]
+    assert float(probability[0]) > 0.8 and float(probability[1]) < 0.2
 
 
-def test_what_was_kept_predicts_the_same_and_so_do_its_paths(pillar):
+def test_a_restored_model_and_its_paths_predict_the_same(pillar):
     data, fold, _, method = pillar
-    other = DirectedSources()
+    other = DirectionalGP()
     other.restore(data.site, method.state())
     batch = data.batch(fold.test[:5])
     want = method.predict(batch.tx, batch.rx)
     got = other.predict(batch.tx, batch.rx)
     assert torch.equal(got.mean, want.mean) and torch.equal(got.variance, want.variance)
-    gain, delay, direction = other.paths(batch.tx, batch.rx)
+    gain, delay, direction, _ = other.paths(batch.tx, batch.rx)
     assert gain.shape == delay.shape == (5, 1, 7) and direction.shape == (5, 7, 3)
     torch.testing.assert_close(gain.sum(-1), want.mean[:, :, 0], atol=1e-6, rtol=1e-4)
     assert other.size() == 7
 
 
 @pytest.mark.parametrize("degrees", [0.2, 1.0, 3.0])
-def test_errors_of_directions_are_told_and_places_pinned_by_phase(degrees):
+def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
     """Directions taken as exact left NMSE 0.08, 0.45 and 0.70."""
     data, fold, sources = directed(60, pillar=True)
-    method = DirectedSources()
+    method = DirectionalGP()
     report = method.fit(turned(data, degrees, seed=0), fold, FitContext(Path()))
     assert error(method, data, fold.test) < (0.07 if degrees < 2 else 0.25)
-    told = float(report.notes[0].partition("error ")[2].partition(" degrees")[0])
-    assert abs(told / degrees - 1) < 0.3
+    estimated = float(report.notes[0].partition("error ")[2].partition(" degrees")[0])
+    assert abs(estimated / degrees - 1) < 0.3
     found = method.sources + method.frame.middle
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == 7 and float(apart.median()) < 0.06  # half a wavelength
 
 
-def test_missing_and_false_rays_make_neither_sources_nor_silence():
+def test_missing_and_spurious_rays_neither_add_nor_remove_sources():
     data, fold, _ = directed(60, pillar=True)
-    method = DirectedSources()
+    method = DirectionalGP()
     report = method.fit(turned(data, 1.0, seed=1, missing=0.1, false=0.1), fold, FitContext(Path()))
-    assert method.size() == 7 and " 0 sightings" not in report.notes[0]
+    assert method.size() == 7 and " 0 visibility entries" not in report.notes[0]
     assert error(method, data, fold.test) < 0.08  # rays alone: 0.17
 
 
-def test_a_channel_says_which_source_a_receiver_missed():
+def test_a_channel_restores_a_missed_ray():
     rng = torch.Generator().manual_seed(0)
     one = torch.randn(20, 4, 1, generator=rng, dtype=torch.complex64)
     truth = torch.ones(20, 4)
     rays = truth.clone()
     rays[torch.arange(20), torch.arange(20) % 4] = 0
     left = ((truth - rays)[:, :, None] * one).sum(1)
-    rates = Rates.first(rays)
-    assert rates.missed == 0.2  # a quarter, but no more is believed at first
-    likely = torch.full((20, 4), 0.75)
-    flip = flips(rays, rates.odds(rays, likely), left, torch.full((20,), 1e-3), one)
+    rates = RayErrorRates.first(rays)
+    assert rates.missed == 0.2  # a quarter, clipped at first
+    probability = torch.full((20, 4), 0.75)
+    flip = flips(rays, rates.odds(rays, probability), left, torch.full((20,), 1e-3), one)
     assert torch.equal(flip, (truth - rays).bool())
-    told = Rates.of(rays, truth)
-    assert abs(told.missed - 0.25) < 1e-6 and told.mistaken == 1e-3
-    # nobody near sees it and nothing is missing: a channel's noise makes no sighting
-    quiet = flips(rays, rates.odds(rays, 0 * likely), 0 * left, torch.ones(20), one)
+    estimated = RayErrorRates.of(rays, truth)
+    assert abs(estimated.missed - 0.25) < 1e-6 and estimated.spurious == 1e-3
+    # no neighbour sees it and the residual is zero: noise adds no visibility
+    quiet = flips(rays, rates.odds(rays, 0 * probability), 0 * left, torch.ones(20), one)
     assert not bool(quiet[rays == 0].any())
 
 
-def test_checkpoints_of_before_directions_had_errors_load(pillar):
+def test_checkpoints_without_position_covariance_load(pillar):
     data, fold, _, method = pillar
     state = method.state()
     del state["open"]
-    other = DirectedSources()
+    other = DirectionalGP()
     other.restore(data.site, state)
     batch = data.batch(fold.test[:5])
     torch.testing.assert_close(other.mean_at(batch.tx, batch.rx), method.mean_at(batch.tx, batch.rx))
@@ -170,14 +172,14 @@ def test_checkpoints_of_before_directions_had_errors_load(pillar):
     ("spoil", "message"),
     [
         (lambda data: replace(data, directions=None), "needs directions of arrival"),
-        (lambda data: replace(data, directions=[d[:0] for d in data.directions]), "meet nowhere"),
-        (lambda data: replace(data, target=0 * data.target), "silent"),
+        (lambda data: replace(data, directions=[d[:0] for d in data.directions]), "do not intersect"),
+        (lambda data: replace(data, target=0 * data.target), "every training channel is zero"),
     ],
 )
-def test_what_cannot_be_followed_is_refused_in_one_line(pillar, spoil, message):
+def test_unusable_data_are_refused_in_one_line(pillar, spoil, message):
     data, fold, _, _ = pillar
     with pytest.raises(ValueError, match=message):
-        DirectedSources().fit(spoil(data), fold, FitContext(Path()))
+        DirectionalGP().fit(spoil(data), fold, FitContext(Path()))
 
 
 def _at_a_source(data, sources):
@@ -200,21 +202,26 @@ HARD = {
 }
 
 
-def test_rays_that_mean_nothing_are_no_sources():
+def test_random_rays_give_no_sources():
     data, fold, _ = directed(60, pillar=True)
-    with pytest.raises(ValueError, match="meet nowhere"):
-        DirectedSources().fit(_anyhow(data), fold, FitContext(Path()))
+    with pytest.raises(ValueError, match="do not intersect"):
+        DirectionalGP().fit(_anyhow(data), fold, FitContext(Path()))
 
 
 @pytest.mark.parametrize("case", HARD)
 def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
     data, fold, sources = directed(60, pillar=True)
     data = HARD[case](data, sources)
-    method = DirectedSources()
+    method = DirectionalGP()
     method.fit(data, fold, FitContext(Path()))
     batch = data.batch(fold.test)
-    said, (_, left) = method.predict(batch.tx, batch.rx), method.leave_one_out()
-    for part in (torch.view_as_real(said.mean), said.variance, said.confidence, torch.view_as_real(left)):
+    predicted, left = method.predict(batch.tx, batch.rx), method.leave_one_out().residual
+    for part in (
+        torch.view_as_real(predicted.mean),
+        predicted.variance,
+        predicted.confidence,
+        torch.view_as_real(left),
+    ):
         assert bool(torch.isfinite(part).all())
     assert error(method, data, fold.test) < 1.1
 
@@ -225,10 +232,10 @@ def test_the_conference_room_from_43_receivers():
         pytest.skip(f"real data not found at {REAL}")
     data = load_newrf(REAL)
     fold = make_split(data.moving, SplitSettings(name="sparse")).folds[0]
-    method = DirectedSources()
+    method = DirectionalGP()
     method.fit(data, fold, FitContext(Path()))
     assert len(fold.train) + len(fold.val) == 43
     assert error(method, data, fold.test) < 0.08
-    searched = VirtualSourceGP(searches=1, budget_s=5, clutter=False, edges=False)
+    searched = ImageSourceGP(searches=1, budget_s=5, clutter=False, edges=False)
     searched.fit(data, fold, FitContext(Path()))
     assert error(searched, data, fold.test) > 0.5

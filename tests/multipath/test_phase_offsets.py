@@ -7,7 +7,7 @@ import pytest
 from rooms import nmse, shoebox
 
 from gsparc.methods.method import FitContext
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.phase_offsets import estimate
 
 FREQUENCY = 2.4e9 + np.arange(16) * 5e6
@@ -43,7 +43,7 @@ def test_tones_not_measured_do_not_count():
 
 
 def _fit(data, fold, tmp_path, offsets):
-    method = VirtualSourceGP(searches=1, search_rows=300, margin=4.0, offsets=offsets)
+    method = ImageSourceGP(searches=1, search_rows=300, margin=4.0, offsets=offsets)
     method.fit(data, fold, FitContext(tmp_path))
     return method
 
@@ -74,4 +74,4 @@ def test_without_estimating_offsets_nothing_is_learned(tmp_path):
 
 def test_unknown_kind_of_offset_is_refused():
     with pytest.raises(ValueError, match="phase_timing"):
-        VirtualSourceGP(offsets="both")
+        ImageSourceGP(offsets="both")

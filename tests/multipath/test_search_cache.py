@@ -1,4 +1,4 @@
-"""An interrupted run of several searches goes on after those that are done."""
+"""An interrupted run resumes after its finished searches."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ from rooms import shoebox
 
 from gsparc.methods.method import FitContext
 from gsparc.multipath import ensemble
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 
 QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "clutter": False, "edges": False}
 
 
 def _fit(data, fold, folder, resume=None, **more):
-    method = VirtualSourceGP(**{**QUICK, **more})
-    method.resume = resume
-    return method, method.fit(data, fold, FitContext(folder))
+    method = ImageSourceGP(**{**QUICK, **more})
+    return method, method.fit(data, fold, FitContext(folder, resume=resume))
 
 
 @pytest.fixture()
@@ -35,7 +34,7 @@ def counted(monkeypatch):
     return begun, fatal
 
 
-def test_what_is_done_is_not_done_again(tmp_path, counted):
+def test_finished_searches_are_reused(tmp_path, counted):
     begun, fatal = counted
     threads = torch.get_num_threads()
     torch.set_num_threads(1)  # one search after the other

@@ -1,4 +1,4 @@
-"""Sources found in an uplink, and the methods that read one."""
+"""Sources estimated in an uplink, and the methods that read one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from gsparc.data.argos import load_argos
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.ridge import Ridge
-from gsparc.multipath.uplink.error_model import unheard_noise
+from gsparc.multipath.uplink.error_model import estimate_noise
 from gsparc.multipath.uplink.method import UplinkField
 from gsparc.multipath.uplink.posterior import Sources
 from gsparc.multipath.uplink.search import SearchSettings, SourceSearch
@@ -52,7 +52,7 @@ def test_noise_is_read_off_empty_delays() -> None:
     aperture = _aperture()
     generator = torch.Generator().manual_seed(0)
     noise = torch.randn(1, 64, 26, dtype=torch.complex64, generator=generator) * 0.1
-    guess = unheard_noise(_three().response(aperture) + noise, aperture, (-0.12, 0.3))
+    guess = estimate_noise(_three().response(aperture) + noise, aperture, (-0.12, 0.3))
     assert 0.005 < float(guess) < 0.02
 
 
@@ -123,12 +123,12 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     uplink[:, 0] = 0
     method = Ridge(inputs)
     method.fit(replace(data, uplink=uplink), fold(), FitContext())
-    said = method.listen(torch.from_numpy(uplink[fold().test])).mean
-    assert torch.isfinite(torch.view_as_real(said)).all() and said[:, 1:].abs().min() > 0
-    assert inputs == "all" or (said[:, 0] == 0).all()
+    predicted = method.listen(torch.from_numpy(uplink[fold().test])).mean
+    assert torch.isfinite(torch.view_as_real(predicted)).all() and predicted[:, 1:].abs().min() > 0
+    assert inputs == "all" or (predicted[:, 0] == 0).all()
 
 
-def test_kept_and_restored(fitted, tmp_path) -> None:
+def test_saved_and_restored(fitted, tmp_path) -> None:
     method, data = fitted
     checkpoint.save(tmp_path / "m.ckpt", method)
     again, _ = checkpoint.load(tmp_path / "m.ckpt")
@@ -183,7 +183,7 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
 
 
 def test_posterior_tells_the_error_of_the_other_band() -> None:
-    """Blur is the mean squared error over draws of the noise, in the other band and on one antenna."""
+    """Posterior variance equals the mean squared error over noise, in the other band and on one antenna."""
     aperture, truth = _aperture(), _three()
     count, noise = 200, 0.05
     generator = torch.Generator().manual_seed(0)
@@ -194,10 +194,10 @@ def test_posterior_tells_the_error_of_the_other_band() -> None:
     other = aperture.at(aperture.tones + 27)
     for where in (other, Aperture(other.places[:1], other.tones[:5])):
         miss = (found.response(where) - truth.response(where)).abs().square().mean((1, 2))
-        assert 0.6 < float(miss.median() / found.blur(where).median()) < 1.6
+        assert 0.6 < float(miss.median() / found.error_variance(where).median()) < 1.6
 
 
-def test_trust_holds_on_a_narrow_grid_of_one_antenna(fitted) -> None:
+def test_expected_errors_hold_on_a_narrow_grid_of_one_antenna(fitted) -> None:
     """Pieces of the downlink are in fades that the whole never is in: expected errors follow."""
     method, data = fitted
     rows = np.concatenate([fold().val, fold().test])

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from gsparc.multipath.gp_likelihood import Scene
-from gsparc.multipath.reflection_orders import respell, upright, vote
+from gsparc.multipath.reflection_orders import find_walls, orthogonal_walls, reassign
 from gsparc.physics.mirror_planes import all_words, bisector, images, reflect
 
 WALLS = torch.tensor(
@@ -36,13 +36,13 @@ def test_words_have_no_letter_after_itself():
     assert all(a != b for word in words for a, b in itertools.pairwise(word))
 
 
-def test_walls_are_voted_for_by_the_sources_they_explain():
+def test_walls_are_found_by_the_sources_they_explain():
     words = [(), *all_words([0, 1, 2, 3], 2)]
     sources = images(TX, WALLS, words)
     sources = sources + 0.002 * torch.randn(
         sources.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
-    walls = vote(sources)
+    walls = find_walls(sources)
     assert walls is not None
     probe = torch.tensor([1.1, 0.3, 0.7], dtype=torch.float64)
     reached = torch.cdist(reflect(probe, WALLS), reflect(probe, walls)).amin(1)
@@ -50,7 +50,7 @@ def test_walls_are_voted_for_by_the_sources_they_explain():
 
 
 def test_two_sources_make_no_wall():
-    assert vote(torch.stack([TX, reflect(TX, WALLS[0])])) is None
+    assert find_walls(torch.stack([TX, reflect(TX, WALLS[0])])) is None
 
 
 def test_walls_of_a_box_are_told_from_sources_spelled_badly():
@@ -62,14 +62,14 @@ def test_walls_of_a_box_are_told_from_sources_spelled_badly():
     tilted = bisector(good.sources[3].expand(2, 3), good.sources[[1, 5]])
     planes = torch.cat([walls[1:], tilted])
     bad = Scene(transmitter, planes, ((), (0,), (1,), (2,), (1, 3), (1, 4), (0, 2)), torch.zeros(7), 0.0)
-    found = upright(bad)
+    found = orthogonal_walls(bad)
     assert found is not None
     told = {(int(p[:3].abs().argmax()), round(float((p[3] * p[:3].sum()).abs()), 2)) for p in found}
     assert told == {(0, 4.0), (1, 0.0), (1, 3.0), (2, 2.5)}
-    assert len(respell(bad, found).planes) == 4
+    assert len(reassign(bad, found).planes) == 4
 
 
 def test_without_perpendicular_planes_there_is_no_box():
     plane = torch.tensor([[1.0, 0, 0, 4]], dtype=torch.float64)
     scene = Scene(torch.zeros(3, dtype=torch.float64), plane, ((), (0,)), torch.zeros(2), 0.0)
-    assert upright(scene) is None
+    assert orthogonal_walls(scene) is None

@@ -12,7 +12,7 @@ from gsparc.data.rfid import load_rfid
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
-from gsparc.multipath.directional_gp import DirectedSources
+from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
 from gsparc.studies.study.sensitivity import displaced, draw, sweep, turned
 
@@ -58,7 +58,7 @@ def test_directions_turn_by_what_was_asked_and_nothing_else(tmp_path) -> None:
         turned(replace(few, directions=None), 1.0, seed=0)
     found = list(
         sweep(
-            {"directed": DirectedSources}, data, fold, [], tmp_path,
+            {"directed": DirectionalGP}, data, fold, [], tmp_path,
             train_errors=False, seed=0, errors_deg=[0.5],
         )
     )  # fmt: skip

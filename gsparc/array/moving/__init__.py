@@ -1,1 +1,1 @@
-"""Spectra of a moving array: sources found where bearings cross, seen from wherever the receiver stands."""
+"""Spectra of a moving array: triangulated sources, their powers over places, and a residual process."""

@@ -1,4 +1,4 @@
-"""Principal components of smooth images: directions from every few pixels, axes from all of them."""
+"""Principal components of smooth images: inner products from thinned pixels, axes over all of them."""
 
 from __future__ import annotations
 

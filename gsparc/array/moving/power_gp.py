@@ -1,4 +1,4 @@
-"""Powers of sources as smooth trends over the floor: a Gaussian process each, one kernel for all."""
+"""Powers of sources over the receiver's position: one Gaussian process per source, one kernel for all."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from gsparc.methods.gp import Kernel
 
 @dataclass(frozen=True)
 class TrendSettings:
-    """How smooth the powers of the sources are taken to be.
+    """Smoothness of the sources' powers.
 
     Attributes:
         lengths: of the Matern kernels tried, in diagonals of the receivers' box.
-        noise: variance of what is not smooth, relative to the kernel's.
-        rows: training rows that the length and the rest's kernel are chosen on, by leaving one out.
+        noise: variance relative to the kernel's.
+        rows: training rows that the length is chosen on, by leave-one-out error.
     """
 
     lengths: tuple[float, ...] = (0.06, 0.12, 0.25)
@@ -37,7 +37,7 @@ class Trend:
         sources: (K, 3) float32 [m].
         kernel: of the powers over the receivers' places.
         level: (K,) mean powers.
-        weights: (n, K), one row per receiver that was learned from.
+        weights: (n, K), one row per training receiver.
     """
 
     sources: Tensor
@@ -46,7 +46,7 @@ class Trend:
     weights: np.ndarray
 
     def powers_at(self, places: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Power (m, K) of every source at places (m, 3) [m]; `known` (n, 3) were learned from."""
+        """Power (m, K) of every source at places (m, 3) [m]; `known` (n, 3) are the training places."""
         return self.level + self.kernel.cross(places, known) @ self.weights
 
     def state(self) -> dict[str, Any]:
@@ -65,10 +65,10 @@ class Trend:
         return Trend(state["sources"], kernel, state["level"].numpy(), state["weights"].numpy())
 
 
-def learn_trend(
+def fit_trend(
     sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
 ) -> tuple[Trend, np.ndarray]:
-    """The trend of powers (n, K) at places (n, 3), and what it says of each row (n, K) without that row.
+    """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K).
 
     Rasmussen and Williams (2006), eq. 5.12.
     """

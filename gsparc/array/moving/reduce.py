@@ -1,6 +1,6 @@
-"""What sources where bearings cross can spare: searches, components of what they leave, pixels, the variance.
+"""Reductions of the moving-array model: searches, residual components, pixels, the variance.
 
-Sources themselves are no knob: a quarter of 48 answers 0.02 ms sooner.
+The number of sources is not reduced: a quarter of 48 saves 0.02 ms.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsparc.array.moving.power_gp import Trend
-from gsparc.array.moving.triangulate import bearings, mixed
+from gsparc.array.moving.triangulate import bearings, mixture
 from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Settings
@@ -23,14 +23,14 @@ from gsparc.ops import Pose
 from gsparc.physics.lags import Lags
 
 if TYPE_CHECKING:
-    from gsparc.array.moving.method import BearingField
+    from gsparc.array.moving.method import MovingArrayField
 
 
 @torch.no_grad()
-def reduced(method: BearingField, settings: Settings) -> Method:
-    """The mean of the first `searches` with the strongest components of what sources leave (`keep`, a share).
+def reduced(method: MovingArrayField, settings: Settings) -> Method:
+    """The mean of the first `searches` with the strongest components of the residual (`keep`, a share).
 
-    On fewer pixels (`stride`) and without its variance, most of a query where many receivers were learned.
+    On fewer pixels (`stride`) and without its variance, most of the query time for large training sets.
     """
     assert method.site is not None and method.site.grid is not None
     if set(settings) <= {"confidence"} and settings.get("confidence", True):
@@ -45,24 +45,24 @@ def reduced(method: BearingField, settings: Settings) -> Method:
             for part in (mean, axes)
         )
     searches = int(settings.get("searches", len(method.trends)))
-    lean = Mean(method, method.trends[: max(searches, 1)], mean, axes, method.weights[:, kept], stride)
+    lean = ReducedMean(method, method.trends[: max(searches, 1)], mean, axes, method.weights[:, kept], stride)
     return Filled(lean, grid, stride) if stride > 1 else lean
 
 
-class Mean(View):
-    """The mean of a field of bearings, in float32, on every `stride`-th pixel.
+class ReducedMean(View):
+    """The mean of a moving-array model, in float32, on every `stride`-th pixel.
 
     Args:
         inner: fitted.
-        trends: of its searches, those that are asked.
-        mean, axes: (P,) and (C, P), the basis of what sources leave.
+        trends: of its searches, those that are evaluated.
+        mean, axes: (P,) and (C, P), the basis of the residual.
         weights: (n, C), so that scores are `kernel(query, places) @ weights`.
         stride: of the pixels P.
     """
 
     def __init__(
         self,
-        inner: BearingField,
+        inner: MovingArrayField,
         trends: Sequence[Trend],
         mean: Tensor,
         axes: Tensor,
@@ -82,8 +82,8 @@ class Mean(View):
         self._mean, self._axes, self._weights = mean, axes, weights.float().contiguous()
         self._middle = torch.from_numpy(inner.positions.mean(0)).float()
         self._places = torch.from_numpy(inner.positions).float() - self._middle
-        self._smooth = [math.sqrt(3) / trend.kernel.length for trend in trends]
-        self._rest = math.sqrt(3) / inner.rest.length
+        self._scales = [math.sqrt(3) / trend.kernel.length for trend in trends]
+        self._residual_scale = math.sqrt(3) / inner.residual_kernel.length
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
@@ -91,20 +91,20 @@ class Mean(View):
         where = rx.position.reshape(-1, 3).expand(len(tx), 3)
         far = torch.linalg.vector_norm((where - self._middle)[:, None] - self._places, dim=-1)
         images = [
-            self._drawn(sources, where, torch.addmm(level, _matern(far * smooth), trend))
-            for sources, level, trend, smooth in zip(
-                self._sources, self._levels, self._trends, self._smooth, strict=True
+            self._image(sources, where, torch.addmm(level, _matern(far * scale), trend))
+            for sources, level, trend, scale in zip(
+                self._sources, self._levels, self._trends, self._scales, strict=True
             )
         ]
         image = images[0] if len(images) == 1 else torch.stack(images).mean(0)
-        scores = _matern(far * self._rest) @ self._weights
+        scores = _matern(far * self._residual_scale) @ self._weights
         found = image.add_(torch.addmm(self._mean, scores, self._axes))
         return Prediction(from_real(found, "spectrum", self._space.image))
 
-    def _drawn(self, sources: Tensor, where: Tensor, power: Tensor) -> Tensor:
+    def _image(self, sources: Tensor, where: Tensor, power: Tensor) -> Tensor:
         """Image (n, P) of one search's sources."""
         atoms = self._space.atoms(bearings(sources, where, self._rotation))
-        image = self._space.spectrum(mixed(power, atoms))
+        image = self._space.spectrum(mixture(power, atoms))
         return (image.sqrt_() if self._exponent == 2 else image).flatten(1)
 
     def size(self) -> int:

@@ -1,4 +1,4 @@
-"""Sources where the bearings of many receivers cross: a greedy search on what is left, then a polish."""
+"""Triangulate sources from the spectra of many receivers: greedy search on the residual, then refinement."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from torch import Tensor
 from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 
-SWEEPS = 20  # over all sources: powers are then within a hundredth of the best
+SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How sources are looked for.
+    """Source search.
 
     Attributes:
         sources: largest number.
         per_round: added before powers are solved again.
-        rows: receivers that are looked at, spread over the site.
+        rows: receivers used, spread over the site.
         candidates: points tried in each round.
-        reach: how far around the receivers sources are looked for, in diagonals of their box.
+        reach: margin of the search box around the receivers, in diagonals of theirs.
         apart: least mean difference of two new sources' directions, as seen from a few receivers.
-        least_gain: the search ends when a round explains less than this share of what was left.
+        least_gain: the search ends when a round explains less than this share of the residual.
         ridge: of the power solves.
-        steps: of the polish.
-        rate: of the polish [m].
+        steps: of the gradient refinement of positions.
+        rate: its step size [m].
     """
 
     sources: int = 48
@@ -58,9 +58,9 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     """
     gram = atoms @ atoms.mT
     gram.diagonal(dim1=-2, dim2=-1).add_(ridge)
-    asked = (atoms @ lags[..., None])[..., 0]
-    found = torch.linalg.solve(gram, asked).clamp_(min=0)
-    slope = (gram @ found[..., None])[..., 0] - asked
+    correlation = (atoms @ lags[..., None])[..., 0]
+    found = torch.linalg.solve(gram, correlation).clamp_(min=0)
+    slope = (gram @ found[..., None])[..., 0] - correlation
     curvature = gram.diagonal(dim1=-2, dim2=-1)
     for _ in range(SWEEPS):
         for k in range(found.shape[1]):
@@ -70,7 +70,7 @@ def powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     return found
 
 
-def mixed(power: Tensor, atoms: Tensor) -> Tensor:
+def mixture(power: Tensor, atoms: Tensor) -> Tensor:
     """Lags (n, Q) of sources of the given power (n, K)."""
     return (power[:, None] @ atoms)[:, 0]
 
@@ -88,12 +88,12 @@ def find_sources(
     """Positions (K, 3) float32 [m] of sources.
 
     Args:
-        lags: (n, Q) of the spectra looked at.
+        lags: (n, Q) of the spectra.
         receivers: (n, 3) [m].
-        first: (3,) [m] where the transmitter stands, which is not moved; None when unknown.
+        first: (3,) [m] position of the transmitter, held fixed; None when unknown.
         rotation: (3, 3) receiver to world.
         space: of the lags.
-        grid: of the spectra; rows are searched by their nearest pixel.
+        grid: of the spectra; candidates are scored at their nearest pixel.
         settings: how.
         seed: of the candidates.
     """
@@ -102,41 +102,41 @@ def find_sources(
     far = settings.reach * float((high - low).norm())
     low, high = low - far, high + far
     known = torch.empty(0, 3) if first is None else first.reshape(1, 3).float()
-    left, found = lags, known
+    residual, found = lags, known
     if len(known):
-        found, left = known, _left(lags, receivers, known, rotation, space, settings.ridge)
-    energy = float(left.square().sum())
+        found, residual = known, _residual(lags, receivers, known, rotation, space, settings.ridge)
+    energy = float(residual.square().sum())
     while len(found) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
-        new = _best(candidates, left, receivers, rotation, space, grid, settings)
+        new = _best(candidates, residual, receivers, rotation, space, grid, settings)
         if not len(new):
             break
         found = torch.cat([found, new])
-        left = _left(lags, receivers, found, rotation, space, settings.ridge)
-        before, energy = energy, float(left.square().sum())
+        residual = _residual(lags, receivers, found, rotation, space, settings.ridge)
+        before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before:
             break
-    return _polished(found, len(known), lags, receivers, rotation, space, settings, generator)
+    return _refined(found, len(known), lags, receivers, rotation, space, settings, generator)
 
 
-def _left(
+def _residual(
     lags: Tensor, receivers: Tensor, sources: Tensor, rotation: Tensor, space: Lags, ridge: float
 ) -> Tensor:
     atoms = space.atoms(bearings(sources, receivers, rotation))
-    return lags - mixed(powers(lags, atoms, ridge), atoms)
+    return lags - mixture(powers(lags, atoms, ridge), atoms)
 
 
 def _best(
     candidates: Tensor,
-    left: Tensor,
+    residual: Tensor,
     receivers: Tensor,
     rotation: Tensor,
     space: Lags,
     grid: SphereGrid,
     settings: SearchSettings,
 ) -> Tensor:
-    """The candidates in whose direction most is left, over all receivers; near doubles dropped."""
-    amplitude = space.spectrum(left).sqrt_().reshape(len(left), -1)
+    """Candidates with the largest residual in their direction, over all receivers, without near doubles."""
+    amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
     score = torch.zeros(len(candidates))
     for image, receiver in zip(amplitude, receivers, strict=True):
         pixel, inside = _pixels(bearings(candidates, receiver[None], rotation)[0], grid)
@@ -165,7 +165,7 @@ def _pixels(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
     return (row.clamp(0, grid.height - 1) * grid.width + column.clamp(0, grid.width - 1)), inside
 
 
-def _polished(
+def _refined(
     sources: Tensor,
     fixed: int,
     lags: Tensor,
@@ -175,9 +175,9 @@ def _polished(
     settings: SearchSettings,
     generator: torch.Generator,
 ) -> Tensor:
-    """Positions by gradient; the first `fixed` stay.
+    """Positions by gradient descent; the first `fixed` stay.
 
-    Powers are the best ones at every step, so that their own change does not enter the gradient.
+    Powers are optimal at every step, so that their derivative does not enter the gradient.
     """
     if settings.steps == 0 or len(sources) == fixed:
         return sources
@@ -187,8 +187,8 @@ def _polished(
     for _ in range(settings.steps):
         some = torch.randperm(len(receivers), generator=generator)[:64]
         everything = torch.cat([sources[:fixed], free])
-        left = _left(lags[some], receivers[some], everything, rotation, space, settings.ridge)
-        loss = left.square().sum() / lags[some].square().sum()
+        residual = _residual(lags[some], receivers[some], everything, rotation, space, settings.ridge)
+        loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

@@ -1,1 +1,1 @@
-"""What blocks paths and where mirrors end: learned once, shared by all sources."""
+"""Clutter: occluding boxes and finite mirrors, shared by all sources."""

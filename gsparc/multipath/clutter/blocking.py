@@ -1,8 +1,8 @@
-"""Boxes that hide and patches that end mirrors, tested against the legs of every path.
+"""Occlusion of path legs by boxes and patches.
 
-A box lets no leg pass that runs through it for more than a few centimetres. A patch is a rectangle on a
-mirror plane: a plane with patches reflects only inside them, and a patch lets no other leg through. Edges
-are soft, so that they can be moved by gradients.
+A box blocks legs with a chord of more than a few centimetres. A patch is a rectangle on a mirror plane: a
+plane with patches reflects only inside them, and a patch blocks all other legs. Edges are soft, so that they
+can be moved by gradients.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from torch import Tensor
 
 from gsparc.multipath.clutter.unfold import Paths
 
-MARGIN = 0.03  # [m] of a chord that still passes: legs end on the faces of what reflects them
-SOFT = 0.02  # [m] width of an edge
+MARGIN = 0.03  # [m], chord that is not blocked: legs end on the faces that reflect them
+SOFT = 0.02  # [m], width of a soft edge
 NEAR_PLANE = 0.02  # [m]; a leg that ends this close to a patch is reflected by it, not blocked
 
 
@@ -26,7 +26,7 @@ class Clutter:
     Attributes:
         boxes: (B, 6) float32 [m], lower then upper corners.
         patches: (Q, 4) float32 [m], lower then upper corners along the plane's `tangents`.
-        plane: Q numbers of planes of the scene.
+        plane: Q indices of planes of the scene.
     """
 
     boxes: Tensor
@@ -35,7 +35,7 @@ class Clutter:
 
     @staticmethod
     def none() -> Clutter:
-        """An empty room with endless mirrors."""
+        """No boxes, infinite mirrors."""
         return Clutter(torch.zeros(0, 6), torch.zeros(0, 4), ())
 
     def __len__(self) -> int:
@@ -61,25 +61,25 @@ class Clutter:
         return replace(self, patches=self.patches[kept], plane=tuple(self.plane[i] for i in kept))
 
     def renamed(self, new: dict[int, int]) -> Clutter:
-        """Planes under new numbers; patches of planes without one go."""
+        """Planes of new indices; patches of planes without one are dropped."""
         kept = [i for i, plane in enumerate(self.plane) if plane in new]
         return replace(self, patches=self.patches[kept], plane=tuple(new[self.plane[i]] for i in kept))
 
 
-def shade(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
-    """How much of each source is seen (K, n) in [0, 1]; differentiable in boxes and patches."""
-    return Screens.of(clutter, planes, paths.valid.shape[0]).shade(paths, soft)
+def visible_share(paths: Paths, clutter: Clutter, planes: Tensor, soft: float = SOFT) -> Tensor:
+    """Visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
+    return Obstacles.of(clutter, planes, paths.valid.shape[0]).visible_share(paths, soft)
 
 
 @dataclass(frozen=True)
-class Screens:
-    """Clutter of one or more scenes, ready to be tested against paths of all their K sources.
+class Obstacles:
+    """Clutter of one or more scenes, prepared for paths of all their K sources.
 
     Attributes:
         boxes: (B, 6).
-        boxed: (B, K, 1) bool, whose boxes they are.
+        box_mask: (B, K, 1) bool, sources that a box applies to.
         patches: (Q, 4).
-        patched: (Q, K, 1) bool, whose patches they are.
+        patch_mask: (Q, K, 1) bool, sources that a patch applies to.
         letter: (Q,) planes of the patches.
         normal, offset: (Q, 3), (Q,) of these planes.
         along: (Q, 2, 3), their tangents.
@@ -87,9 +87,9 @@ class Screens:
     """
 
     boxes: Tensor
-    boxed: Tensor
+    box_mask: Tensor
     patches: Tensor
-    patched: Tensor
+    patch_mask: Tensor
     letter: Tensor
     normal: Tensor
     offset: Tensor
@@ -97,14 +97,14 @@ class Screens:
     ends: Tensor
 
     @staticmethod
-    def of(clutter: Clutter, planes: Tensor, sources: int) -> Screens:
+    def of(clutter: Clutter, planes: Tensor, sources: int) -> Obstacles:
         """From one scene's clutter, planes (P, 4) and number of sources."""
         letter = torch.tensor(clutter.plane, dtype=torch.long)
         ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
         ends[letter] = True
         used = planes[letter]
         along = [tangents(plane) for plane in used]
-        return Screens(
+        return Obstacles(
             clutter.boxes,
             torch.ones(len(clutter.boxes), sources, 1, dtype=torch.bool),
             clutter.patches,
@@ -117,14 +117,14 @@ class Screens:
         )
 
     @staticmethod
-    def beside(many: list[Screens]) -> Screens:
-        """Of several scenes whose sources, and planes, are numbered on."""
+    def concatenate(many: list[Obstacles]) -> Obstacles:
+        """Of several scenes, with consecutive indices of sources and planes."""
         planes = torch.tensor([0] + [len(s.ends) - 1 for s in many]).cumsum(0).tolist()
-        return Screens(
+        return Obstacles(
             torch.cat([s.boxes for s in many]),
-            _blocks([s.boxed for s in many]),
+            _blocks([s.box_mask for s in many]),
             torch.cat([s.patches for s in many]),
-            _blocks([s.patched for s in many]),
+            _blocks([s.patch_mask for s in many]),
             torch.cat([s.letter + first for s, first in zip(many, planes, strict=False)]),
             torch.cat([s.normal for s in many]),
             torch.cat([s.offset for s in many]),
@@ -132,11 +132,11 @@ class Screens:
             torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
         )
 
-    def shade(self, paths: Paths, soft: float = SOFT) -> Tensor:
-        """How much of each source is seen (K, n) in [0, 1]."""
+    def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
+        """Visible share (K, n) in [0, 1] of each source."""
         seen = torch.ones(paths.valid.shape)
         if len(self.boxes):
-            passed = torch.where(self.boxed, past_boxes(paths, self.boxes, soft), 1.0)
+            passed = torch.where(self.box_mask, past_boxes(paths, self.boxes, soft), 1.0)
             seen = seen * passed.prod(0)
         if len(self.patches):
             seen = seen * self._past_patches(paths, soft)
@@ -144,7 +144,7 @@ class Screens:
 
     def _past_patches(self, paths: Paths, soft: float) -> Tensor:
         shape = (-1, 1, 1, 1)
-        mine = (self.patched & paths.valid)[..., None]  # (Q, K, n, 1)
+        mine = (self.patch_mask & paths.valid)[..., None]  # (Q, K, n, 1)
         offset = self.offset.view(shape)
         above, below = (_dot(p, self.normal) - offset for p in (paths.start, paths.end))
         ends_here = paths.letter == self.letter.view(shape)
@@ -158,7 +158,7 @@ class Screens:
         reflected = 1 - torch.where(ends_here, 1 - inside, 1.0).prod(0)
         bounded = self.ends[paths.letter]
         seen = passed * torch.where(bounded, reflected, 1.0).prod(-1)
-        # A mirror that ends is known well enough to say from where its words cannot be seen
+        # the words of a finite mirror are invisible where their path is not valid
         return torch.where(paths.valid | ~bounded.any(-1), seen, 0.0)
 
 
@@ -170,7 +170,7 @@ def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
 
 
 def within(points: Tensor, patches: Tensor, soft: float = SOFT) -> Tensor:
-    """How far inside patches (Q, 4) points (..., 2) are, as a share (Q, ...)."""
+    """Soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
     return _inside([points[..., 0], points[..., 1]], patches, soft)
 
 

@@ -1,4 +1,4 @@
-"""Where would one more box explain most of what is left? Random boxes, then the best ones evolve."""
+"""Find the box that would explain most of the residual: random candidates, then an evolution strategy."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import past_boxes
-from gsparc.multipath.clutter.residual import Explained
+from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 
 BLOCK = 64  # candidates at a time
@@ -28,7 +28,7 @@ class Evolution:
         children: of each parent and round.
         spread: first standard deviation of a mutation [m].
         fall: factor from round to round.
-        halved: rounds after which only the better half goes on.
+        halved: rounds after which only the better half is kept.
     """
 
     rounds: int = 14
@@ -64,9 +64,9 @@ def evolve(
 
 
 def find_box(
-    explained: Explained,
+    scorer: CandidateScorer,
     paths: Paths,
-    shaded: Tensor,
+    visible_waves: Tensor,
     room: Tensor,
     generator: torch.Generator,
     *,
@@ -75,19 +75,19 @@ def find_box(
     seeds: Tensor | None = None,
     strongest: int = 24,
 ) -> tuple[Tensor, float]:
-    """The box (6,) whose shadow explains most, and the nats it would gain.
+    """The box (6,) whose shadow explains most, and its gain [nats].
 
     Args:
-        explained: what is left.
+        scorer: what is left.
         paths: of all K sources.
-        shaded: (n, K) complex, waves of the sources as they are seen now.
+        visible_waves: (n, K) complex, waves of the sources under the present clutter.
         room: (2, 3) [m], where boxes may be.
         generator: of the candidates.
         draws, parents: random boxes, and how many of them evolve.
         seeds: (s, 6) more parents.
-        strongest: sources that are looked at.
+        strongest: number of sources used.
     """
-    waves = shaded * explained.gains
+    waves = visible_waves * scorer.gains
     chosen = waves.abs().square().sum(0).topk(min(strongest, waves.shape[1])).indices
     few, waves = paths.take(chosen), waves[:, chosen]
 
@@ -98,7 +98,7 @@ def find_box(
             lost = torch.complex(
                 torch.einsum("bkn,nk->nb", hidden, waves.real), torch.einsum("bkn,nk->nb", hidden, waves.imag)
             )
-            scores.append(explained.score(-lost))
+            scores.append(scorer.score(-lost))
         return torch.cat(scores)
 
     def repaired(boxes: Tensor) -> Tensor:

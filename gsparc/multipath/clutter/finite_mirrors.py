@@ -1,7 +1,7 @@
-"""Mirrors that end: the best patch on a known plane, and small mirrors parallel to known walls.
+"""Finite mirrors: the best patch on a known plane, and small mirrors parallel to known walls.
 
-A table top is seen in by few receivers: looked for as a source seen by all, it drowns. Looked for as a patch,
-every receiver whose reflection would lie elsewhere is left out of the sum.
+Few receivers see a reflection in a table top: as a source visible to all it stays below the noise. As a
+patch, only receivers whose reflection point lies on it are summed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import tangents, within
 from gsparc.multipath.clutter.boxes import BLOCK, Evolution, evolve
-from gsparc.multipath.clutter.residual import Explained
+from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
 from gsparc.physics.mirror_planes import Word, reflect
@@ -25,24 +25,24 @@ from gsparc.physics.waves import LIGHT, NEAR_M
 log = logging.getLogger(__name__)
 
 SMALLEST, LARGEST = 0.2, 3.0  # [m] sides of random patches
-LEAST_SIDE = 0.05  # [m]
-PARALLEL = 0.999  # cosine of normals that are one
-CELL = 0.35  # [m] of the raster on which small mirrors are looked for
-STEP = 0.08  # of a wavelength, between planes tried
+MIN_SIDE = 0.05  # [m]
+PARALLEL = 0.999  # cosine of normals that are taken as equal
+CELL = 0.35  # [m], of the raster that small mirrors are searched on
+STEP = 0.08  # of a wavelength, between candidate planes
 BEHIND = 0.4  # [m], how far behind the receivers' box planes are tried
-LONGEST = 6  # cells along each side of a rectangle
-MOST_CELLS = 2e8  # of all rasters along one wall's normal; a site with more is no room
+MAX_SPAN = 6  # cells along each side of a rectangle
+MAX_CELLS = 2e8  # of all rasters along one wall's normal; larger sites are not searched
 BLOCK_CELLS = 2e7  # of the rasters held at a time, four numbers each
-TINY = 4  # receivers that a small mirror must serve
+MIN_SERVED = 4  # receivers with a reflection in a small mirror, at least
 
 
 def find_patch(
-    explained: Explained,
+    scorer: CandidateScorer,
     paths: Paths,
     words: tuple[Word, ...],
     number: int,
     plane: Tensor,
-    shaded: Tensor,
+    visible_waves: Tensor,
     room: Tensor,
     generator: torch.Generator,
     draws: int = 300,
@@ -50,17 +50,17 @@ def find_patch(
     """The patch (4,) on plane `number` that, were its words seen only in it, explains most; and its nats.
 
     Args:
-        explained: what is left.
+        scorer: what is left.
         paths: of all K sources.
         words: of the sources.
         number, plane: (4,) which.
-        shaded: (n, K) complex, waves of the sources as they are seen now.
+        visible_waves: (n, K) complex, waves of the sources as they are seen now.
         room: (2, 3) [m].
         generator: of the candidates.
         draws: random patches, of which the best evolve.
     """
     mine = [k for k, word in enumerate(words) if number in word]
-    few, waves = paths.take(mine), shaded[:, mine]
+    few, waves = paths.take(mine), visible_waves[:, mine]
     along = tangents(plane)
     met, here = few.end @ along.T, few.letter == number
     ends = room @ along.T
@@ -72,7 +72,7 @@ def find_patch(
             inside = within(met, part)
             seen = torch.where(here, inside, torch.ones_like(inside)).prod(-1)
             scores.append(
-                explained.score(
+                scorer.score(
                     torch.complex(
                         torch.einsum("bkn,nk->nb", seen, waves.real),
                         torch.einsum("bkn,nk->nb", seen, waves.imag),
@@ -82,7 +82,7 @@ def find_patch(
         return torch.cat(scores)
 
     def repaired(patches: Tensor) -> Tensor:
-        lower = torch.minimum(patches[:, :2], patches[:, 2:] - LEAST_SIDE)
+        lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
         return torch.cat([torch.maximum(lower, low), torch.minimum(patches[:, 2:], high)], 1)
 
     middle = low + (high - low) * torch.rand(draws, 2, generator=generator)
@@ -99,7 +99,7 @@ class SmallMirror:
     Attributes:
         plane: (4,) float64.
         patch: (4,) float32, along its tangents.
-        score: nats that its words together would gain, about.
+        score: approximate gain of its words together [nats].
     """
 
     plane: Tensor
@@ -124,7 +124,7 @@ def directions(planes: Tensor, numbers: list[int]) -> Tensor:
 
 def find_mirrors(
     rows: Rows,
-    explained: Explained,
+    scorer: CandidateScorer,
     transmitter: Tensor,
     planes: Tensor,
     numbers: list[int],
@@ -135,20 +135,20 @@ def find_mirrors(
 
     For every plane of a comb along every wall's normal, the sums `a^H K^-1 y` of its words (itself, after and
     before each wall) are collected in a raster of where it is met; integral images give every rectangle.
-    In a site so wide, or of waves so short, that these are more than `MOST_CELLS` none is looked for.
+    Sites whose rasters have more than `MAX_CELLS` are not searched.
 
     Args:
         rows: n.
-        explained: what is left.
+        scorer: what is left.
         transmitter: (3,) float64 [m].
         planes, numbers: (P, 4), and which of them are walls.
         room: (2, 3) [m], where mirrors may be.
         most: of them.
     """
     wavelength = LIGHT / float(rows.frequency.mean())
-    pulled, known = explained.pulled, planes[numbers]
+    alpha, known = scorer.alpha, planes[numbers]
     found: list[SmallMirror] = []
-    scale = explained.root.square().sum(0).view(2, -1).mean(0)  # what a row knows, diagonal of K^-1
+    scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # of rows, diagonal of K^-1
     for normal in directions(planes, numbers):
         ends = (room.double() @ normal).sort().values
         offsets = torch.arange(
@@ -156,13 +156,14 @@ def find_mirrors(
         )
         candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
         each = math.prod(_cells(room, tangents(candidates[0]))) * (1 + 2 * len(known))
-        if each * len(candidates) > MOST_CELLS:
+        if each * len(candidates) > MAX_CELLS:
             log.info(
-                "small mirrors are not looked for: %.0e cells in a site this wide", each * len(candidates)
+                "no search for small mirrors: %.0e raster cells at this site and wavelength",
+                each * len(candidates),
             )
             continue
         parts = [
-            _raster(rows, pulled, scale, transmitter, block, known, room)
+            _raster(rows, alpha, scale, transmitter, block, known, room)
             for block in candidates.split(max(1, int(BLOCK_CELLS / each)))
         ]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -189,7 +190,7 @@ def _apart(found: list[SmallMirror], least: float) -> list[SmallMirror]:
 
 def _raster(
     rows: Rows,
-    pulled: Tensor,
+    alpha: Tensor,
     scale: Tensor,
     transmitter: Tensor,
     candidates: Tensor,
@@ -206,7 +207,7 @@ def _raster(
         cell = ((met @ along.T - low) / CELL).floor().long()
         inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
         index = (cell[..., 0] * cells[1] + cell[..., 1]).clamp(0, cells[0] * cells[1] - 1)
-        own = wave.conj() * pulled
+        own = wave.conj() * alpha
         for values, into in ((own.real, matched), (own.imag, matched)):
             into.append(_binned(values * inside, index, cells))
         power.append(_binned(wave.abs().square() * scale * inside, index, cells))
@@ -214,7 +215,7 @@ def _raster(
     sums = [_integral(torch.stack(t)) for t in (matched[::2], matched[1::2], power, served)]
     total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
     # a few cells, or all there are: a wall that was missed
-    sizes = [sorted({*range(1, min(LONGEST, count) + 1), count}) for count in cells]
+    sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
     for wide, high_by in product(*sizes):
         real, imag, energy, count = (
             s[..., wide:, high_by:] - s[..., :-wide, high_by:] - s[..., wide:, :-high_by]
@@ -222,7 +223,7 @@ def _raster(
             for s in sums
         )  # fmt: skip
         score = (real.square() + imag.square()) / energy.clamp_min(1e-3) / 2
-        summed = ((score - 1).clamp_min(0) * (count >= TINY)).sum(0)  # words add up: (C, u, v)
+        summed = ((score - 1).clamp_min(0) * (count >= MIN_SERVED)).sum(0)  # words add up: (C, u, v)
         value, at = summed.flatten(1).max(1)
         first = torch.stack([at // summed.shape[2], at % summed.shape[2]], 1)
         span = torch.tensor([wide, high_by])

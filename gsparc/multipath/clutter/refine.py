@@ -1,7 +1,7 @@
-"""Boxes, patches and amplitudes moved together, what varies from place to place held.
+"""Joint descent on boxes, patches and amplitudes, with the varying part of the gains held.
 
-Planes and phases move only where they are new: of the others the part that varies is held where it was, and
-would go on explaining what the constant part has left.
+Planes and phases move only where they are new: the varying part of the others stays where it was and would
+explain what the moved constant part leaves.
 """
 
 from __future__ import annotations
@@ -12,27 +12,27 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsparc.multipath.clutter.blocking import SOFT, Clutter, shade
+from gsparc.multipath.clutter.blocking import SOFT, Clutter, visible_share
 from gsparc.multipath.clutter.residual import Residual
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.phased_gp import PhasedScene
 from gsparc.physics.mirror_planes import Word, images
 
-ALIKE = 0.7  # standard deviation of the sources' log amplitudes about their mean
-SLOWER = 0.97  # factor of all step sizes from step to step
+AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
+STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
 
 @dataclass(frozen=True)
-class Accord:
-    """How alike mirrors turn the phase: source k's is von Mises about `expected`.
+class ReflectionPhasePrior:
+    """Prior of phases by reflection order: that of source k is von Mises about `expected`.
 
-    Materials are nearly lossless or nearly opaque, so a reflection turns by about 0 or pi, the same for most
-    walls of a room. Knowing that tells where a wall is that few receivers see: were its phase free, it could
-    slide along its normal.
+    Materials are nearly lossless or nearly opaque, so the phase shift of a reflection is about 0 or pi, the
+    same for most walls of a room. This fixes the offset of a wall that few receivers see, which a free phase
+    would leave ambiguous.
 
     Attributes:
-        turn: of each reflection, 0 or pi [rad].
+        turn: phase shift of a reflection, 0 or pi [rad].
         concentration: kappa, by Best and Fisher's approximation from the mean resultant length (N. I. Fisher,
             "Statistical Analysis of Circular Data", 1993, section 4.5).
     """
@@ -41,18 +41,18 @@ class Accord:
     concentration: float
 
     @staticmethod
-    def of(phased: PhasedScene) -> Accord:
-        """From a scene's phases, strong sources counting most."""
+    def of(phased: PhasedScene) -> ReflectionPhasePrior:
+        """From a scene's phases, weighted by power."""
         order = torch.tensor([len(word) for word in phased.scene.words])
         if len(order) < 4:
-            return Accord(0.0, 0.0)
+            return ReflectionPhasePrior(0.0, 0.0)
         power = phased.scene.log_amplitude.mul(2).exp() * (order > 0)
         share, turn = max(
             (float((power * (phased.phase - phased.phase[0] - order * t).cos()).sum() / power.sum()), t)
             for t in (0.0, math.pi)
         )
         share = min(max(share, 0.0), 0.97)
-        return Accord(turn, share * (2 - share**2) / (1 - share**2))
+        return ReflectionPhasePrior(turn, share * (2 - share**2) / (1 - share**2))
 
     def expected(self, first: Tensor, words: tuple[Word, ...]) -> Tensor:
         """Phases (K,) of words, given the transmitter's own."""
@@ -64,7 +64,7 @@ class Accord:
 
 
 @dataclass(frozen=True)
-class Pace:
+class StepSizes:
     """Step sizes of Adam.
 
     Attributes:
@@ -86,27 +86,27 @@ def descend(
     paths: Paths,
     steps: int,
     soft: float = SOFT,
-    pace: Pace = Pace(),
-    accord: Accord = Accord(0.0, 0.0),
+    step_sizes: StepSizes = StepSizes(),
+    phase_prior: ReflectionPhasePrior = ReflectionPhasePrior(0.0, 0.0),
 ) -> PhasedScene:
-    """The most likely of the scenes met in `steps` steps; paths are those of the start."""
+    """The most likely scene of `steps` steps; paths are those of the start."""
     scene, rows = phased.scene, residual.rows
     start = (
         scene.clutter.boxes, scene.clutter.patches, scene.planes, phased.phase, scene.log_amplitude,
     )  # fmt: skip
     values = [v.clone().requires_grad_() for v in start]
-    rates = (pace.edge, pace.edge, pace.plane, pace.phase, pace.logarithm)
+    rates = (step_sizes.edge, step_sizes.edge, step_sizes.plane, step_sizes.phase, step_sizes.logarithm)
     groups = [{"params": [v], "lr": rate} for v, rate in zip(values, rates, strict=True)]
     optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
-        seen = shade(paths, Clutter(boxes, patches, scene.clutter.plane), scene.planes, soft)
+        seen = visible_share(paths, Clutter(boxes, patches, scene.clutter.plane), scene.planes, soft)
         waves = steering(rows, images(scene.transmitter, planes, scene.words))
         waves = waves * torch.polar(torch.ones(()), phase)
-        away = (log_amplitude - log_amplitude.mean().detach()) / ALIKE
-        cost = residual.nll(seen, log_amplitude, waves) + away.square().sum() / 2
-        cost = cost + accord.cost(phase, scene.words)
+        deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
+        cost = residual.nll(seen, log_amplitude, waves) + deviation.square().sum() / 2
+        cost = cost + phase_prior.cost(phase, scene.words)
         if cost.item() < lowest:
             lowest, best = cost.item(), [v.detach().clone() for v in values]
         if step == steps:
@@ -119,7 +119,7 @@ def descend(
                 value.grad[:count] = 0
         optimizer.step()
         for group in optimizer.param_groups:
-            group["lr"] *= SLOWER
+            group["lr"] *= STEP_DECAY
     clutter = Clutter(best[0], best[1], scene.clutter.plane)
     moved = replace(scene, planes=best[2], log_amplitude=best[4], clutter=clutter)
     return replace(phased, scene=moved, phase=best[3])

@@ -1,8 +1,8 @@
-"""What is left to explain, and how much another box, patch or source would explain of it.
+"""Residual of a scene, and the gain of another box, patch or source.
 
-The process of `gsparc.multipath.phased_gp` with its covariance in two parts: what varies from place to
-place and the noise, factored once and held, and the sources' constant gains, a few columns that change with
-every move of a box and are added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
+The process of `gsparc.multipath.phased_gp` with its covariance in two parts: varying gains and noise,
+factored once and held, and the sources' constant gains, a low-rank part that changes with every move of a box
+and is added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from torch import Tensor
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, View
+from gsparc.multipath.visibility_kernel import View
 
-TRIED = 1.5  # factor between two noise variances tried
-LEAST_NOISE = 3e-4  # variance, in units of the rows' power; less is only found where a search is wrong
-CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # shares tried
+TRIED = 1.5  # factor between two candidates of the noise variance
+LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
+CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # candidates
 
 
 class Residual:
-    """Rows of one output against a phased scene with a `KernelVisibility`; n rows are 2 n real numbers.
+    """Rows of one output against a phased scene; n rows are 2 n real numbers.
 
     Args:
         rows: R = 1.
-        phased: its clutter shades what varies; the constant part is shaded by whoever asks.
+        phased: its clutter attenuates the varying part; callers pass the visible shares of the constant part.
         noise_floor: known variance of the noise, in units of the rows' power.
 
     Attributes:
@@ -38,7 +38,7 @@ class Residual:
     def __init__(self, rows: Rows, phased: PhasedScene, noise_floor: float = JITTER) -> None:
         self.rows, self.noise_floor = rows, noise_floor
         self.target = stacked(rows.target)[0][:, 0]
-        self.waves = phased.unshaded(rows)
+        self.waves = phased.unobstructed(rows)
         self._cached = self._parts(phased)
         self.phased = self._tuned(phased)
         self._factor(self.phased)
@@ -47,25 +47,28 @@ class Residual:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         n, scene = len(self.rows), phased.scene
         scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
-        law = _law(phased)
+        kernel = phased.scene.visibility
         varying = torch.zeros(2, n, 2, n)
         for k, source in enumerate(scene.sources):
             view = View.of(self.rows.position, source)
             add_source(
-                varying, scaled[:, k], phased.turning, replace(law, constant=0.0).correlation(view, view)
+                varying,
+                scaled[:, k],
+                phased.quadrature,
+                replace(kernel, constant=0.0).correlation(view, view),
             )
         across = stacked(scaled)[1]
-        return varying.view(2 * n, 2 * n), shares(phased.turning)[1] * (across @ across.T)
+        return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
 
     def _tuned(self, phased: PhasedScene) -> PhasedScene:
-        """Constant share and noise of the likelihood's choice, one after the other on a grid."""
+        """Constant share and noise by likelihood, in turn on a grid."""
         columns = stacked(phased.waves(self.rows) * phased.scene.log_amplitude.exp())[0]
-        law, noise = _law(phased), phased.scene.log_noise
-        constant = min(CONSTANTS, key=lambda c: abs(c - float(law.constant)))
+        kernel, noise = phased.scene.visibility, phased.scene.log_noise
+        constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
 
         def cost(constant: float, noise: float) -> float:
-            self._factored(constant, noise, phased.turning)
-            return self._nll(columns * self._constant(constant, phased.turning)).item()
+            self._factored(constant, noise, phased.quadrature)
+            return self._nll(columns * self._constant(constant, phased.quadrature)).item()
 
         best = cost(constant, noise)
         for _ in range(2):
@@ -77,19 +80,19 @@ class Residual:
             for step in (-math.log(TRIED), math.log(TRIED)):
                 while noise + step > math.log(LEAST_NOISE) and (new := cost(constant, noise + step)) < best:
                     best, noise = new, noise + step
-        scene = replace(phased.scene, visibility=replace(law, constant=constant), log_noise=noise)
+        scene = replace(phased.scene, visibility=replace(kernel, constant=constant), log_noise=noise)
         return replace(phased, scene=scene)
 
     def _factor(self, phased: PhasedScene) -> None:
-        constant = float(_law(phased).constant)
-        self._factored(constant, phased.scene.log_noise, phased.turning)
-        self.share = self._constant(constant, phased.turning)
+        constant = float(phased.scene.visibility.constant)
+        self._factored(constant, phased.scene.log_noise, phased.quadrature)
+        self.share = self._constant(constant, phased.quadrature)
         eye = torch.eye(len(self.target))
         self.root = torch.linalg.solve_triangular(self._lower, eye, upper=False)
         self.white = self.root @ self.target
         del self._cached, self._lower
 
-    def _factored(self, constant: float, noise: float, turning: float) -> None:
+    def _factored(self, constant: float, noise: float, quadrature: float) -> None:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
@@ -98,57 +101,59 @@ class Residual:
         self._white = torch.linalg.solve_triangular(self._lower, self.target[:, None], upper=False)[:, 0]
 
     @staticmethod
-    def _constant(constant: float, turning: float) -> float:
-        return math.sqrt(constant * (1 - turning / 2))
+    def _constant(constant: float, quadrature: float) -> float:
+        return math.sqrt(constant * (1 - quadrature / 2))
 
     def _nll(self, columns: Tensor) -> Tensor:
         whitened = torch.linalg.solve_triangular(self._lower, columns, upper=False)
         return _cost(whitened, self._white, self._determinant)
 
-    # ---- the constant part, shaded ----
-    def columns(self, shade: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+    # ---- the constant part ----
+    def columns(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
         """Constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
-        scaled = (self.waves if waves is None else waves) * (shade.T * log_amplitude.exp() * self.share)
+        scaled = (self.waves if waves is None else waves) * (
+            visible_share.T * log_amplitude.exp() * self.share
+        )
         return self.root @ torch.cat([scaled.real, scaled.imag])
 
-    def nll(self, shade: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+    def nll(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
         """Negative log likelihood (), in nats; differentiable."""
-        return _cost(self.columns(shade, log_amplitude, waves), self.white, self._determinant)
+        return _cost(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
 
-    def gains_of_each(self, shade: Tensor, log_amplitude: Tensor) -> Tensor:
-        """What the likelihood would lose without each source's constant part (K,) [nats]."""
-        columns = self.columns(shade, log_amplitude)
+    def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
+        """Log likelihood lost without each source's constant part (K,) [nats]."""
+        columns = self.columns(visible_share, log_amplitude)
         inner = columns.T @ columns + torch.eye(columns.shape[1])
         inverse = torch.linalg.inv(inner)
         mean = inverse @ (columns.T @ self.white)
         spread = inverse.diagonal()
         return 0.5 * (mean.square() / spread + spread.log())
 
-    def explained(self, shade: Tensor, log_amplitude: Tensor) -> Explained:
-        """The constant parts at their posterior means, taken out."""
-        columns = self.columns(shade, log_amplitude)
+    def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
+        """Scorer of candidates, with the constant parts at their posterior means removed."""
+        columns = self.columns(visible_share, log_amplitude)
         lower = torch.linalg.cholesky(columns.T @ columns + torch.eye(columns.shape[1]))
         mean = torch.cholesky_solve((columns.T @ self.white)[:, None], lower)[:, 0]
-        taken = torch.linalg.solve_triangular(lower, columns.T, upper=False)
+        projection = torch.linalg.solve_triangular(lower, columns.T, upper=False)
         gains = mean * self.share * log_amplitude.exp()
-        return Explained(self.root, taken, self.white - columns @ mean, gains)
+        return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
 
-class Explained:
-    """Residual after the constant parts, and scores of what could be added to them.
+class CandidateScorer:
+    """Residual after the constant parts, and gains of candidate changes.
 
     Attributes:
         gains: (K,) float32, posterior mean of each source's constant gain along its phase.
     """
 
-    def __init__(self, root: Tensor, taken: Tensor, left: Tensor, gains: Tensor) -> None:
-        self.root, self.taken, self.left, self.gains = root, taken, left, gains
+    def __init__(self, root: Tensor, projection: Tensor, residual: Tensor, gains: Tensor) -> None:
+        self.root, self.projection, self.residual, self.gains = root, projection, residual, gains
 
     @property
-    def pulled(self) -> Tensor:
-        """K^-1 y (n,) complex64, constant parts taken out."""
-        n = len(self.left) // 2
-        both = self.root.T @ self.left
+    def alpha(self) -> Tensor:
+        """K^-1 y (n,) complex64, constant parts removed."""
+        n = len(self.residual) // 2
+        both = self.root.T @ self.residual
         return torch.complex(both[:n], both[n:])
 
     def score(self, change: Tensor) -> Tensor:
@@ -158,19 +163,19 @@ class Explained:
     def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """The same, and the multiples (M,)."""
         whitened = self.root @ torch.cat([change.real, change.imag])
-        power = whitened.square().sum(0) - (self.taken @ whitened).square().sum(0)
-        matched = (self.left @ whitened).clamp_min(0)
+        power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
+        matched = (self.residual @ whitened).clamp_min(0)
         multiple = torch.where(power > 1e-2, matched / power.clamp_min(1e-2), 0.0)
         return multiple * matched / 2, multiple
 
     def score_waves(self, waves: Tensor) -> tuple[Tensor, Tensor]:
         """Nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
         parts = [self.root @ part for part in stacked(waves)]
-        seen = [self.taken @ part for part in parts]
+        seen = [self.projection @ part for part in parts]
         dot = [
             [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)] for i in range(2)
         ]
-        along, across = (self.left @ part for part in parts)
+        along, across = (self.residual @ part for part in parts)
         determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(1e-9)
         gain = torch.complex(
             (dot[1][1] * along - dot[0][1] * across) / determinant,
@@ -184,10 +189,3 @@ def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
     lower = torch.linalg.cholesky(inner)
     fit = torch.linalg.solve_triangular(lower, (columns.T @ white)[:, None], upper=False)
     return determinant + lower.diagonal().log().sum() + 0.5 * (white.square().sum() - fit.square().sum())
-
-
-def _law(phased: PhasedScene) -> KernelVisibility:
-    law = phased.scene.visibility
-    if not isinstance(law, KernelVisibility):
-        raise TypeError(f"furniture is learned beside KernelVisibility, not {type(law).__name__}")
-    return law

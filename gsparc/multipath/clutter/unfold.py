@@ -1,8 +1,8 @@
-"""Words unfolded into the straight legs of their paths, from receiver back to transmitter.
+"""Unfold reflection words into the straight legs of their paths, from receiver to transmitter (image method).
 
-The path of word (i, j) leaves the receiver towards the image of the whole word, meets plane j there, goes on
-towards the image of (i,), and so on. Of perpendicular mirrors both orders have the same image; which of them
-a receiver sees follows from where the line to the image meets the planes first.
+The path of word (i, j) leaves the receiver towards the image of the whole word, meets plane j there,
+continues towards the image of (i,), and so on. Of perpendicular mirrors both orders have the same image;
+which of them a receiver sees follows from where the line to the image meets the planes first.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from torch import Tensor
 
 from gsparc.physics.mirror_planes import Word, images, reflect
 
-SAME_M = 0.05  # spellings whose images are closer are the same source
-EDGE = 1e-6  # a plane is met between both ends of a leg, give or take
+SAME_M = 0.05  # [m], words of the same planes whose images are closer are the same source
+EDGE = 1e-6  # tolerance of the intersection of a leg with a plane
 
 
 @dataclass(frozen=True)
@@ -41,14 +41,14 @@ class Paths:
 
 @dataclass(frozen=True)
 class Unfolding:
-    """All spellings of K words, ready to be unfolded from anywhere.
+    """All orders of the planes of K words with the same image, prepared for unfolding.
 
     Attributes:
         chain: (K, M, L, 3) float32 [m]; entry l is the image after l letters.
         normal: (K, M, L - 1, 3) float32 unit normals of the letters' planes.
         offset: (K, M, L - 1) float32 [m].
         letter: (K, M, L - 1), -1 beyond the word's end.
-        given: (K, M) bool, whether there is such a spelling.
+        given: (K, M) bool, whether the entry exists.
     """
 
     chain: Tensor
@@ -60,11 +60,11 @@ class Unfolding:
     @staticmethod
     def of(transmitter: Tensor, planes: Tensor, words: tuple[Word, ...]) -> Unfolding:
         """From a scene's transmitter (3,), planes (P, 4) and words."""
-        spellings = _spellings(transmitter, planes, words)
-        most, order = max(map(len, spellings)), max(map(len, words), default=0)
+        variants = _equivalent_words(transmitter, planes, words)
+        most, order = max(map(len, variants)), max(map(len, words), default=0)
         letter = torch.full((len(words), most, order), -1)
         given = torch.zeros(len(words), most, dtype=torch.bool)
-        for k, mine in enumerate(spellings):
+        for k, mine in enumerate(variants):
             for m, word in enumerate(mine):
                 letter[k, m, : len(word)] = torch.tensor(word, dtype=torch.long)
                 given[k, m] = True
@@ -79,11 +79,11 @@ class Unfolding:
         return Unfolding(torch.stack(chain, 2).float(), normal, used[..., 3].float(), letter, given)
 
     @staticmethod
-    def beside(many: list[Unfolding]) -> Unfolding:
-        """Of several scenes, whose letters have been numbered on."""
-        spellings = max(u.letter.shape[1] for u in many)
+    def concatenate(many: list[Unfolding]) -> Unfolding:
+        """Of several scenes, with consecutive plane indices."""
+        variants = max(u.letter.shape[1] for u in many)
         order = max(u.letter.shape[2] for u in many)
-        padded = [u.padded(spellings, order) for u in many]
+        padded = [u.padded(variants, order) for u in many]
         return Unfolding(
             *(
                 torch.cat([getattr(u, name) for u in padded])
@@ -91,10 +91,10 @@ class Unfolding:
             )
         )
 
-    def padded(self, spellings: int, order: int) -> Unfolding:
-        """With room for more spellings and letters."""
+    def padded(self, variants: int, order: int) -> Unfolding:
+        """With room for more variants and letters."""
         pad = torch.nn.functional.pad
-        more, longer = spellings - self.letter.shape[1], order - self.letter.shape[2]
+        more, longer = variants - self.letter.shape[1], order - self.letter.shape[2]
         chain = torch.cat([self.chain, self.chain[:, :, -1:].expand(-1, -1, longer, -1)], 2)
         return Unfolding(
             pad(chain, (0, 0, 0, 0, 0, more)),
@@ -104,8 +104,8 @@ class Unfolding:
             pad(self.given, (0, more)),
         )
 
-    def numbered_from(self, first: int) -> Unfolding:
-        """Letters moved up by `first`."""
+    def with_offset(self, first: int) -> Unfolding:
+        """Plane indices increased by `first`."""
         return replace(self, letter=torch.where(self.letter >= 0, self.letter + first, -1))
 
     def paths(self, places: Tensor) -> Paths:
@@ -131,7 +131,7 @@ class Unfolding:
         starts.append(here)
         ends.append(self.chain[:, :, None, 0].expand_as(here))
         letters.append(torch.full(shape, -1))
-        chosen = valid.int().argmax(1)  # the first valid spelling, else the first
+        chosen = valid.int().argmax(1)  # the first valid variant, else the first
         return Paths(
             _pick(torch.stack(starts, -2), chosen),
             _pick(torch.stack(ends, -2), chosen),
@@ -141,14 +141,14 @@ class Unfolding:
 
 
 def _pick(values: Tensor, chosen: Tensor) -> Tensor:
-    """(K, M, n, ...) at spelling `chosen` (K, n)."""
+    """(K, M, n, ...) at variant `chosen` (K, n)."""
     if values.shape[1] == 1:
         return values[:, 0]
     index = chosen[:, None].reshape(len(chosen), 1, -1, *[1] * (values.dim() - 3))
     return values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]
 
 
-def _spellings(transmitter: Tensor, planes: Tensor, words: tuple[Word, ...]) -> list[list[Word]]:
+def _equivalent_words(transmitter: Tensor, planes: Tensor, words: tuple[Word, ...]) -> list[list[Word]]:
     """Each word, then its permutations with the same image."""
     found = []
     for word in words:

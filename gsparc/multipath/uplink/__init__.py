@@ -1,1 +1,1 @@
-"""The sources heard in a fresh uplink: the channel of the other half of the band follows from them."""
+"""Plane-wave sources of an uplink snapshot, extrapolated to the downlink's band."""

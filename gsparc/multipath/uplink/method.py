@@ -1,4 +1,4 @@
-"""`model=uplink`: find the sources in the fresh uplink, hear them again in the downlink's band."""
+"""`model=uplink`: plane-wave sources estimated in each uplink snapshot, extrapolated to the downlink."""
 
 from __future__ import annotations
 
@@ -15,28 +15,34 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, Prediction
 from gsparc.methods.uplink_method import UplinkMethod
-from gsparc.multipath.uplink.error_model import Heard, Trust, learn, signs, unheard_noise
+from gsparc.multipath.uplink.error_model import (
+    ErrorModel,
+    SearchResult,
+    error_features,
+    estimate_noise,
+    fit_error_model,
+)
 from gsparc.multipath.uplink.posterior import Sources
 from gsparc.multipath.uplink.search import SearchSettings, SourceSearch
 from gsparc.physics.plane_waves import Aperture, flat_places, mean_delay, phasor
+from gsparc.physics.waves import LIGHT
 
-LIGHT = 299_792_458.0  # [m/s]
 CHUNK = 32  # snapshots searched together
 LEAKAGES = (1e-4, 3e-4, 1e-3)
-PIECES, PIECE_TONES = 4, 5  # of the downlink, one antenna each, that the confidence is also learned on
+PIECES, PIECE_TONES = 4, 5  # of the downlink, one antenna each, added to the error model's training set
 
 
 class UplinkField(UplinkMethod):
-    """A field of plane-wave sources, found anew in every snapshot.
+    """Plane-wave sources, estimated in every snapshot.
 
-    Directions and delays are the same in both halves of a band; only their interference differs. What is
-    learned from training snapshots is how much the hardware leaks, and how wrong a set of sources will be.
+    Directions and delays are the same in both halves of a band; only their interference differs.
+    Training snapshots set the hardware's leakage and the error model.
 
     Args:
-        search: how sources are looked for.
-        teachers: training snapshots that the confidence is learned from, at most.
-        shrink: pull predictions towards zero by the error that is to be expected.
-        seed: of the draw of the teachers.
+        search: source search.
+        teachers: largest number of training snapshots of the error model.
+        shrink: shrink predictions towards zero by the expected error.
+        seed: of the subsample of training snapshots.
     """
 
     name = "uplink"
@@ -52,64 +58,64 @@ class UplinkField(UplinkMethod):
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
         self.settings, self.teachers = search or SearchSettings(), teachers
         self.shrink, self.seed = shrink, seed
-        self.trust: Trust | None = None
+        self.error_model: ErrorModel | None = None
 
-    # ---- learning ----
+    # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Choose the leakage on validation rows, learn the confidence on training rows."""
+        """Choose the leakage on validation rows, fit the error model on training rows."""
         started = time.perf_counter()
         self.site = self._need_uplink(data)
-        self.trust = None
+        self.error_model = None
         rng = np.random.default_rng(self.seed)
         few = rng.permutation(fold.val if len(fold.val) else fold.train)[:100]
         errors = {}
         for leakage in LEAKAGES:
             self._prepare(self.site, replace(self.settings, leakage=leakage))
-            errors[leakage] = float(np.median(self._taught(data, few, rng, 0)[1]))
+            errors[leakage] = float(np.median(self._training_errors(data, few, rng, 0)[1]))
         best = min(errors, key=lambda leakage: errors[leakage])
         self._prepare(self.site, replace(self.settings, leakage=best))
-        # Nothing of the search is fitted to training rows: their errors are as honest as any.
+        # The search is not fitted to training rows: their errors are unbiased.
         rows = rng.permutation(fold.train)[: self.teachers]
-        self.trust = learn(*self._taught(data, rows, rng, PIECES))
+        self.error_model = fit_error_model(*self._training_errors(data, rows, rng, PIECES))
         note = f"uplink: leakage {best:g} chosen on {len(few)} validation snapshots"
         return FitReport(time.perf_counter() - started, (note,))
 
     @torch.no_grad()
-    def _taught(
+    def _training_errors(
         self, data: Measurements, rows: np.ndarray, rng: np.random.Generator, pieces: int
     ) -> tuple[Tensor, Tensor]:
-        """Signs (n, S) and relative errors (n,) of snapshots whose downlink is known, whole and in pieces.
+        """Error features (n, S) and relative errors (n,) of training snapshots, whole and in pieces.
 
-        Pieces are one antenna and a few tones: whoever asks for a narrow grid on one antenna meets fades
-        that the whole downlink never shows.
+        Pieces are one antenna and a few tones: narrow grids of one antenna fade deeper than the whole
+        downlink.
         """
-        seen, wrong = [], []
+        features, error = [], []
         whole = self._downlink
         antennas, tones = len(whole.places), len(whole.tones)
         for start in range(0, len(rows), CHUNK):
             batch = data.batch(rows[start : start + CHUNK])
             assert batch.uplink is not None
-            heard = self._hear(batch.uplink, batch.noise_variance)
+            result = self._search(batch.uplink, batch.noise_variance)
             views = [(slice(None), slice(None))]
             for _ in range(pieces if tones > PIECE_TONES else 0):
                 one, first = int(rng.integers(antennas)), int(rng.integers(tones - PIECE_TONES + 1))
                 views.append((slice(one, one + 1), slice(first, first + PIECE_TONES)))
-            everything = heard.sources.response(whole)
+            everything = result.sources.response(whole)
             for some, band in views:
                 aperture = Aperture(whole.places[some], whole.tones[band])
                 mean, true = everything[:, some, band], batch.target[:, some, band]
-                wrong.append(_power(mean - true) / _power(true).clamp_min(1e-30))
-                seen.append(signs(heard, mean, aperture))
-        return torch.cat(seen), torch.cat(wrong)
+                error.append(_power(mean - true) / _power(true).clamp_min(1e-30))
+                features.append(error_features(result, mean, aperture))
+        return torch.cat(features), torch.cat(error)
 
-    # ---- answering ----
+    # ---- predicting ----
     def sources(self, uplink: Tensor, noise: Tensor | None = None) -> Sources:
         """The sources of snapshots (B, U, L): directions, delays, gains."""
-        return self._hear(uplink, noise).sources
+        return self._search(uplink, noise).sources
 
     def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
         """See `UplinkMethod.listen`; the variance is the expected squared error per entry."""
-        return self._judged(uplink, noise, self._downlink)
+        return self._predict_at(uplink, noise, self._downlink)
 
     def listen_at(
         self,
@@ -120,25 +126,25 @@ class UplinkField(UplinkMethod):
     ) -> Prediction:
         """The same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
         tones = ((frequency_hz.double() - self._middle_hz) / self._spacing_hz).float()
-        return self._judged(uplink, noise, Aperture(self._downlink.places[antennas], tones))
+        return self._predict_at(uplink, noise, Aperture(self._downlink.places[antennas], tones))
 
-    def _judged(self, uplink: Tensor, noise: Tensor | None, aperture: Aperture) -> Prediction:
-        assert self.trust is not None
+    def _predict_at(self, uplink: Tensor, noise: Tensor | None, aperture: Aperture) -> Prediction:
+        assert self.error_model is not None
         with torch.inference_mode():  # a fifth less overhead in a single query
-            heard = self._hear(uplink, noise)
-            mean = heard.sources.response(aperture)
-            wrong = self.trust.expected(signs(heard, mean, aperture))
+            result = self._search(uplink, noise)
+            mean = result.sources.response(aperture)
+            error = self.error_model.expected(error_features(result, mean, aperture))
             if self.shrink:
-                mean = mean / (1 + wrong)[:, None, None]
-            variance = wrong * _power(mean)
-        mean, wrong, variance = (part.clone() for part in (mean, wrong, variance))  # ordinary tensors again
-        return Prediction(mean, confidence=1 / (1 + wrong), variance=variance)
+                mean = mean / (1 + error)[:, None, None]
+            variance = error * _power(mean)
+        mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
+        return Prediction(mean, confidence=1 / (1 + error), variance=variance)
 
-    def _hear(self, uplink: Tensor, noise: Tensor | None) -> Heard:
+    def _search(self, uplink: Tensor, noise: Tensor | None) -> SearchResult:
         aperture = self.search.aperture
         if noise is None:
-            noise = unheard_noise(uplink, aperture, self.settings.delay_window)
-        # Timing is the snapshot's own: delays are sought about their mean, and put back where they were.
+            noise = estimate_noise(uplink, aperture, self.settings.delay_window)
+        # Timing differs between snapshots: search delays about their mean, then add it back.
         mean = mean_delay(uplink)
         straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
         parts = [
@@ -148,7 +154,7 @@ class UplinkField(UplinkMethod):
         if len(parts) > 1:
             found = Sources(*(torch.cat([getattr(p, name) for p, _ in parts]) for name in vars(found)))
             left = torch.cat([rest for _, rest in parts])
-        return Heard(replace(found, delay=found.delay + mean[:, None]), left, uplink, noise)
+        return SearchResult(replace(found, delay=found.delay + mean[:, None]), left, uplink, noise)
 
     def _prepare(self, site: Site, settings: SearchSettings) -> None:
         assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
@@ -164,17 +170,17 @@ class UplinkField(UplinkMethod):
         chosen = torch.from_numpy(np.asarray(site.antennas))
         self._downlink = Aperture(places[chosen], tones(site.subcarriers_hz))
 
-    # ---- keeping ----
+    # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
-        trust = None if self.trust is None else vars(self.trust)
-        return {"search": asdict(self.search.settings), "trust": trust}
+        error_model = None if self.error_model is None else vars(self.error_model)
+        return {"search": asdict(self.search.settings), "trust": error_model}
 
     def restore(self, site: Site, state: Mapping[str, Any]) -> None:
         """See `Method.restore`."""
         self.site = site
         self._prepare(site, SearchSettings(**state["search"]))
-        self.trust = None if state["trust"] is None else Trust(**state["trust"])
+        self.error_model = None if state["trust"] is None else ErrorModel(**state["trust"])
 
     def size(self) -> int:
         """Sources of a snapshot."""

@@ -15,18 +15,18 @@ from torch import Tensor
 from gsparc.multipath.uplink.posterior import Sources
 from gsparc.physics.plane_waves import Aperture, Columns, delays, steering
 
-LEAST_SHARE = 1e-7  # of a snapshot's power that a source's prior keeps, so that nothing divides by zero
-UNEXPLAINED = 0.2  # of what a round leaves counts as noise: sources not found yet pull on those found
+LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
+UNEXPLAINED = 0.2  # of a round's residual that counts as noise: sources not found yet bias those found
 LARGEST_STEP = (0.06, 0.012)  # of direction cosines and of delays, a fraction of a resolution cell
-REACH = (0.03, 0.006)  # standard deviation of a step before anything is known: half a step of the grid
+REACH = (0.03, 0.006)  # prior standard deviation of a step: half a step of the grid
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """How sources are looked for.
+    """Source search.
 
     Attributes:
-        rounds: of looking at what is left over.
+        rounds: of matching pursuit.
         picks: new sources a round.
         refinements: joint steps after each round.
         final: joint steps at the end.
@@ -59,56 +59,56 @@ class SourceSearch:
         self._over_tones = delays(self.delays[None], aperture)[0].conj().T.contiguous()
 
     def __call__(self, snapshot: Tensor, noise: Tensor) -> tuple[Sources, Tensor]:
-        """Sources of snapshots (B, A, K) complex64 of noise power (B,); also what is left, (B, A, K)."""
+        """Sources of snapshots (B, A, K) complex64 of noise power (B,), and the residual (B, A, K)."""
         s = self.settings
         power = snapshot.abs().square().mean((1, 2))
         scale = power.sqrt().clamp_min(1e-30)
         y, noise = snapshot / scale[:, None, None], noise / power.clamp_min(1e-30) + s.leakage
         count = len(snapshot)
         direction, delay = snapshot.real.new_zeros(count, 0, 2), snapshot.real.new_zeros(count, 0)
-        prior, left = delay, y
+        prior, residual = delay, y
         for turn in range(s.rounds):
-            new_direction, new_delay = self._peaks(left)
+            new_direction, new_delay = self._peaks(residual)
             direction, delay = torch.cat([direction, new_direction], 1), torch.cat([delay, new_delay], 1)
             prior = torch.cat([prior, torch.full_like(new_delay, 1 / (s.rounds * s.picks))], 1)
             last = turn == s.rounds - 1
-            restless = noise + UNEXPLAINED * left.abs().square().mean((1, 2))
+            inflated_noise = noise + UNEXPLAINED * residual.abs().square().mean((1, 2))
             for _ in range(s.refinements + (s.final if last else 0)):
-                fit = self._fit(y, restless, direction, delay, prior)
-                turned, moved = self._step(fit, restless)
+                fit = self._fit(y, inflated_noise, direction, delay, prior)
+                turned, moved = self._step(fit, inflated_noise)
                 direction, delay = direction + turned, delay + moved
-                prior = (fit.gain.abs().square() + fit.variance(restless)).clamp_min(LEAST_SHARE)
+                prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(LEAST_SHARE)
             if not last:
-                left = y - fit.columns.response(fit.gain)
+                residual = y - fit.columns.response(fit.gain)
         fit = self._fit(y, noise, direction, delay, prior)
-        left = scale[:, None, None] * (y - fit.columns.response(fit.gain))
-        return self._found(fit, noise, direction, delay, scale), left
+        residual = scale[:, None, None] * (y - fit.columns.response(fit.gain))
+        return self._posterior(fit, noise, direction, delay, scale), residual
 
-    def _peaks(self, left: Tensor) -> tuple[Tensor, Tensor]:
+    def _peaks(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest local maxima of the correlation with the grid's atoms."""
-        score = torch.view_as_real(self._over_antennas @ (left @ self._over_tones)).square().sum(-1)
+        score = torch.view_as_real(self._over_antennas @ (residual @ self._over_tones)).square().sum(-1)
         cube = score.view(-1, *self.shape)
         peaks = torch.where(_largest_near(cube) == cube, cube, 0).flatten(1)
         at = peaks.topk(self.settings.picks, 1).indices
         return self.cosines[at // len(self.delays)], self.delays[at % len(self.delays)]
 
     def _fit(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
-        """Best gains of given sources, and which way their places should move."""
+        """Best gains of given sources, and the gradient by their directions and delays."""
         n = delay.shape[1]
         columns = Columns.of(direction, delay, self.aperture)
-        whole, heard = columns.gram(), columns.inner(y)
-        torch.diagonal(whole, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
-        cross, inverse = whole[:, n:, :n], torch.linalg.inv(whole[:, :n, :n])
-        gain = (inverse @ heard[:, :n, None])[..., 0]
-        loud = gain.repeat(1, 3)
-        slope = ((heard[:, n:] - (cross @ gain[..., None])[..., 0]) * loud.conj()).real
-        follow = cross @ inverse
-        projected = whole[:, n:, n:] - follow @ cross.mH
-        curvature = (projected * loud[:, None] * loud.conj()[..., None]).real
-        return _Fit(columns, gain, inverse, slope, curvature, follow)
+        gram, inner = columns.gram(), columns.inner(y)
+        torch.diagonal(gram, dim1=1, dim2=2)[:, :n].add_(noise[:, None] / prior)
+        cross, inverse = gram[:, n:, :n], torch.linalg.inv(gram[:, :n, :n])
+        gain = (inverse @ inner[:, :n, None])[..., 0]
+        gains = gain.repeat(1, 3)
+        slope = ((inner[:, n:] - (cross @ gain[..., None])[..., 0]) * gains.conj()).real
+        gain_slopes = cross @ inverse
+        projected = gram[:, n:, n:] - gain_slopes @ cross.mH
+        curvature = (projected * gains[:, None] * gains.conj()[..., None]).real
+        return _Fit(columns, gain, inverse, slope, curvature, gain_slopes)
 
     def _step(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on what the best gains leave."""
+        """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on the residual of the best gains."""
         n = fit.gain.shape[1]
         reach = self._reach(n)
         factor, _ = torch.linalg.cholesky_ex(self._scaled(fit, noise))
@@ -123,10 +123,12 @@ class SourceSearch:
         torch.diagonal(scaled, dim1=1, dim2=2).add_(noise[:, None])
         return scaled
 
-    def _found(self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor) -> Sources:
+    def _posterior(
+        self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor
+    ) -> Sources:
         """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
         reach = self._reach(fit.gain.shape[1])
-        loud = (fit.gain * scale[:, None]).repeat(1, 3)
+        gains = (fit.gain * scale[:, None]).repeat(1, 3)
         spread = torch.linalg.inv(self._scaled(fit, noise)) * (reach[:, None] * reach)
         return Sources(
             direction,
@@ -134,7 +136,7 @@ class SourceSearch:
             fit.gain * scale[:, None],
             fit.inverse * (noise * scale**2)[:, None, None],
             spread * (noise / 2)[:, None, None],
-            -(fit.follow.mH * loud[:, None]),
+            -(fit.gain_slopes.mH * gains[:, None]),
         )
 
     def _reach(self, count: int) -> Tensor:
@@ -144,7 +146,7 @@ class SourceSearch:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Gains of given sources, and the projected problem of their places (unit gains' columns made loud).
+    """Gains of given sources, and the projected problem of their places (columns of unit gains, scaled).
 
     Attributes:
         columns: atoms and slopes.
@@ -152,7 +154,7 @@ class _Fit:
         inverse: (B, N, N) of the regularised Gram matrix of the atoms.
         slope: (B, 3 N) downhill.
         curvature: (B, 3 N, 3 N).
-        follow: (B, 3 N, N) what the slopes of unit gains have in common with the gains' inverse.
+        gain_slopes: (B, 3 N, N) what the slopes of unit gains have in common with the gains' inverse.
     """
 
     columns: Columns
@@ -160,7 +162,7 @@ class _Fit:
     inverse: Tensor
     slope: Tensor
     curvature: Tensor
-    follow: Tensor
+    gain_slopes: Tensor
 
     def variance(self, noise: Tensor) -> Tensor:
         """Of the gains (B, N)."""

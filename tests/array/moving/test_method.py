@@ -1,4 +1,4 @@
-"""The field of bearings on exact rooms: it must find the images and see them from anywhere."""
+"""The moving-array model on exact rooms: it must find the image sources and render them from anywhere."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import torch
 from boxes import ROOM, TRANSMITTER, room_of_spectra
 from scipy.optimize import nnls
 
-from gsparc.array.moving.method import BearingField
+from gsparc.array.moving.method import MovingArrayField
 from gsparc.array.moving.triangulate import SearchSettings, find_sources, powers
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.evaluation.scores import score
@@ -33,7 +33,7 @@ def fold(data):
 
 @pytest.fixture(scope="module")
 def fitted(data, fold, tmp_path_factory):
-    method = BearingField(search=SEARCH, components=64)
+    method = MovingArrayField(search=SEARCH, components=64)
     assert method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run"))).seconds > 0
     return method
 
@@ -51,7 +51,7 @@ def test_the_strong_images_are_found(data):
     assert distance[0] < 0.1 and (distance < 0.25).sum() >= 3
 
 
-def test_it_sees_better_than_a_process_on_images(data, fold, fitted, tmp_path):
+def test_it_beats_the_process_on_images(data, fold, fitted, tmp_path):
     rival = GaussianProcess()
     rival.fit(data, fold, FitContext(tmp_path))
     split = make_split(data.moving, SplitSettings(test_fraction=0.3))
@@ -67,18 +67,18 @@ def test_confidence_falls_away_from_the_measurements(data, fold, fitted):
     assert torch.isfinite(there.mean).all() and there.mean.min() >= 0 and there.mean.max() <= 1
 
 
-def test_a_stored_field_says_the_same(data, fold, fitted, tmp_path):
+def test_a_restored_model_predicts_the_same(data, fold, fitted, tmp_path):
     batch = data.batch(fold.test)
     torch.save(fitted.state(), tmp_path / "state.pt")
-    again = BearingField()
+    again = MovingArrayField()
     again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
     one, two = (m.predict(batch.tx, batch.rx) for m in (fitted, again))
     torch.testing.assert_close(one.mean, two.mean)
     torch.testing.assert_close(one.confidence, two.confidence)
 
 
-def test_several_searches_answer_together(data, fold, fitted, tmp_path):
-    twice = BearingField(search=SEARCH, components=64, searches=2)
+def test_several_searches_are_averaged(data, fold, fitted, tmp_path):
+    twice = MovingArrayField(search=SEARCH, components=64, searches=2)
     notes = twice.fit(data, fold, FitContext(tmp_path)).notes
     assert "2 searches" in notes[0] and twice.size() > fitted.size() and len(twice.trends) == 2
     assert not torch.equal(twice.trends[0].sources, twice.trends[1].sources)
@@ -90,7 +90,7 @@ def test_several_searches_answer_together(data, fold, fitted, tmp_path):
 
 def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
     quick = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
-    method = BearingField(search=quick, components=16)
+    method = MovingArrayField(search=quick, components=16)
     method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3))
     assert len(method.trends) == 1
     seconds = method.fit(data, fold, FitContext(tmp_path, budget_s=600.0)).seconds
@@ -115,27 +115,27 @@ def test_the_variance_is_about_the_error(data, fold, fitted):
 
 
 def test_power_spectra_are_recognised(fold, tmp_path):
-    method = BearingField(search=dataclasses.replace(SEARCH, sources=9, steps=0), components=0)
+    method = MovingArrayField(search=dataclasses.replace(SEARCH, sources=9, steps=0), components=0)
     method.fit(room_of_spectra(scale="power"), fold, FitContext(tmp_path))
     assert method.exponent == 1 and method.axes.shape[0] == 0
 
 
-def test_what_it_cannot_do_is_said(data, fold, tmp_path):
+def test_unusable_data_are_refused(data, fold, tmp_path):
     def refused(words, **changes):
         site = dataclasses.replace(data.site, **changes)
         with pytest.raises(ValueError, match=words):
-            BearingField().fit(dataclasses.replace(data, site=site), fold, FitContext(tmp_path))
+            MovingArrayField().fit(dataclasses.replace(data, site=site), fold, FitContext(tmp_path))
 
     refused("moving receiver", static_end="rx")
     refused("which array", array=None)
     turned = data.rx_rotation.copy()
     turned[3] = np.diag([-1.0, -1.0, 1.0])
     with pytest.raises(ValueError, match="one orientation"):
-        BearingField().fit(dataclasses.replace(data, rx_rotation=turned), fold, FitContext(tmp_path))
+        MovingArrayField().fit(dataclasses.replace(data, rx_rotation=turned), fold, FitContext(tmp_path))
     rng = np.random.default_rng(0)
     noise = dataclasses.replace(data, target=rng.integers(0, 255, data.target.shape).astype(np.uint8))
     with pytest.raises(ValueError, match="cannot have measured"):
-        BearingField(search=SEARCH).fit(noise, fold, FitContext(tmp_path))
+        MovingArrayField(search=SEARCH).fit(noise, fold, FitContext(tmp_path))
 
 
 def test_grid_is_the_sites_own():

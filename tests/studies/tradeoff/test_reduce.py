@@ -13,7 +13,7 @@ from boxes import room_of_spectra
 from campaigns import brief, channels, compose
 
 from gsparc.array.method import ArrayField
-from gsparc.array.moving.method import BearingField
+from gsparc.array.moving.method import MovingArrayField
 from gsparc.array.moving.triangulate import SearchSettings
 from gsparc.array.wave_packets import PacketSettings
 from gsparc.data.load import load
@@ -22,7 +22,7 @@ from gsparc.methods import reduced
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitContext
-from gsparc.multipath.image_source_gp import VirtualSourceGP
+from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.studies.train import train
 from gsparc.training import reduce as field_reduce
 
@@ -115,7 +115,7 @@ def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path)
     data = load({"name": "own", "file": str(channels(tmp_path / "own.npz", rows=60, shape="S"))})
     rows = np.arange(60)
     fold = Fold(rows[rows % 3 > 0], rows[:0], rows[::3])
-    method = VirtualSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
+    method = ImageSourceGP(searches=2, budget_s=4, search_rows=40, max_sources=4)
     method.fit(data, fold, FitContext(tmp_path))
     measured = reduced.contributions(method, data, fold.train)
     silent = reduced.reduced(method, {"confidence": False}, measured)
@@ -142,7 +142,7 @@ def crossings(tmp_path_factory):
     data = room_of_spectra()
     rows = np.arange(len(data.target))
     fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
-    method = BearingField(
+    method = MovingArrayField(
         SearchSettings(sources=17, rows=40, candidates=2000, steps=20), components=64, seed=0
     )
     method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
