@@ -232,11 +232,10 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
 def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     """The backward operator alone, for an upstream gradient of noise."""
     raster = composite(plan, *model, features)
-    numbers = operators.numbers(plan.grid, plan.optics)
     upstream = torch.randn_like(raster.image)
     inputs = (upstream, None, raster.image, raster.transmittance, *model, None, features)
-    place = (plan.pose.position, plan.pose.rotation, list(plan.buffers))
-    return lambda: operators.composite_backward_op(*inputs, *place, *numbers)
+    view = operators.view_of(plan)
+    return lambda: operators.composite_backward_op(*inputs, *view)
 
 
 def by_kernel(function: Callable[[], Any]) -> dict[str, float]:

@@ -14,8 +14,11 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import torch
+
+from gsparc.ops.settings import KernelSettings
 
 SOURCES = Path(__file__).parent / "csrc"
 UNITS = ("plan", "composite", "frozen", "networks", "similarity")
@@ -27,19 +30,28 @@ class LibraryUnavailable(RuntimeError):
     """There are no CUDA kernels here; the message says why in one line."""
 
 
+_C_TYPES: dict[type, Any] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: ctypes.c_double}
+
+
+class _Settings(ctypes.Structure):
+    """`KernelSettings<double>` of csrc/layout.h."""
+
+    _fields_ = tuple((name, _C_TYPES[kind]) for name, kind in get_type_hints(KernelSettings).items())
+
+
+_NUMBERS = (
+    *("twice", "poses", "count", "samples", "channels", "capacity", "device", "height", "width"),
+    *("inputs", "hidden", "radius", "built_for", "driver"),
+)
+
+
 class Call(ctypes.Structure):
     """One call into the library; `Call` of csrc/cuda/view.h."""
 
     _fields_ = (
-        ("twice", ctypes.c_int32),
-        ("poses", ctypes.c_int32),
-        ("count", ctypes.c_int32),
-        ("samples", ctypes.c_int32),
-        ("channels", ctypes.c_int32),
-        ("capacity", ctypes.c_int32),
-        ("device", ctypes.c_int32),
-        ("whole", ctypes.c_int32 * 6),
-        ("real", ctypes.c_double * 10),
+        *((name, ctypes.c_int32) for name in _NUMBERS),
+        ("settings", _Settings),
+        ("window", ctypes.c_double * 8),
         ("tensors", ctypes.c_uint64 * 32),
         ("scratch", ctypes.c_uint64),
         ("stream", ctypes.c_uint64),
@@ -76,7 +88,9 @@ class Library:
         try:
             self.run("check", call)
         except RuntimeError as error:
-            built, driver = (f"{version // 1000}.{version % 1000 // 10}" for version in call.whole[:2])
+            built, driver = (
+                f"{version // 1000}.{version % 1000 // 10}" for version in (call.built_for, call.driver)
+            )
             raise LibraryUnavailable(
                 f"{error}; the kernels were built with CUDA {built} and the driver is of CUDA {driver}: "
                 "update the driver, or set CUDA_HOME to a toolkit no newer than it"

@@ -6,24 +6,16 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import door, reference
-from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import Optics
 
 
-def make_plan(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    strongest: Tensor,
-    ids: Tensor | None,
-    pose: Pose,
-    grid: SphereGrid,
-    optics: Optics,
-) -> Plan:
+def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Order and radii; the footprints themselves are formed again, differentiably, when compositing."""
-    door.finite(means, quats, scales, strongest, pose)
+    door.finite(gaussians, pose)
+    means, quats, scales, strongest, _ = gaussians
     orders, centers, reaches, seen_at_all = [], [], [], []
     for index in range(len(pose)):
         seen = reference.project(means, quats, scales, pose[index], grid, optics)
@@ -42,21 +34,12 @@ def make_plan(
     )
 
 
-def composite(
-    plan: Plan,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    features: Tensor,
-    means2d: Tensor,
-) -> tuple[Tensor, Tensor]:
+def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
     images, behinds = [], []
     for index, values in enumerate(per_pose):
-        weights, _, behind = _weights(plan, index, means, quats, scales, opacities, extinctions, means2d)
+        weights, _, behind = _weights(plan, index, gaussians, means2d)
         order = plan.buffers[0][index]
         images.append(torch.einsum("nu,bnc->bcu", weights, values[:, order]))
         behinds.append(behind)
@@ -64,26 +47,22 @@ def composite(
     return torch.cat(images).unflatten(-1, size), torch.stack(behinds).unflatten(-1, size)
 
 
-def mean_weights(
-    plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     averages, shares = [], []
     still = torch.zeros_like(plan.means2d)
     for index in range(plan.num_poses):
-        weights, alpha, _ = _weights(plan, index, means, quats, scales, opacities, extinctions, still)
+        weights, alpha, _ = _weights(plan, index, gaussians, still)
         back = torch.argsort(plan.buffers[0][index])
         averages.append(weights.mean(1)[back])
         shares.append(visible_share(weights.sum(1), alpha.sum(1))[back])
     return torch.stack(averages), torch.stack(shares)
 
 
-def freeze(
-    plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
-) -> tuple[Tensor, tuple[Tensor, ...]]:
+def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
     still = torch.zeros_like(plan.means2d)
-    weights, _, _ = _weights(plan, 0, means, quats, scales, opacities, extinctions, still)
+    weights, _, _ = _weights(plan, 0, gaussians, still)
     return plan.buffers[0][0], (weights,)
 
 
@@ -92,10 +71,14 @@ def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Ten
     return (features.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
 
 
-def _weights(plan, index, means, quats, scales, opacities, extinctions, means2d):
-    hides = opacities if extinctions is None else extinctions
-    shift = means2d[index] - means2d[index].detach()
+def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """For a pose and the Gaussians in depth order: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
     order = plan.buffers[0][index]
-    return reference.composite_weights(
-        *(means, quats, scales, opacities, hides, order, shift, plan.pose[index], plan.grid, plan.optics)
-    )
+    means, quats, scales, opacities, extinctions = (None if t is None else t[order] for t in gaussians)
+    seen = reference.project(means, quats, scales, plan.pose[index], plan.grid, plan.optics)
+    shift = (means2d[index] - means2d[index].detach())[order]
+    shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
+    hides = opacities if extinctions is None else extinctions
+    alpha, gamma = reference.layers(seen, shapes, opacities, hides, plan.optics)
+    before, behind = reference.transmittances(gamma, plan.optics.cutoff.transmittance)
+    return alpha * before, alpha, behind

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.ops.geometry import Pose
+from gsparc.ops import built
+from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, WIDEST
 
 
@@ -28,16 +29,16 @@ def gaussians(
     opacities: Tensor,
     extinctions: Tensor | None,
     ids: Tensor | None,
-) -> None:
-    """Refuse Gaussians whose shapes, dtypes or devices disagree (ValueError, TypeError)."""
+) -> Gaussians:
+    """Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
     n = means.shape[0] if means.dim() else 0
-    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    if extinctions is not None:
-        expected["extinctions"], given["extinctions"] = (n,), extinctions
-    for name, tensor in given.items():
-        if tuple(tensor.shape) != expected[name]:
-            raise ValueError(f"{name} must be {expected[name]} for {n} means, got {tuple(tensor.shape)}")
+    given = Gaussians(means, quats, scales, opacities, extinctions)
+    expected = ((n, 3), (n, 4), (n, 3), (n,), (n,))
+    for name, tensor, shape in zip(Gaussians._fields, given, expected, strict=True):
+        if tensor is None:
+            continue
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must be {shape} for {n} means, got {tuple(tensor.shape)}")
         _same_kind(name, tensor, means)
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the rasterizer computes in float32 or float64, got means in {means.dtype}")
@@ -45,12 +46,14 @@ def gaussians(
         tuple(ids.shape) != (n,) or ids.dtype != torch.int64 or ids.device != means.device
     ):
         raise ValueError(f"ids must be ({n},) int64 on {means.device}, got {tuple(ids.shape)} {ids.dtype}")
+    return given
 
 
-def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor, pose: Pose) -> None:
+def finite(gaussians: Gaussians, pose: Pose) -> None:
     """Refuse what no footprint can be made of (ValueError), naming the first Gaussian, or a pose."""
     if not all(bool(torch.isfinite(part).all()) for part in (pose.position, pose.rotation)):
         raise_for_pose()
+    means, quats, scales, strongest, _ = gaussians
     sound = {
         "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
@@ -62,10 +65,22 @@ def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor, pose
             raise_for(name, int(torch.argmin(ok.to(torch.int8))))
 
 
-def strongest(opacities: Tensor, extinctions: Tensor) -> Tensor:
-    """The larger of each two; the smaller where it is negative, so that nobody hides behind the other."""
+def strongest(gaussians: Gaussians) -> Gaussians:
+    """The larger of opacity and extinction as the opacity; the smaller where it is negative, an error."""
+    opacities, extinctions = gaussians.opacities, gaussians.extinctions
+    if extinctions is None:
+        return gaussians
     least = torch.minimum(opacities, extinctions)
-    return torch.where(least < 0, least, torch.maximum(opacities, extinctions))
+    larger = torch.where(least < 0, least, torch.maximum(opacities, extinctions))
+    return gaussians._replace(opacities=larger, extinctions=None)
+
+
+def raise_for_verdict(verdict: int) -> None:
+    """The error for what a plan found, if it is not -1: UNSOUND_POSE, or 4 * Gaussian + which parameter."""
+    if verdict == built.kernels().UNSOUND_POSE:
+        raise_for_pose()
+    if verdict >= 0:
+        raise_for(Gaussians._fields[verdict % 4], verdict // 4)
 
 
 def raise_for(name: str, index: int) -> None:

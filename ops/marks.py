@@ -7,8 +7,8 @@ from torch import Tensor
 
 from gsparc.ops import _native
 from gsparc.ops.cpu_kernels import addresses
-from gsparc.ops.operators import numbers
 from gsparc.ops.plan import Plan
+from gsparc.ops.settings import kernel_settings
 
 
 def exponentials(tasks: int) -> int:
@@ -37,7 +37,6 @@ def pairs(plan: Plan) -> int:
     """
     if plan.backend != "cpu":
         raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
-    whole, real = numbers(plan.grid, plan.optics)
-    twice = plan.means2d.dtype == torch.float64
+    double, settings = plan.means2d.dtype == torch.float64, kernel_settings(plan.grid, plan.optics)
     sizes = (plan.num_poses, plan.num_gaussians, torch.get_num_threads())
-    return _native.mark_pairs(twice, *sizes, whole, real, addresses(*plan.buffers))
+    return _native.mark_pairs(double, *sizes, settings, addresses(*plan.buffers))

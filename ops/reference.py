@@ -204,26 +204,6 @@ def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
     return torch.where(lit, light[:-1], 0.0), light[-1]
 
 
-def composite_weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor,
-    order: Tensor,
-    shift: Tensor,
-    pose: Pose,
-    grid: SphereGrid,
-    optics: Optics,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """For one pose and the Gaussians in `order`: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
-    seen = project(means[order], quats[order], scales[order], pose, grid, optics)
-    shapes = footprints(seen, grid, optics, shift[order])
-    alpha, gamma = layers(seen, shapes, opacities[order], extinctions[order], optics)
-    before, behind = transmittances(gamma, optics.cutoff.transmittance)
-    return alpha * before, alpha, behind
-
-
 def radii(seen: Projected, strongest: Tensor, optics: Optics) -> Tensor:
     """Long half axes (N,) [px] of the footprints at the cut-off of opacities (or extinctions) `strongest`."""
     k11, k12, k22 = seen.covariance.unbind(-1)

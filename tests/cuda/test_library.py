@@ -118,7 +118,7 @@ def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(
             pass
 
         def run(self, name: str, call: cuda_library.Call) -> int:
-            call.whole[:2] = [13000, 12080]
+            call.built_for, call.driver = 13000, 12080
             raise RuntimeError("CUDA driver version is insufficient for CUDA runtime version")
 
     monkeypatch.setattr(cuda_library, "missing_device", lambda: None)

@@ -81,9 +81,8 @@ def recording(path: Path) -> Iterator[None]:
     """Every call of the kernels goes into a file as replay.cpp reads it, then runs."""
     run = cuda_kernels.run
 
-    def kept(name, like, *tensors, whole=(), real=(), sizes):
-        call = cuda_library.Call(twice=like.dtype == torch.float64, **sizes)
-        call.whole[: len(whole)], call.real[: len(real)] = list(whole), list(real)
+    def kept(name, like, *tensors, **numbers):
+        call = cuda_kernels.call_for(like, (), **numbers)
         with path.open("ab") as file:
             file.write(name.encode().ljust(32, b"\0") + bytes(call) + len(tensors).to_bytes(8, "little"))
             for tensor in tensors:
@@ -91,7 +90,7 @@ def recording(path: Path) -> Iterator[None]:
                 size = -1 if flat is None else len(flat)
                 file.write(size.to_bytes(8, "little", signed=True))
                 file.write(b"" if flat is None else flat.numpy().tobytes())
-        run(name, like, *tensors, whole=whole, real=real, sizes=sizes)
+        run(name, like, *tensors, **numbers)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cuda_kernels, "run", kept)
