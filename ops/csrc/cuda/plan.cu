@@ -338,7 +338,7 @@ const char* gsparc_error(int64_t code) {
 #ifdef __CUDACC__
     return cudaGetErrorString(cudaError_t(code));
 #else
-    return code == shim::kUnmet ? "a barrier was not met by all threads" : code ? "a grid larger than GPUs take" : "";
+    return shim::message(code);
 #endif
 }
 
