@@ -1,11 +1,11 @@
-"""What a training step is made of, beside the rasterizer: Lightning's loop, its logging, Adam, SSIM.
+"""Cost of a training step beside the rasterizer: Lightning's loop, its logging, Adam, SSIM.
 
     python bench/step.py dataset=rfid dataset.root=FOLDER [overrides of train.py]
 
 Steps of the configured model in turns: bare (a loop of a few lines around the same module), under Lightning
 with figures logged every tenth step, and every step; the bare loop with Adam's three forms, and without SSIM.
-Medians of the steps of each turn, then of the turns, in milliseconds of the processor: what a neighbour takes
-is not counted.
+Medians of the steps of each turn, then of the turns, in milliseconds of process time, which excludes
+other processes.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from gsparc.trainer import Training
 STEPS, TURNS = 40, 4
 
 
-class Watch(L.Callback):
-    """Notes when steps end, and keeps the module that takes them."""
+class StepTimer(L.Callback):
+    """Records when each step ends, and the module."""
 
     def __init__(self) -> None:
         self.ends: list[float] = []
         self.module: GaussianModule | None = None
 
     def on_train_batch_end(self, trainer, module, *unused):
-        """One more."""
+        """Record the time."""
         self.ends.append(time.process_time())
         self.module = module
 
@@ -65,14 +65,14 @@ class Steps:
 
     def under_lightning(self, log_every: int) -> tuple[float, GaussianModule]:
         """Milliseconds of a step, and the module."""
-        method, watch = build(self.config.model), Watch()
+        method, timer = build(self.config.model), StepTimer()
         settings = trainer.TrainerSettings(max_steps=STEPS, val_every=STEPS, checkpoint_every=10 * STEPS)
         trainer.LOG_EVERY = log_every
-        method.training = Training(settings, callbacks=lambda: [watch])
+        method.training = Training(settings, callbacks=lambda: [timer])
         with tempfile.TemporaryDirectory() as folder:
             method.fit(self.data, self.fold, Path(folder))
-        assert watch.module is not None
-        return median_step(watch.ends), watch.module
+        assert timer.module is not None
+        return median_step(timer.ends), timer.module
 
     def bare(self, adam: Callable, ssim: bool = True) -> float:
         """Milliseconds of a step of a loop that does nothing else."""

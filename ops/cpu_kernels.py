@@ -1,6 +1,6 @@
-"""The operators of this package by the C++ kernels.
+"""The operators on CPU tensors, by the C++ kernels.
 
-Tensors go to them as addresses; the caller keeps them alive, and torch's number of threads goes along.
+Kernels receive addresses of tensors, which the caller keeps alive, and torch's number of threads.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, door
+from gsparc.ops import _native, validation
 from gsparc.ops.geometry import Gaussians
 from gsparc.ops.networks import Layers
 from gsparc.ops.operators import Buffers, Poses, check_memory, contiguous, empty_like, plan_tensors
@@ -19,7 +19,7 @@ from gsparc.ops.settings import KernelSettings
 
 
 def addresses(*tensors: Tensor | None) -> list[int]:
-    """Where tensors lie; 0 stands for none."""
+    """Addresses of tensors; 0 for None."""
     return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
@@ -37,7 +37,7 @@ def plan(
     means = gaussians.means
     buffers, *screen = plan_tensors(means, len(poses.positions), settings.height, 0)
     tensors = (*contiguous((*gaussians, *poses, ids)), *buffers[:-1], *screen)
-    door.raise_for_verdict(_run(_native.plan, gaussians, poses, settings, tensors=tensors))
+    validation.raise_for_status(_run(_native.plan, gaussians, poses, settings, tensors=tensors))
     entries = int(buffers.starts[-1])
     check_memory(entries, 4)
     buffers = buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))

@@ -1,4 +1,4 @@
-"""The `cuda` backend: the operators on the CUDA kernels, and views frozen by them."""
+"""The `cuda` backend: CUDA kernels for the operators, and frozen views."""
 
 from __future__ import annotations
 

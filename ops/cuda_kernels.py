@@ -4,8 +4,8 @@ A plan's buffers have the shapes of the CPU's, with contents of their own: recor
 Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
 tiles' starts (P tiles + 1), then for each entry its Gaussian and its slot.
 
-Inside a captured CUDA graph nothing may wait for the GPU, so a plan takes as many entries as plans of this
-size have needed before, and some more; should it need more, its images and gradients are NaN, never wrong.
+Inside a captured CUDA graph nothing may synchronise, so a plan has room for as many entries as earlier plans
+of this size needed, plus headroom; if it needs more, its images and gradients are NaN.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, cuda_library, door
+from gsparc.ops import _native, cuda_library, validation
 from gsparc.ops.geometry import Gaussians
 from gsparc.ops.networks import Layers
 from gsparc.ops.operators import Buffers, Poses, check_memory, contiguous, empty_like, plan_tensors
@@ -38,8 +38,8 @@ def tiles(settings: KernelSettings) -> int:
     return -(-settings.height // _native.TILE_HEIGHT) * -(-settings.width // _native.TILE_WIDTH)
 
 
-def _roomy(entries: int) -> int:
-    """Room of a captured plan where the largest seen had so many entries."""
+def _with_headroom(entries: int) -> int:
+    """Capacity of a captured plan where the largest plan so far had so many entries."""
     return entries + entries // 4 + 1024
 
 
@@ -121,10 +121,10 @@ def plan(
     if _capturing(means):
         if key not in _capacities:
             raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
-        capacity = _roomy(_capacities[key])
+        capacity = _with_headroom(_capacities[key])
     else:
-        wrong, capacity = verdict.tolist()
-        door.raise_for_verdict(wrong)
+        status, capacity = verdict.tolist()
+        validation.raise_for_status(status)
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
     buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))

@@ -1,4 +1,4 @@
-"""The `cpu` backend: the operators on the C++ kernels, and views frozen by them."""
+"""The `cpu` backend: C++ kernels for the operators, and frozen views."""
 
 from __future__ import annotations
 

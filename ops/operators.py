@@ -22,7 +22,7 @@ from gsparc.ops.results import visible_share
 from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
 
 KERNELS: dict[str, ModuleType] = {}
-"""By type of device; backends enter theirs when they are loaded."""
+"""Modules of kernels by type of device; each backend adds its own when it is loaded."""
 
 MEMORY_BOUND = 8 * 2**30
 """Bytes that one call may need for entries and gradient slots [B]; more is refused before it is allocated."""
@@ -72,7 +72,7 @@ def _outputs(outputs: Any, like: Tensor) -> Any:
 def operator(shapes: Callable[..., Any]) -> CustomOpDef:
     """Define `gsparc::NAME` of a function `NAME_op`; each field of a named tuple becomes an argument.
 
-    The first argument of every operator is a tensor, whose device decides who computes it.
+    The first argument of every operator is a tensor, whose device selects the kernel.
     """
     name = shapes.__name__.removesuffix("_op")
     hints = get_type_hints(shapes)
@@ -120,7 +120,7 @@ def empty_like(tensors: Any) -> Any:
 
 
 def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
-    """What kernels read: detached and contiguous."""
+    """Detached, contiguous tensors, as kernels read them."""
     return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors]
 
 

@@ -12,7 +12,7 @@ from gsparc.ops.operators import KERNELS, operator
 
 
 def served(images: Tensor) -> bool:
-    """Whether a kernel takes these images: float32, on a CPU or on a GPU that renders."""
+    """Whether a kernel supports these images: float32, on a device whose kernels are loaded."""
     if images.dtype != torch.float32:
         return False
     if images.device.type == "cpu" and built.kernels() is not None:

@@ -203,7 +203,7 @@ void channels_backward(bool twice, const Ints& sizes, const Reals& tones, int th
     });
 }
 
-// Exponentials accumulated by `tasks` tasks of the yardstick.
+// Exponentials accumulated by `tasks` tasks of the roofline.
 int64_t mark_exponentials(int tasks, int threads) {
     nb::gil_scoped_release unlocked;
     std::vector<float> sums(tasks);

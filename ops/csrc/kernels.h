@@ -114,7 +114,7 @@ template <class S> struct Kernels {
     void (*similarity)(const SimilarityArgs&);
     void (*channels)(const ChannelArgs<S>&);
     void (*channels_backward)(const ChannelBackwardArgs<S>&);
-    void (*mark_exponentials)(int tasks, int threads, float* sums);  // see yardstick.h
+    void (*mark_exponentials)(int tasks, int threads, float* sums);  // see machine_limits.h
     void (*mark_copy)(const char* from, char* to, int64_t bytes, int threads);
     int64_t (*mark_pairs)(const PlanView<S>&, const KernelSettings<S>&, int threads);
     void (*bin_strip)(const int16_t* first, const int16_t* last, int count, int strip, int32_t* to);  // see bins.h; may be null

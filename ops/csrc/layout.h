@@ -30,7 +30,7 @@ constexpr int kLanes = 16;      // most pixels done at a time by any instruction
 
 constexpr int64_t kUnsoundPose = int64_t(1) << 62;  // what a plan returns of a pose; of a Gaussian 4 i + parameter
 
-constexpr int kMarkPixels = 384, kMarkRounds = 64, kMarkPairs = kMarkPixels * kMarkRounds;  // see yardstick.h
+constexpr int kMarkPixels = 384, kMarkRounds = 64, kMarkPairs = kMarkPixels * kMarkRounds;  // see machine_limits.h
 
 // A strip is kStripRows rows of the image, the unit of work. Row-wise strips let azimuth wrap without tiles.
 constexpr int kStripRows = 4;

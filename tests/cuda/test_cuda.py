@@ -162,7 +162,7 @@ def test_captured_plan_without_room_is_nan_never_wrong(where, monkeypatch):
     scene, grid = random_scene(n=40).to(torch.float32), GRIDS["hemisphere"]
     render(scene, poses(0), grid)
     monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
-    monkeypatch.setattr(cuda_kernels, "_roomy", lambda entries: 5)
+    monkeypatch.setattr(cuda_kernels, "_with_headroom", lambda entries: 5)
     got = render(scene, poses(0), grid)
     for name in ("image", "transmittance", "d_means", "d_quats", "d_scales", "d_opacities", "d_features"):
         assert torch.isnan(got[name]).all(), name

@@ -11,7 +11,7 @@ import pytest
 import torch
 from test_module import module
 
-from gsparc.ops import Pose, backends, door
+from gsparc.ops import Pose, backends, validation
 from gsparc.ops.plan import Plan
 
 
@@ -38,7 +38,7 @@ class Shapes:
 
 
 def unlooked(pose: Pose, means: torch.Tensor) -> Pose:
-    """`door.poses`, which does not look at poses on a GPU, either."""
+    """`validation.poses`, which does not look at poses on a GPU, either."""
     return Pose(pose.position.to(means).reshape(-1, 3), pose.rotation.to(means).reshape(-1, 3, 3))
 
 
@@ -46,7 +46,7 @@ def unlooked(pose: Pose, means: torch.Tensor) -> Pose:
 def test_a_training_loss_and_its_gradients_stay_on_the_models_device(kind, campaign, tmp_path, monkeypatch):
     monkeypatch.setattr(backends, "choose", lambda name, device: Shapes)
     monkeypatch.setattr(backends, "named", lambda name: Shapes)
-    monkeypatch.setattr(door, "poses", unlooked)
+    monkeypatch.setattr(validation, "poses", unlooked)
     data = campaign(kind)
     made = module(data, tmp_path).to("meta")
     batch = data.batch(np.arange(6)).to("meta")

@@ -1,4 +1,4 @@
-"""What comes in is checked once, here; an error is one line saying what to change."""
+"""Input validation of the rasterizer: each error is one line that says what to change."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from gsparc.ops.settings import FARTHEST, WIDEST
 
 
 class UnsoundGaussian(ValueError):
-    """A Gaussian that no footprint can be made of.
+    """A Gaussian with a parameter out of range or not finite.
 
     Attributes:
-        index: its row.
+        index: its row in the tensors.
     """
 
     def __init__(self, message: str, index: int) -> None:
@@ -39,7 +39,7 @@ def gaussians(
             continue
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must be {shape} for {n} means, got {tuple(tensor.shape)}")
-        _same_kind(name, tensor, means)
+        _check_dtype_and_device(name, tensor, means)
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the rasterizer computes in float32 or float64, got means in {means.dtype}")
     if ids is not None and (
@@ -50,59 +50,59 @@ def gaussians(
 
 
 def finite(gaussians: Gaussians, pose: Pose) -> None:
-    """Refuse what no footprint can be made of (ValueError), naming the first Gaussian, or a pose."""
+    """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
     if not all(bool(torch.isfinite(part).all()) for part in (pose.position, pose.rotation)):
         raise_for_pose()
     means, quats, scales, strongest, _ = gaussians
-    sound = {
+    valid = {
         "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
         "scales": ((scales >= 0) & (scales <= WIDEST)).all(-1),
         "opacities": (strongest >= 0) & (strongest <= 1),
     }
-    for name, ok in sound.items():
+    for name, ok in valid.items():
         if not bool(ok.all()):
             raise_for(name, int(torch.argmin(ok.to(torch.int8))))
 
 
 def strongest(gaussians: Gaussians) -> Gaussians:
-    """The larger of opacity and extinction as the opacity; the smaller where it is negative, an error."""
+    """Gaussians with max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
     opacities, extinctions = gaussians.opacities, gaussians.extinctions
     if extinctions is None:
         return gaussians
-    least = torch.minimum(opacities, extinctions)
-    larger = torch.where(least < 0, least, torch.maximum(opacities, extinctions))
+    smaller = torch.minimum(opacities, extinctions)
+    larger = torch.where(smaller < 0, smaller, torch.maximum(opacities, extinctions))
     return gaussians._replace(opacities=larger, extinctions=None)
 
 
-def raise_for_verdict(verdict: int) -> None:
-    """The error for what a plan found, if it is not -1: UNSOUND_POSE, or 4 * Gaussian + which parameter."""
-    if verdict == built.kernels().UNSOUND_POSE:
+def raise_for_status(status: int) -> None:
+    """Raise for a plan's status: UNSOUND_POSE, 4 * Gaussian + index of the parameter, or -1 if valid."""
+    if status == built.kernels().UNSOUND_POSE:
         raise_for_pose()
-    if verdict >= 0:
-        raise_for(Gaussians._fields[verdict % 4], verdict // 4)
+    if status >= 0:
+        raise_for(Gaussians._fields[status % 4], status // 4)
 
 
 def raise_for(name: str, index: int) -> None:
-    """The error for Gaussian `index` whose `name` no footprint can be made of (UnsoundGaussian)."""
-    wanted = {
+    """Raise for the invalid parameter `name` of Gaussian `index` (UnsoundGaussian)."""
+    expected = {
         "means": f"finite and within {FARTHEST:.0e} m",
         "scales": f"finite and from 0 to {WIDEST:.0e} m",
         "opacities": "in [0, 1], extinctions included",
     }.get(name, "finite")
     raise UnsoundGaussian(
-        f"Gaussian {index} has {name} that are not {wanted}; find where they come from", index
+        f"Gaussian {index} has {name} that are not {expected}; find where they come from", index
     )
 
 
 def raise_for_pose() -> None:
-    """The error for a pose that no direction can be told from (ValueError)."""
+    """Raise for a pose that is not finite (ValueError)."""
     raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
 
 
 def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
     """Features (N, C) or (B, N, C) as (B, N, C), checked against the Gaussians and the poses (ValueError)."""
-    _same_kind("features", values, means)
+    _check_dtype_and_device("features", values, means)
     if values.dim() not in (2, 3) or values.shape[-2] != means.shape[0]:
         raise ValueError(
             f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
@@ -116,13 +116,13 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
 
 
 def poses(pose: Pose, means: Tensor) -> Pose:
-    """Poses (P,) in the Gaussians' dtype and on their device, always batched; plans look if finite."""
+    """Poses (P,) in the Gaussians' dtype and on their device, always batched; the plan checks values."""
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
     return Pose(position, rotation)
 
 
-def _same_kind(name: str, tensor: Tensor, means: Tensor) -> None:
+def _check_dtype_and_device(name: str, tensor: Tensor, means: Tensor) -> None:
     if tensor.dtype != means.dtype:
         raise TypeError(f"{name} is {tensor.dtype} but means is {means.dtype}; convert one of them")
     if tensor.device != means.device:

@@ -1,5 +1,5 @@
-// What this machine can do at best: the marks that timings are divided by. Written before the kernels were tuned
-// and with an exponential of their own, so that no change to the kernels moves them.
+// Roofline of this machine: peak rates that timings are divided by. Written before the kernels were tuned and with an
+// exponential of their own, so that no change to the kernels moves them.
 #pragma once
 #include <string.h>
 

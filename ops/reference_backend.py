@@ -1,11 +1,11 @@
-"""The `reference` backend behind the public face: plans and composites with dense tensors and autograd."""
+"""The `reference` backend: plans and composites with dense tensors and autograd."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import door, reference
+from gsparc.ops import reference, validation
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
@@ -13,23 +13,23 @@ from gsparc.ops.settings import Optics
 
 
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
-    """Order and radii; the footprints themselves are formed again, differentiably, when compositing."""
-    door.finite(gaussians, pose)
+    """Depth order and radii; compositing evaluates the footprints again, differentiably."""
+    validation.finite(gaussians, pose)
     means, quats, scales, strongest, _ = gaussians
-    orders, centers, reaches, seen_at_all = [], [], [], []
+    orders, centers, radii, visible = [], [], [], []
     for index in range(len(pose)):
         seen = reference.project(means, quats, scales, pose[index], grid, optics)
         shapes = reference.footprints(seen, grid, optics, torch.zeros_like(means[:, :2]))
         alpha, _ = reference.layers(seen, shapes, strongest, strongest, optics)
         orders.append(reference.depth_order(seen, ids))
         centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
-        seen_at_all.append((alpha > 0).any(1))
-        reaches.append(torch.where(seen_at_all[-1], reference.radii(seen, strongest, optics), 0.0))
+        visible.append((alpha > 0).any(1))
+        radii.append(torch.where(visible[-1], reference.radii(seen, strongest, optics), 0.0))
     return Plan(
         *(pose, grid, optics, "reference"),
         means2d=torch.stack(centers),
-        radii=torch.stack(reaches),
-        visible=torch.stack(seen_at_all),
+        radii=torch.stack(radii),
+        visible=torch.stack(visible),
         buffers=(torch.stack(orders),),
     )
 
@@ -37,32 +37,32 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
-    images, behinds = [], []
+    images, transmittances = [], []
     for index, values in enumerate(per_pose):
-        weights, _, behind = _weights(plan, index, gaussians, means2d)
+        weights, _, transmittance = _weights(plan, index, gaussians, means2d)
         order = plan.buffers[0][index]
         images.append(torch.einsum("nu,bnc->bcu", weights, values[:, order]))
-        behinds.append(behind)
+        transmittances.append(transmittance)
     size = (plan.grid.height, plan.grid.width)
-    return torch.cat(images).unflatten(-1, size), torch.stack(behinds).unflatten(-1, size)
+    return torch.cat(images).unflatten(-1, size), torch.stack(transmittances).unflatten(-1, size)
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    averages, shares = [], []
-    still = torch.zeros_like(plan.means2d)
+    means, shares = [], []
+    no_shift = torch.zeros_like(plan.means2d)
     for index in range(plan.num_poses):
-        weights, alpha, _ = _weights(plan, index, gaussians, still)
-        back = torch.argsort(plan.buffers[0][index])
-        averages.append(weights.mean(1)[back])
-        shares.append(visible_share(weights.sum(1), alpha.sum(1))[back])
-    return torch.stack(averages), torch.stack(shares)
+        weights, alpha, _ = _weights(plan, index, gaussians, no_shift)
+        inverse = torch.argsort(plan.buffers[0][index])
+        means.append(weights.mean(1)[inverse])
+        shares.append(visible_share(weights.sum(1), alpha.sum(1))[inverse])
+    return torch.stack(means), torch.stack(shares)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
-    still = torch.zeros_like(plan.means2d)
-    weights, _, _ = _weights(plan, 0, gaussians, still)
+    no_shift = torch.zeros_like(plan.means2d)
+    weights, _, _ = _weights(plan, 0, gaussians, no_shift)
     return plan.buffers[0][0], (weights,)
 
 
@@ -80,5 +80,5 @@ def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> t
     shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
     hides = opacities if extinctions is None else extinctions
     alpha, gamma = reference.layers(seen, shapes, opacities, hides, plan.optics)
-    before, behind = reference.transmittances(gamma, plan.optics.cutoff.transmittance)
-    return alpha * before, alpha, behind
+    before, transmittance = reference.transmittances(gamma, plan.optics.cutoff.transmittance)
+    return alpha * before, alpha, transmittance

@@ -1,4 +1,4 @@
-"""What this machine can do at best, measured beside the kernels: see csrc/yardstick.h."""
+"""Roofline of this CPU: peak rates that kernel timings are divided by; see csrc/machine_limits.h."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from gsparc.ops.settings import kernel_settings
 
 
 def exponentials(tasks: int) -> int:
-    """Accumulate bare exponentials over a row of pixels on torch's number of threads; returns how many."""
+    """Accumulate exponentials over a row of pixels in torch's threads; returns how many were evaluated."""
     return _native.mark_exponentials(tasks, torch.get_num_threads())
 
 
 def copy(source: Tensor, target: Tensor) -> int:
-    """Copy a contiguous tensor on torch's number of threads; returns the bytes read and written.
+    """Copy a contiguous tensor in torch's threads; returns the bytes read and written.
 
     Raises:
         ValueError: one is not contiguous, or their sizes differ.
