@@ -7,7 +7,8 @@ computes it on a device is the function of the same name and parameters in that 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from types import ModuleType
 from typing import Any, NamedTuple, get_type_hints
 
@@ -69,8 +70,28 @@ def _outputs(outputs: Any, like: Tensor) -> Any:
     return tuple(like.new_empty(0) if leaf is None else leaf for leaf in _leaves(outputs))
 
 
+_KINDS = tuple(get_type_hints(KernelSettings).values())
+
+
+def packed(settings: KernelSettings) -> list[float]:
+    """Settings as an operator takes them."""
+    return list(map(float, settings))
+
+
+@lru_cache(maxsize=64)
+def _named(numbers: tuple[float, ...]) -> KernelSettings:
+    return KernelSettings(*(kind(number) for kind, number in zip(_KINDS, numbers, strict=True)))
+
+
+def _unpacked(packed: tuple[Sequence[float]]) -> KernelSettings:
+    return _named(tuple(packed[0]))
+
+
 def operator(shapes: Callable[..., Any]) -> CustomOpDef:
-    """Define `gsparc::NAME` of a function `NAME_op`; each field of a named tuple becomes an argument.
+    """Define `gsparc::NAME` of a function `NAME_op`.
+
+    Each field of a named tuple becomes an argument; `KernelSettings` become one list of numbers (`packed`),
+    for torch's time per call grows with the square of the number of arguments.
 
     The first argument of every operator is a tensor, whose device selects the kernel.
     """
@@ -80,8 +101,12 @@ def operator(shapes: Callable[..., Any]) -> CustomOpDef:
     arguments: dict[str, Any] = {}
     groups: list[tuple[Any, int, int]] = []  # named tuple or None, first and last argument
     for parameter, hint in hints.items():
-        fields = get_type_hints(hint) if hasattr(hint, "_fields") else {parameter: hint}
-        groups.append((getattr(hint, "_make", None), len(arguments), len(arguments) + len(fields)))
+        make, fields = getattr(hint, "_make", None), {parameter: hint}
+        if hint is KernelSettings:
+            make, fields = _unpacked, {parameter: Sequence[float]}
+        elif make:
+            fields = get_type_hints(hint)
+        groups.append((make, len(arguments), len(arguments) + len(fields)))
         arguments |= fields
 
     def grouped(flat: tuple[Any, ...]) -> list[Any]:
@@ -205,17 +230,14 @@ def weights_backward_op(
     return empty_like(gaussians)
 
 
-_SETTINGS = len(KernelSettings._fields)
-
-
 def _gradients(gaussians: tuple[Tensor, ...], tensors: list[Tensor | None]) -> list[Tensor | None]:
     """Gradients of the Gaussians, which are the first `tensors`: None for an absent one."""
     return [g if t is not None else None for g, t in zip(gaussians, tensors, strict=False)]
 
 
 def _composite_setup(ctx, inputs, output):
-    ctx.save_for_backward(*output, *inputs[1:-_SETTINGS])
-    ctx.settings = inputs[-_SETTINGS:]
+    ctx.save_for_backward(*output, *inputs[1:-1])
+    ctx.settings = inputs[-1]
 
 
 def _composite_backward(ctx, grad_image, grad_transmittance):
@@ -223,9 +245,9 @@ def _composite_backward(ctx, grad_image, grad_transmittance):
     if grad_image is None:
         grad_image = torch.zeros_like(image)
     *gaussians, features, means2d = composite_backward_op(
-        grad_image, grad_transmittance, image, transmittance, *tensors, *ctx.settings
+        grad_image, grad_transmittance, image, transmittance, *tensors, ctx.settings
     )
-    rest = [None] * (len(tensors) - 6 + _SETTINGS)
+    rest = [None] * (len(tensors) - 5)
     return means2d, *_gradients(gaussians, tensors), features, *rest
 
 
@@ -233,15 +255,15 @@ composite_op.register_autograd(_composite_backward, setup_context=_composite_set
 
 
 def _weights_setup(ctx, inputs, output):
-    ctx.save_for_backward(*inputs[:-_SETTINGS])
-    ctx.settings, ctx.size = inputs[-_SETTINGS:], output[0].shape
+    ctx.save_for_backward(*inputs[:-1])
+    ctx.settings, ctx.size = inputs[-1], output[0].shape
 
 
 def _weights_backward(ctx, *grads):
     tensors = ctx.saved_tensors
     filled = [tensors[0].new_zeros(ctx.size) if grad is None else grad for grad in grads]
-    gaussians = weights_backward_op(*filled, *tensors, *ctx.settings)
-    return *_gradients(gaussians, tensors), *[None] * (len(tensors) - 5 + _SETTINGS)
+    gaussians = weights_backward_op(*filled, *tensors, ctx.settings)
+    return *_gradients(gaussians, tensors), *[None] * (len(tensors) - 4)
 
 
 weights_op.register_autograd(_weights_backward, setup_context=_weights_setup)
@@ -250,7 +272,7 @@ weights_op.register_autograd(_weights_backward, setup_context=_weights_setup)
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Project, cull, order and bin."""
     *buffers, means2d, radii, visible = plan_op(
-        *gaussians, ids, pose.position, pose.rotation, *kernel_settings(grid, optics)
+        *gaussians, ids, pose.position, pose.rotation, packed(kernel_settings(grid, optics))
     )
     device = gaussians.means.device.type
     return Plan(pose, grid, optics, device, means2d, radii, visible, Buffers(*buffers))
@@ -259,7 +281,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
 def view_of(plan: Plan) -> tuple[Any, ...]:
     """The last arguments of an operator on a plan."""
     settings = kernel_settings(plan.grid, plan.optics)
-    return plan.pose.position, plan.pose.rotation, *plan.buffers, *settings
+    return plan.pose.position, plan.pose.rotation, *plan.buffers, packed(settings)
 
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:

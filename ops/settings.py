@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 from gsparc.ops.geometry import SphereGrid
@@ -104,6 +105,7 @@ class KernelSettings(NamedTuple):
     horizon_cosine: float
 
 
+@lru_cache(maxsize=64)
 def kernel_settings(grid: SphereGrid, optics: Optics) -> KernelSettings:
     """What a grid and optics are to the kernels."""
     return KernelSettings(

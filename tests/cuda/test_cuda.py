@@ -177,16 +177,17 @@ def test_captured_plan_needs_an_earlier_one(where, monkeypatch):
 
 
 def test_unsound_input_is_named(where):
-    scene, settings = random_scene(n=40), kernel_settings(GRIDS["hemisphere"], Optics())
+    scene = random_scene(n=40)
+    settings = operators.packed(kernel_settings(GRIDS["hemisphere"], Optics()))
     model = [scene.means, scene.quats, scene.scales, scene.opacities]
     place, turn = torch.zeros(1, 3).double(), torch.eye(3).double()[None]
     for part, (name, row) in enumerate([("means", 7), ("quats", 39), ("scales", 0), ("opacities", 12)]):
         wrong = [tensor.clone() for tensor in model]
         wrong[part][row] = math.nan
         with pytest.raises(ValueError, match=f"Gaussian {row} has {name}"):
-            operators.plan_op(*wrong, None, None, place, turn, *settings)
+            operators.plan_op(*wrong, None, None, place, turn, settings)
     with pytest.raises(ValueError, match="pose is not finite"):
-        operators.plan_op(*model, None, None, place * math.nan, turn, *settings)
+        operators.plan_op(*model, None, None, place * math.nan, turn, settings)
 
 
 def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):

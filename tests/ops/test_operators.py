@@ -11,8 +11,17 @@ import torch
 from rasters import poses, random_scene
 from torch.library import opcheck
 
-from gsparc.ops import SphereGrid, composite, cpu_kernels, cuda_kernels, make_plan, operators
-from gsparc.ops.settings import kernel_settings
+from gsparc.ops import (
+    SphereGrid,
+    composite,
+    cpu_kernels,
+    cuda_kernels,
+    make_plan,
+    networks,
+    operators,
+    similarity,
+)
+from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
 
 ROOT = Path(__file__).parents[2]
 GRID = SphereGrid.hemisphere(10, 40)
@@ -24,12 +33,12 @@ def test_opcheck(hides):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
     view = (pose.position, pose.rotation)
-    settings = kernel_settings(GRID, plan.optics)
+    settings = operators.packed(kernel_settings(GRID, plan.optics))
     leaves = [tensor.clone().requires_grad_() for tensor in model]
     hidden = scene.extinctions.clone().requires_grad_() if hides else None
     features, means2d = scene.features.clone().requires_grad_(), plan.means2d.clone().requires_grad_()
-    opcheck(operators.plan_op, (*model, None, None, *view, *settings))
-    rest = (*view, *plan.buffers, *settings)
+    opcheck(operators.plan_op, (*model, None, None, *view, settings))
+    rest = (*view, *plan.buffers, settings)
     opcheck(operators.composite_op, (means2d, *leaves, hidden, features, *rest))
     opcheck(operators.weights_op, (*leaves, hidden, *rest))
 
@@ -41,7 +50,7 @@ def test_opcheck_of_the_gradients(hides, behind):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
     common = (*model, scene.extinctions)
-    view = (pose.position, pose.rotation, *plan.buffers, *kernel_settings(GRID, plan.optics))
+    view = (pose.position, pose.rotation, *plan.buffers, operators.packed(kernel_settings(GRID, plan.optics)))
     raster = composite(plan, *model, scene.features, extinctions=scene.extinctions)
     light = torch.ones_like(raster.transmittance) if behind else None
     images = (torch.ones_like(raster.image), light, raster.image, raster.transmittance)
@@ -89,16 +98,22 @@ def test_inputs_on_strides_are_understood():
 
 
 def test_every_device_has_every_operator_with_the_same_signature():
+    defined = {**vars(operators), **vars(networks), **vars(similarity)}
     names = ["plan", "composite", "composite_backward", "weights", "weights_backward"]
     for name in [*names, "networks", "networks_backward", "similarity"]:
         first, second = (inspect.signature(getattr(of, name)) for of in (cpu_kernels, cuda_kernels))
         assert first == second, name
-        flat = getattr(torch.ops.gsparc, name).default._schema.arguments
+        flat = defined[f"{name}_op"]._opoverload._schema.arguments
         hints = [hint for key, hint in get_type_hints(getattr(cpu_kernels, name)).items() if key != "return"]
-        assert len(flat) == sum(len(getattr(hint, "_fields", (0,))) for hint in hints), name
+        tensors = [hint for hint in hints if hint is not KernelSettings]
+        count = sum(len(getattr(hint, "_fields", (0,))) for hint in tensors) + len(hints) - len(tensors)
+        assert len(flat) == count, name
 
 
 def test_arguments_of_an_operator_have_names():
-    """Sixteen numbers were packed into two lists and unpacked by position."""
+    """Settings travel as one list and arrive by name, each in its own type."""
     schema = str(torch.ops.gsparc.weights.default._schema)
-    assert "Tensor? extinctions" in schema and "float alpha_min, float transmittance_min" in schema
+    assert "Tensor? extinctions" in schema and "Tensor entries, float[] settings" in schema
+    settings = kernel_settings(GRID, Optics(projection="equirect"))
+    again = operators._unpacked((operators.packed(settings),))
+    assert again == settings and list(map(type, again)) == list(map(type, settings))
