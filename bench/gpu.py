@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from record import LOG, guarded, told, update
+from record import LOG, guarded, output_of, update
 
 
 def machine() -> dict[str, Any]:
@@ -23,11 +23,11 @@ def machine() -> dict[str, Any]:
     asked = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
     return {
         "gpu": torch.cuda.get_device_name(),
-        "driver": told("nvidia-smi", asked, "--format=csv,noheader"),
+        "driver": output_of("nvidia-smi", asked, "--format=csv,noheader"),
         "capability": ".".join(map(str, torch.cuda.get_device_capability())),
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
-        "commit": told("git", "describe", "--always", "--dirty")
+        "commit": output_of("git", "describe", "--always", "--dirty")
         or os.environ.get("GSPARC_COMMIT", "unknown"),
         "date": datetime.date.today().isoformat(),
     }
@@ -45,7 +45,7 @@ NEEDED = {
 
 
 def needs(file: Path) -> None:
-    """Which modules are missing for which stage, before any of them fails for it."""
+    """Record which modules each stage lacks."""
     missing = {
         stage: [name for name in names if importlib.util.find_spec(name) is None]
         for stage, names in NEEDED.items()
@@ -54,7 +54,7 @@ def needs(file: Path) -> None:
 
 
 def build(file: Path) -> None:
-    """Compile the library anew and say how long it took."""
+    """Compile the library and record the time."""
     from gsparc.ops import cuda_library
 
     path = cuda_library.library_path(*cuda_library.architectures())
@@ -65,7 +65,7 @@ def build(file: Path) -> None:
 
 
 def bench(file: Path) -> None:
-    """Ceilings, kernels, end-to-end queries, frozen batches."""
+    """Roofline, kernels, end-to-end queries, frozen batches."""
     import measure
 
     update(file, machine=guarded(machine))
@@ -87,8 +87,8 @@ def short() -> None:
     LOG.info("every kernel ran")
 
 
-def of_what() -> list[str]:
-    """The folder RFID of the real release where that is set, else a simulated site."""
+def dataset_overrides() -> list[str]:
+    """The RFID release where the environment names its folder, else a simulated site."""
     if os.environ.get("RFID"):
         return ["dataset=rfid", f"dataset.root={os.environ['RFID']}"]
     return ["experiment=demo", "dataset.root=build/stand-ins", "dataset.count=160"]
@@ -99,17 +99,17 @@ def train(file: Path) -> None:
     import measure
 
     update(file, learning=guarded(lambda: measure.learning(200)))
-    results: dict[str, Any] = {"of": of_what()[0]}
+    results: dict[str, Any] = {"dataset": dataset_overrides()[0]}
     for accelerator in ("gpu", "cpu"):
         folder = Path("build") / f"train-{accelerator}"
-        command = [sys.executable, "-P", "train.py", *of_what()]
+        command = [sys.executable, "-P", "train.py", *dataset_overrides()]
         command += [f"trainer.accelerator={accelerator}", f"hydra.run.dir={folder}"]
         command += ["baselines=[zero,mean,nearest]"]
         command += ["model.effects.array=false", "model.effects.phase=false"]  # the splatted field
         started = time.perf_counter()
         try:
-            told_whole = {**os.environ, "HYDRA_FULL_ERROR": "1"}
-            done = subprocess.run(command, capture_output=True, text=True, timeout=130, env=told_whole)
+            environment = {**os.environ, "HYDRA_FULL_ERROR": "1"}
+            done = subprocess.run(command, capture_output=True, text=True, timeout=130, env=environment)
         except subprocess.TimeoutExpired as late:
             done = subprocess.CompletedProcess(command, 124, "", str(late))
         results[accelerator] = {"wall_s": round(time.perf_counter() - started, 1), "exit": done.returncode}
@@ -160,17 +160,17 @@ def flat(section: dict[str, Any], before: str = "") -> list[tuple[str, Any]]:
     return rows
 
 
-TELLING = ("passed", "failed", "skipped", "SUMMARY", " error")
+SUMMARY_WORDS = ("passed", "failed", "skipped", "SUMMARY", " error")
 
 
 def note(file: Path, name: str, status: str, seconds: str) -> None:
-    """How a stage ended."""
+    """Record exit status, duration and summary lines of a stage."""
     known = json.loads(file.read_text()) if file.exists() else {}
     stages = known.get("stages", {}) | {name: {"exit": int(status), "seconds": int(seconds)}}
     log = file.parent / f"{name}.log"
     if log.exists() and name in ("tests", "hard", "sanitize"):
         lines = log.read_text(errors="replace").splitlines()
-        kept = [line for line in lines if any(word in line for word in TELLING)]
+        kept = [line for line in lines if any(word in line for word in SUMMARY_WORDS)]
         stages[name]["said"] = kept[-6:]
     file.write_text(json.dumps(known | {"stages": stages}, indent=1))
 

@@ -1,4 +1,4 @@
-"""What the stages of gpu.py measure: medians and 95th percentiles, as ratios to what the device can do.
+"""Measurements of gpu.py's stages: medians and 95th percentiles, as ratios to the device's roofline.
 
 Kernels are timed as replays of captured graphs between events, queued behind a wait so that the host is not
 timed; `cold` ones find nothing of their own in the second-level cache. End to end is from a call to its
@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from record import guarded, told
+from record import guarded, output_of
 from torch import Tensor
 
 from gsparc.field.losses import _Kernel, _Similarity, ssim
@@ -135,11 +135,11 @@ def cold_ms(function: Callable[[], Any], rounds: int = 100) -> dict[str, float]:
 def clocks() -> str:
     """SM and memory clocks now and at most, power and temperature, as the driver says."""
     asked = "--query-gpu=clocks.sm,clocks.max.sm,clocks.mem,clocks.max.mem,power.draw,temperature.gpu"
-    return told("nvidia-smi", asked, "--format=csv,noheader")
+    return output_of("nvidia-smi", asked, "--format=csv,noheader")
 
 
 def ceilings() -> dict[str, Any]:
-    """What this device does at best: copy bandwidth, float32 arithmetic, and a launch that does nothing."""
+    """Roofline of this device: copy bandwidth, float32 rate, and the time of an empty launch."""
     big = torch.randn(512 * 2**20, device="cuda")
     other = torch.empty_like(big)
     copy = event_ms(partial(other.copy_, big))["p50"]
@@ -162,7 +162,7 @@ def ceilings() -> dict[str, Any]:
 
 
 def compared(times: dict[str, float], bytes_: float, flops: float, limits: dict[str, Any]) -> dict[str, Any]:
-    """Times beside the least the device needs for so many bytes and operations."""
+    """Times beside the roofline's lower bound for so many bytes and operations."""
     by_bytes, by_flops = bytes_ / limits["copy_tb_s"] / 1e9, flops / limits["float32_tflop_s"] / 1e9
     floor = max(by_bytes, by_flops)
     return times | {
@@ -175,7 +175,7 @@ def compared(times: dict[str, float], bytes_: float, flops: float, limits: dict[
 
 
 def counted_pairs(model: Model, pose: Pose) -> tuple[int, int]:
-    """(pixel, Gaussian) pairs that are lit and inside, and entries of the plan."""
+    """(pixel, Gaussian) pairs with a positive weight, and entries of the plan."""
     view = freeze(make_plan(*model, pose, GRID), *model, version=0)
     return int((view.buffers[3] > 0).sum()), len(view.buffers[2])
 
@@ -188,7 +188,7 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
     pixels = GRID.height * GRID.width
     found: dict[str, Any] = {"pairs": pairs, "entries": entries, "pairs_per_pixel": pairs / pixels}
 
-    # Bytes and operations that nobody can avoid: the model once, the plan's records once, images once.
+    # Minimal bytes and operations: the model once, the plan's records once, images once.
     image, gaussians, records = 8 * pixels, 4 * count * 12, 4 * count * 21
     planning = (gaussians + records, 0)
     forward = (gaussians + image, pairs * (FORWARD_FLOPS + PER_CHANNEL))
@@ -232,11 +232,10 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
 def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     """The backward operator alone, for an upstream gradient of noise."""
     raster = composite(plan, *model, features)
-    numbers = operators.numbers(plan.grid, plan.optics)
     upstream = torch.randn_like(raster.image)
     inputs = (upstream, None, raster.image, raster.transmittance, *model, None, features)
-    place = (plan.pose.position, plan.pose.rotation, list(plan.buffers))
-    return lambda: operators.composite_backward_op(*inputs, *place, *numbers)
+    view = operators.view_of(plan)
+    return lambda: operators.composite_backward_op(*inputs, *view)
 
 
 def by_kernel(function: Callable[[], Any]) -> dict[str, float]:
@@ -280,7 +279,7 @@ BATCHES = (1, 16, 64, 256, 1024, 4096)
 
 
 def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
-    """Spectra per second of a static receiver by the size of the batch, beside the vendor's products."""
+    """Spectra per second of a static receiver by the size of the batch, beside cuBLAS and cuSPARSE."""
     model, pose = scene(count), origin()
     view = freeze(make_plan(*model, pose, GRID), *model, version=0)
     weights = int((view.buffers[3] > 0).sum())
@@ -303,7 +302,7 @@ def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
 def frozen_batch(
     view: Any, dense: Tensor, sparse: Tensor, batch: int, weights: int, limits: dict[str, Any]
 ) -> dict[str, Any]:
-    """One size of batch: calls as a user makes them, captured ones, and the vendor's three ways."""
+    """One batch size: user calls, captured graphs, and three products of cuBLAS and cuSPARSE."""
     features = torch.rand(batch, len(dense), 1, device="cuda")
     flat = features.squeeze(-1)
     columns = flat.mT.contiguous()

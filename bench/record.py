@@ -1,4 +1,4 @@
-"""Where the figures of bench/gpu.sh go: one JSON file, section by section."""
+"""The JSON file of bench/gpu.sh's results, written section by section."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ def update(file: Path, **sections: Any) -> None:
     known = json.loads(file.read_text()) if file.exists() else {}
     unfinished = file.with_suffix(".part")
     unfinished.write_text(json.dumps(known | sections, indent=1))
-    unfinished.replace(file)  # a stage that is ended here leaves what was known
+    unfinished.replace(file)  # atomic: a stage that is killed here leaves the earlier sections
     LOG.info("%s", json.dumps(sections))
 
 
-def told(*command: str) -> str:
-    """What a program prints, or nothing where there is none such."""
+def output_of(*command: str) -> str:
+    """Standard output of a program, empty if it is not installed."""
     try:
         return subprocess.run(command, capture_output=True, text=True).stdout.strip()
     except OSError:
@@ -31,7 +31,7 @@ def told(*command: str) -> str:
 
 
 def guarded(section: Callable[[], Any]) -> Any:
-    """What a section measured, or its error: one failure must not cost the others."""
+    """Result of a section, or its error, so that the other sections still run."""
     try:
         return section()
     except Exception as error:

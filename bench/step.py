@@ -1,11 +1,11 @@
-"""What a training step is made of, beside the rasterizer: Lightning's loop, its logging, Adam, SSIM.
+"""Cost of a training step beside the rasterizer: Lightning's loop, its logging, Adam, SSIM.
 
     python bench/step.py dataset=rfid dataset.root=FOLDER [overrides of train.py]
 
 Steps of the configured model in turns: bare (a loop of a few lines around the same module), under Lightning
 with figures logged every tenth step, and every step; the bare loop with Adam's three forms, and without SSIM.
-Medians of the steps of each turn, then of the turns, in milliseconds of the processor: what a neighbour takes
-is not counted.
+Medians of the steps of each turn, then of the turns, in milliseconds of process time, which excludes
+other processes.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from gsparc.training.lightning_module import GaussianModule
 STEPS, TURNS = 40, 4
 
 
-class Watch(L.Callback):
-    """Notes when steps end, and keeps the module that takes them."""
+class StepTimer(L.Callback):
+    """Records when each step ends, and the module."""
 
     def __init__(self) -> None:
         self.ends: list[float] = []
         self.module: GaussianModule | None = None
 
     def on_train_batch_end(self, trainer, module, *unused):
-        """One more."""
+        """Record the time."""
         self.ends.append(time.process_time())
         self.module = module
 
@@ -66,15 +66,15 @@ class Steps:
 
     def under_lightning(self, log_every: int) -> tuple[float, GaussianModule]:
         """Milliseconds of a step, and the module."""
-        method, watch = build(self.config.model), Watch()
+        method, timer = build(self.config.model), StepTimer()
         fit.LOG_EVERY = log_every
         trainer = partial(fit.DEFAULTS, max_steps=STEPS, val_check_interval=STEPS)
         with tempfile.TemporaryDirectory() as folder:
             method.fit(
-                self.data, self.fold, FitContext(Path(folder), trainer=trainer, callbacks=lambda: [watch])
+                self.data, self.fold, FitContext(Path(folder), trainer=trainer, callbacks=lambda: [timer])
             )
-        assert watch.module is not None
-        return median_step(watch.ends), watch.module
+        assert timer.module is not None
+        return median_step(timer.ends), timer.module
 
     def bare(self, adam: Callable, ssim: bool = True) -> float:
         """Milliseconds of a step of a loop that does nothing else."""

@@ -2,57 +2,60 @@
 
 from collections.abc import Sequence
 
+from gsparc.ops.settings import KernelSettings
+
 RECORD: int
 MOMENTS: int
 STRIP_ROWS: int
 UNSOUND_POSE: int
+TILE_WIDTH: int
+TILE_HEIGHT: int
+SIMILARITY_WIDTH: int
+SIMILARITY_HEIGHT: int
+MOST_RADIUS: int
+MOST_INPUTS: int
+MOST_OUTPUTS: int
 
 Ints = Sequence[int]
 Reals = Sequence[float]
 
 def plan(
-    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
+    double: bool, poses: int, count: int, threads: int, settings: KernelSettings, tensors: Ints
 ) -> int: ...
-def entries(twice: bool, poses: int, count: int, threads: int, height: int, tensors: Ints) -> None: ...
+def entries(double: bool, poses: int, count: int, threads: int, height: int, tensors: Ints) -> None: ...
 def composite(
-    twice: bool,
+    double: bool,
     poses: int,
     count: int,
+    threads: int,
     samples: int,
     channels: int,
-    threads: int,
-    whole: Ints,
-    real: Reals,
+    settings: KernelSettings,
     tensors: Ints,
 ) -> None: ...
-def composite_backward(
-    twice: bool,
-    poses: int,
-    count: int,
-    samples: int,
-    channels: int,
-    threads: int,
-    whole: Ints,
-    real: Reals,
-    tensors: Ints,
-) -> None: ...
+
+composite_backward = composite
+
 def weights(
-    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
+    double: bool, poses: int, count: int, threads: int, settings: KernelSettings, tensors: Ints
 ) -> None: ...
-def weights_backward(
-    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
-) -> None: ...
-def freeze(twice: bool, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints) -> int: ...
-def thaw(twice: bool, height: int, width: int, channels: int, threads: int, tensors: Ints) -> None: ...
+
+weights_backward = weights
+
+def freeze(double: bool, count: int, threads: int, settings: KernelSettings, tensors: Ints) -> int: ...
+def thaw(double: bool, channels: int, height: int, width: int, threads: int, tensors: Ints) -> None: ...
 def instruction_set() -> str: ...
 def use_instruction_set(name: str) -> bool: ...
 def mark_exponentials(tasks: int, threads: int) -> int: ...
 def mark_copy(source: int, target: int, size: int, threads: int) -> None: ...
 def mark_pairs(
-    twice: bool, poses: int, count: int, threads: int, whole: Ints, real: Reals, tensors: Ints
+    double: bool, poses: int, count: int, threads: int, settings: KernelSettings, tensors: Ints
 ) -> int: ...
-def networks(twice: bool, sizes: Ints, threads: int, tensors: Ints) -> None: ...
-def networks_backward(twice: bool, sizes: Ints, threads: int, tensors: Ints) -> None: ...
+def networks(double: bool, sizes: Ints, threads: int, tensors: Ints) -> None: ...
+
+networks_backward = networks
+
 def similarity(sizes: Ints, stability: Reals, threads: int, tensors: Ints) -> None: ...
-def channels(twice: bool, sizes: Ints, tones: Reals, threads: int, tensors: Ints) -> None: ...
-def channels_backward(twice: bool, sizes: Ints, tones: Reals, threads: int, tensors: Ints) -> None: ...
+def channels(double: bool, sizes: Ints, tones: Reals, threads: int, tensors: Ints) -> None: ...
+
+channels_backward = channels

@@ -1,4 +1,4 @@
-"""Which backend does the work, and why one cannot."""
+"""Choice of backend, with the reason where one is unavailable."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from types import ModuleType
 
 import torch
 
-from gsparc.ops import dense
+from gsparc.ops import reference_backend
 
 
 class BackendUnavailable(RuntimeError):
-    """A backend was asked for that is not here; the message says why."""
+    """The requested backend is not available; the message says why."""
 
 
 def choose(name: str | None, device: torch.device) -> ModuleType:
@@ -26,7 +26,7 @@ def choose(name: str | None, device: torch.device) -> ModuleType:
 def named(name: str) -> ModuleType:
     """The backend called `name` (BackendUnavailable, ValueError)."""
     if name == "reference":
-        return dense
+        return reference_backend
     if name == "cpu":
         return _cpu()
     if name == "cuda":

@@ -1,4 +1,4 @@
-"""Whether the CPU kernels are here."""
+"""Whether the CPU kernels were compiled."""
 
 from __future__ import annotations
 

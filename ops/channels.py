@@ -53,7 +53,7 @@ def channels(
 def summed(
     gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float], subcarriers: int
 ) -> Tensor:
-    """The same (B, A, K, 2) in plain PyTorch; the definition of truth. `tones`: first and spacing [Hz]."""
+    """The same (B, A, K, 2) in plain PyTorch; the reference. `tones`: first and spacing [Hz]."""
     numbers = torch.arange(subcarriers, dtype=torch.float64, device=gains.device)
     turns = torch.outer(delays, tones[0] + tones[1] * numbers)
     phase = -2 * math.pi * (turns - turns.detach().floor())

@@ -1,6 +1,6 @@
-"""The operators of this package by the C++ kernels.
+"""The operators on CPU tensors, by the C++ kernels.
 
-Tensors go to them as addresses; the caller keeps them alive, and torch's number of threads goes along.
+Kernels receive addresses of tensors, which the caller keeps alive, and torch's number of threads.
 """
 
 from __future__ import annotations
@@ -11,76 +11,54 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, door
-from gsparc.ops.operators import check_memory, filled, gradients, model_of, plan_tensors
+from gsparc.ops import _native, validation
+from gsparc.ops.geometry import Gaussians
+from gsparc.ops.networks import Layers
+from gsparc.ops.operators import Buffers, Poses, check_memory, contiguous, empty_like, plan_tensors
+from gsparc.ops.settings import KernelSettings
 
 
 def addresses(*tensors: Tensor | None) -> list[int]:
-    """Where tensors lie; 0 stands for none."""
+    """Addresses of tensors; 0 for None."""
     return [0 if tensor is None else tensor.data_ptr() for tensor in tensors]
 
 
+def _run(kernel: Any, gaussians: Gaussians, poses: Poses, *numbers: Any, tensors: tuple[Any, ...]) -> Any:
+    """Call a kernel with sizes, `numbers` and the addresses of `tensors`."""
+    means = gaussians.means
+    sizes = (means.dtype == torch.float64, len(poses.positions), len(means), torch.get_num_threads())
+    return kernel(*sizes, *numbers, addresses(*tensors))
+
+
 def plan(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    strongest: Tensor,
-    ids: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings
+) -> tuple[Buffers, Tensor, Tensor, Tensor]:
     """`gsparc::plan`."""
-    poses, n, twice, threads = (
-        positions.shape[0],
-        means.shape[0],
-        means.dtype == torch.float64,
-        torch.get_num_threads(),
-    )
-    *buffers, means2d, radii, visible = plan_tensors(means, poses, whole[0])
-    inputs = [t.contiguous() for t in (means, quats, scales, strongest)]
-    outputs = (*buffers, means2d, radii, visible)
-    wrong = _native.plan(
-        *(twice, poses, n, threads, whole, real),
-        addresses(*inputs, None, positions.contiguous(), rotations.contiguous(), ids, *outputs),
-    )
-    if wrong == _native.UNSOUND_POSE:
-        door.raise_for_pose()
-    if wrong >= 0:
-        door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)
-    count = int(buffers[-1][-1])
-    check_memory(count, 4)
-    entries = means.new_empty(count, dtype=torch.int32)
-    _native.entries(twice, poses, n, threads, whole[0], addresses(*buffers, entries))
-    plan: Any = (*buffers, entries, means2d, radii, visible)
-    return plan
+    means = gaussians.means
+    buffers, *screen = plan_tensors(means, len(poses.positions), settings.height, 0)
+    tensors = (*contiguous((*gaussians, *poses, ids)), *buffers[:-1], *screen)
+    validation.raise_for_status(_run(_native.plan, gaussians, poses, settings, tensors=tensors))
+    entries = int(buffers.starts[-1])
+    check_memory(entries, 4)
+    buffers = buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))
+    _run(_native.entries, gaussians, poses, settings.height, tensors=buffers)
+    return buffers, screen[0], screen[1], screen[2]
 
 
 def composite(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    features: Tensor,
     means2d: Tensor,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
+    gaussians: Gaussians,
+    features: Tensor,
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
 ) -> tuple[Tensor, Tensor]:
     """`gsparc::composite`."""
-    samples, n, channels = features.shape
-    image = features.new_empty(samples, channels, *whole[:2])
-    transmittance = means.new_empty(positions.shape[0], *whole[:2])
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    features = features.contiguous()
-    _native.composite(
-        *(means.dtype == torch.float64, positions.shape[0], n, samples, channels, torch.get_num_threads()),
-        *(whole, real, addresses(*buffers, *model, features, image, transmittance)),
-    )
+    samples, _, channels = features.shape
+    image = features.new_empty(samples, channels, settings.height, settings.width)
+    transmittance = features.new_empty(len(poses.positions), settings.height, settings.width)
+    tensors = (*buffers, *contiguous((*gaussians, *poses, features)), image, transmittance)
+    _run(_native.composite, gaussians, poses, samples, channels, settings, tensors=tensors)
     return image, transmittance
 
 
@@ -89,125 +67,75 @@ def composite_backward(
     grad_transmittance: Tensor | None,
     image: Tensor,
     transmittance: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
+    gaussians: Gaussians,
     features: Tensor,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
+) -> tuple[Gaussians, Tensor, Tensor]:
     """`gsparc::composite_backward`."""
     samples, n, channels = features.shape
-    poses = positions.shape[0]
-    check_memory(
-        buffers[-1].shape[0],
-        means.element_size() * (_native.MOMENTS + (samples * channels if poses == 1 else channels)),
-    )
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    grads = gradients(means, quats, scales, opacities, extinctions)
-    grad_features, grad_screen = (
-        features.new_empty(features.shape),
-        means.new_empty(poses, n, 2),
-    )
-    inputs = [t.contiguous() for t in (features, image, transmittance, grad_image)]
-    grad_transmittance = None if grad_transmittance is None else grad_transmittance.contiguous()
-    _native.composite_backward(
-        *(means.dtype == torch.float64, poses, n, samples, channels, torch.get_num_threads(), whole, real),
-        addresses(*buffers, *model, *inputs, grad_transmittance, *grads, grad_features, grad_screen),
-    )
-    outputs: Any = (*filled(grads, means), grad_features, grad_screen)
-    return outputs
+    per_entry = _native.MOMENTS + (samples * channels if len(poses.positions) == 1 else channels)
+    check_memory(len(buffers.entries), features.element_size() * per_entry)
+    grads, grad_features = empty_like(gaussians), features.new_empty(features.shape)
+    grad_means2d = features.new_empty(len(poses.positions), n, 2)
+    images = (image, transmittance, grad_image, grad_transmittance)
+    inputs = contiguous((*gaussians, *poses, features, *images))
+    tensors = (*buffers, *inputs, *grads, grad_features, grad_means2d)
+    _run(_native.composite_backward, gaussians, poses, samples, channels, settings, tensors=tensors)
+    return grads, grad_features, grad_means2d
 
 
 def weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
+    gaussians: Gaussians, poses: Poses, buffers: Buffers, settings: KernelSettings
 ) -> tuple[Tensor, Tensor]:
     """`gsparc::weights`."""
-    poses, n = positions.shape[0], means.shape[0]
-    seen, total = means.new_empty(poses, n), means.new_empty(poses, n)
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    _native.weights(
-        *(means.dtype == torch.float64, poses, n, torch.get_num_threads(), whole, real),
-        addresses(*buffers, *model, seen, total),
-    )
+    seen, total = (gaussians.means.new_empty(len(poses.positions), len(gaussians.means)) for _ in range(2))
+    tensors = (*buffers, *contiguous((*gaussians, *poses)), seen, total)
+    _run(_native.weights, gaussians, poses, settings, tensors=tensors)
     return seen, total
 
 
 def weights_backward(
     grad_seen: Tensor,
     grad_total: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    gaussians: Gaussians,
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
+) -> Gaussians:
     """`gsparc::weights_backward`."""
-    poses, n = positions.shape[0], means.shape[0]
-    check_memory(buffers[-1].shape[0], means.element_size() * _native.MOMENTS)
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    grads = gradients(means, quats, scales, opacities, extinctions)
-    grad_seen, grad_total = grad_seen.contiguous(), grad_total.contiguous()
-    _native.weights_backward(
-        *(means.dtype == torch.float64, poses, n, torch.get_num_threads(), whole, real),
-        addresses(*buffers, *model, None, None, grad_seen, grad_total, *grads),
-    )
-    return filled(grads, means)
+    check_memory(len(buffers.entries), gaussians.means.element_size() * _native.MOMENTS)
+    grads = empty_like(gaussians)
+    inputs = contiguous((*gaussians, *poses, None, None, grad_seen, grad_total))
+    _run(_native.weights_backward, gaussians, poses, settings, tensors=(*buffers, *inputs, *grads))
+    return grads
 
 
-def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+def networks(encoded: Tensor, layers: Layers) -> Tensor:
     """`gsparc::networks`."""
-    out = encoded.new_empty(encoded.shape[0], weight1.shape[0], weight2.shape[2])
-    _networks("networks", *_contiguous(encoded, weight1, bias1, weight2, bias2), out)
+    out = encoded.new_empty(len(encoded), len(layers.weight1), layers.weight2.shape[2])
+    _networks(_native.networks, encoded, layers, out)
     return out
 
 
-def networks_backward(
-    slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def networks_backward(slope: Tensor, encoded: Tensor, layers: Layers) -> Layers:
     """`gsparc::networks_backward`."""
-    inputs = _contiguous(encoded, weight1, bias1, weight2, bias2)
-    grads = tuple(torch.empty_like(tensor) for tensor in inputs[1:])
-    _networks("networks_backward", *inputs, None, *_contiguous(slope), *grads)
-    return grads[0], grads[1], grads[2], grads[3]
+    grads = empty_like(layers)
+    _networks(_native.networks_backward, encoded, layers, None, slope.contiguous(), *grads)
+    return grads
 
 
-def _networks(name: str, encoded: Tensor, weight1: Tensor, *rest: Tensor | None) -> None:
-    """Call a kernel on contiguous tensors; rest is bias1, weight2 and what else it takes."""
-    (samples, inputs), (count, _, hidden) = encoded.shape, weight1.shape
-    weight2 = rest[1]
-    assert weight2 is not None
-    sizes = (samples, count, inputs, hidden, weight2.shape[2])
-    kernel = getattr(_native, name)
-    kernel(encoded.dtype == torch.float64, sizes, torch.get_num_threads(), addresses(encoded, weight1, *rest))
-
-
-def _contiguous(*tensors: Tensor) -> list[Tensor]:
-    return [tensor.contiguous() for tensor in tensors]
+def _networks(kernel, encoded: Tensor, layers: Layers, *rest: Tensor | None) -> None:
+    (count, inputs, hidden), outputs = layers.weight1.shape, layers.weight2.shape[2]
+    sizes = (len(encoded), count, inputs, hidden, outputs)
+    tensors = contiguous((encoded, *layers))
+    kernel(encoded.dtype == torch.float64, sizes, torch.get_num_threads(), addresses(*tensors, *rest))
 
 
 def similarity(
     prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor | None]:
     """`gsparc::similarity`."""
     window = torch.tensor(taps, dtype=torch.float32)
     images = [prediction.contiguous(), target.contiguous()]
@@ -215,4 +143,4 @@ def similarity(
     sizes = (*prediction.shape, len(taps) // 2)
     tensors = addresses(window, *images, value, slopes)
     _native.similarity(sizes, stability, torch.get_num_threads(), tensors)
-    return value, prediction.new_empty(0) if slopes is None else slopes
+    return value, slopes

@@ -4,8 +4,8 @@ A plan's buffers have the shapes of the CPU's, with contents of their own: recor
 Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
 tiles' starts (P tiles + 1), then for each entry its Gaussian and its slot.
 
-Inside a captured CUDA graph nothing may wait for the GPU, so a plan takes as many entries as plans of this
-size have needed before, and some more; should it need more, its images and gradients are NaN, never wrong.
+Inside a captured CUDA graph nothing may synchronise, so a plan has room for as many entries as earlier plans
+of this size needed, plus headroom; if it needs more, its images and gradients are NaN.
 """
 
 from __future__ import annotations
@@ -13,16 +13,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import nullcontext
 from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import cuda_library, door
-from gsparc.ops.operators import check_memory, filled, gradients, layout, model_of, plan_tensors
+from gsparc.ops import _native, cuda_library, validation
+from gsparc.ops.geometry import Gaussians
+from gsparc.ops.networks import Layers
+from gsparc.ops.operators import Buffers, Poses, check_memory, contiguous, empty_like, plan_tensors
+from gsparc.ops.settings import KernelSettings
 
-TILE_WIDTH, TILE_HEIGHT = 8, 4
 BYTES_PER_ENTRY = 36  # entries and what sorting them takes
-SIMILARITY_TILE, MOST_RADIUS = (8, 32), 5  # rows and columns of a block; its widest window
 MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
 
 libraries: dict[str, cuda_library.Library] = {}
@@ -31,13 +33,13 @@ libraries: dict[str, cuda_library.Library] = {}
 _capacities: dict[tuple, int] = {}
 
 
-def tiles(whole: Sequence[int]) -> int:
+def tiles(settings: KernelSettings) -> int:
     """Tiles of one pose's image."""
-    return -(-whole[0] // TILE_HEIGHT) * -(-whole[1] // TILE_WIDTH)
+    return -(-settings.height // _native.TILE_HEIGHT) * -(-settings.width // _native.TILE_WIDTH)
 
 
-def _roomy(entries: int) -> int:
-    """Room of a captured plan where the largest seen had so many entries."""
+def _with_headroom(entries: int) -> int:
+    """Capacity of a captured plan where the largest plan so far had so many entries."""
     return entries + entries // 4 + 1024
 
 
@@ -45,20 +47,17 @@ def _capturing(tensor: Tensor) -> bool:
     return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
-def run(
-    name: str,
-    like: Tensor,
-    *tensors: Tensor | None,
-    whole: Sequence[int] = (),
-    real: Sequence[float] = (),
-    sizes: dict[str, int],
-) -> None:
+def call_for(like: Tensor, tensors: Sequence[Tensor | None], **numbers: Any) -> cuda_library.Call:
+    """A call in the precision and on the device of `like`; `numbers` are fields of `Call`."""
+    call = cuda_library.Call(twice=like.dtype == torch.float64, device=like.device.index or 0, **numbers)
+    call.tensors[: len(tensors)] = [0 if t is None else t.data_ptr() for t in tensors]
+    return call
+
+
+def run(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> None:
     """Call a kernel with addresses of tensors and scratch memory, on the stream of `like`'s device."""
     library, device = libraries[like.device.type], like.device
-    call = cuda_library.Call(twice=like.dtype == torch.float64, device=device.index or 0, **sizes)
-    call.whole[: len(whole)], call.real[: len(real)] = list(whole), list(real)
-    addresses = [0 if t is None else t.data_ptr() for t in tensors]
-    call.tensors[: len(addresses)] = addresses
+    call = call_for(like, tensors, **numbers)
     with torch.cuda.device(device) if like.is_cuda else nullcontext():
         needed = library.run(name, call)
         scratch = torch.empty(needed, dtype=torch.uint8, device=device)
@@ -68,122 +67,94 @@ def run(
 
 
 @cache
-def _tables(device: torch.device, dtype: torch.dtype, whole: tuple, real: tuple) -> Tensor:
+def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) -> Tensor:
     """Sines and cosines of the grid's rows and columns, kept for good: captured graphs hold their address."""
     library = libraries[device.type]
-    call = cuda_library.Call(twice=dtype == torch.float64)
-    call.whole[:], call.real[:] = list(whole), list(real)
+    call = call_for(torch.empty(0, dtype=dtype), (), settings=settings)
     numbers = torch.empty(library.run("tables", call), dtype=dtype)
     call.tensors[0] = numbers.data_ptr()
     library.run("tables", call)
     return numbers.to(device)
 
 
-def view_of(means: Tensor, buffers: Sequence[Tensor], whole: Sequence[int], real: Sequence[float]) -> list:
-    """The addresses of `read_view`."""
-    tables = _tables(means.device, means.dtype, tuple(whole), tuple(real))
-    return [tables, *buffers[:5], buffers[5][-1:], buffers[6] if len(buffers) > 6 else None]
-
-
-def capacity_of(buffers: Sequence[Tensor], poses: int, whole: Sequence[int]) -> int:
+def capacity_of(buffers: Buffers, poses: int, settings: KernelSettings) -> int:
     """How many entries a plan has room for."""
-    return (buffers[6].numel() - poses * tiles(whole) - 1) // 2
+    return (buffers.entries.numel() - poses * tiles(settings) - 1) // 2
+
+
+def run_on_plan(
+    name: str,
+    buffers: Buffers,
+    gaussians: Gaussians,
+    poses: Poses,
+    settings: KernelSettings,
+    *tensors: Tensor | None,
+    **numbers: Any,
+) -> None:
+    """Call a kernel that reads a plan (`read_view`), Gaussians and poses, then `tensors`."""
+    means, count = gaussians.means, len(poses.positions)
+    entries = buffers.entries if buffers.entries.numel() else None
+    view = (_tables(means.device, means.dtype, settings), *buffers[:5], buffers.starts[-1:], entries)
+    numbers = {"capacity": capacity_of(buffers, count, settings), **numbers}
+    sizes = {"poses": count, "count": len(means), "settings": settings}
+    run(name, means, *view, *contiguous((*gaussians, *poses)), *tensors, **sizes, **numbers)
 
 
 def plan(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    strongest: Tensor,
-    ids: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings
+) -> tuple[Buffers, Tensor, Tensor, Tensor]:
     """`gsparc::plan`."""
-    poses, n = positions.shape[0], means.shape[0]
-    if poses * n >= MOST_PAIRS:
+    means, count, n = gaussians.means, len(poses.positions), len(gaussians.means)
+    if count * n >= MOST_PAIRS:
         raise MemoryError(
-            f"{poses} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
+            f"{count} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
         )
-    tensors = plan_tensors(means, poses, whole[0])
-    starts = poses * tiles(whole) + 1
+    buffers, means2d, radii, visible = plan_tensors(means, count, settings.height, 0)
+    starts = count * tiles(settings) + 1
     if n == 0:
-        return (*(t.zero_() for t in tensors[:6]), tensors[3].new_zeros(starts), *tensors[6:])  # type: ignore[return-value]
-    *buffers, means2d, radii, visible = tensors
-    model = [t.contiguous() for t in (means, quats, scales, strongest)]
-    view = [positions.contiguous(), rotations.contiguous()]
+        zeros = [buffer.zero_() for buffer in buffers[:-1]]
+        return Buffers(*zeros, buffers.entries.new_zeros(starts)), means2d, radii, visible
     verdict = means.new_empty(2, dtype=torch.int64)
-    sizes = {"poses": poses, "count": n}
-    outputs = (None if ids is None else ids.contiguous(), means2d, radii, visible, verdict)
-    run(
-        "plan",
-        means,
-        *view_of(means, buffers, whole, real),
-        *model,
-        None,
-        *view,
-        *outputs,
-        whole=whole,
-        real=real,
-        sizes=sizes,
-    )
-    key = (poses, n, tuple(whole))
+    outputs = (*contiguous([ids]), means2d, radii, visible, verdict)
+    run_on_plan("plan", buffers, gaussians, poses, settings, *outputs, capacity=0)
+    key = (count, n, settings)
     if _capturing(means):
         if key not in _capacities:
             raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
-        capacity = _roomy(_capacities[key])
+        capacity = _with_headroom(_capacities[key])
     else:
-        wrong, capacity = verdict.tolist()
-        if wrong == layout().UNSOUND_POSE:
-            door.raise_for_pose()
-        if wrong >= 0:
-            door.raise_for(("means", "quats", "scales", "opacities")[wrong % 4], wrong // 4)
+        status, capacity = verdict.tolist()
+        validation.raise_for_status(status)
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
-    buffers.append(means.new_empty(starts + 2 * capacity, dtype=torch.int32))
-    sizes["capacity"] = capacity
-    run("bin", means, *view_of(means, buffers, whole, real), whole=whole, real=real, sizes=sizes)
-    return (*buffers, means2d, radii, visible)  # type: ignore[return-value]
+    buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))
+    run_on_plan("bin", buffers, gaussians, poses, settings)
+    return buffers, means2d, radii, visible
 
 
-def _by_gaussian(features: Tensor, poses: int) -> Tensor:
+def _by_gaussian(features: Tensor, poses: Poses) -> Tensor:
     """Features (B, N, C) as (P, N, K) with the K channels of a pose side by side."""
-    if poses != 1:
+    if len(poses.positions) != 1:
         return features.contiguous()
     samples, n, channels = features.shape
     return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
 
 
-def _channels(features: Tensor, poses: int) -> int:
-    return features.shape[2] * (features.shape[0] if poses == 1 else 1)
-
-
 def composite(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    features: Tensor,
     means2d: Tensor,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
+    gaussians: Gaussians,
+    features: Tensor,
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
 ) -> tuple[Tensor, Tensor]:
     """`gsparc::composite`."""
-    poses = positions.shape[0]
-    image = features.new_empty(features.shape[0], features.shape[2], *whole[:2])
-    transmittance = means.new_empty(poses, *whole[:2])
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
+    samples, _, channels = features.shape
+    image = features.new_empty(samples, channels, settings.height, settings.width)
+    transmittance = features.new_empty(len(poses.positions), settings.height, settings.width)
     rows = _by_gaussian(features, poses)
-    tensors = [*view_of(means, buffers, whole, real), *model, rows, image, transmittance]
-    sizes = {"poses": poses, "count": means.shape[0], "channels": _channels(features, poses)}
-    sizes["capacity"] = capacity_of(buffers, poses, whole)
-    run("composite", means, *tensors, whole=whole, real=real, sizes=sizes)
+    tensors = (rows, image, transmittance)
+    run_on_plan("composite", buffers, gaussians, poses, settings, *tensors, channels=rows.shape[2])
     return image, transmittance
 
 
@@ -192,128 +163,96 @@ def composite_backward(
     grad_transmittance: Tensor | None,
     image: Tensor,
     transmittance: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
+    gaussians: Gaussians,
     features: Tensor,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
+) -> tuple[Gaussians, Tensor, Tensor]:
     """`gsparc::composite_backward`."""
-    poses, n, capacity = positions.shape[0], means.shape[0], capacity_of(buffers, positions.shape[0], whole)
-    channels = _channels(features, poses)
-    check_memory(capacity, means.element_size() * (layout().MOMENTS + channels))
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    grads = gradients(means, quats, scales, opacities, extinctions)
+    count, (samples, n, channels) = len(poses.positions), features.shape
     rows = _by_gaussian(features, poses)
-    slopes, screen = torch.empty_like(rows), means.new_empty(poses, n, 2)
-    behind = None if grad_transmittance is None else grad_transmittance.contiguous()
-    inputs = [rows, image.contiguous(), transmittance.contiguous(), grad_image.contiguous(), behind]
-    tensors = [*view_of(means, buffers, whole, real), *model, *inputs, *grads, slopes, screen]
-    sizes = {"poses": poses, "count": n, "channels": channels, "capacity": capacity}
+    width, entries = rows.shape[2], capacity_of(buffers, count, settings)
+    check_memory(entries, features.element_size() * (_native.MOMENTS + width))
+    grads, grad_rows = empty_like(gaussians), torch.empty_like(rows)
+    grad_means2d = features.new_empty(count, n, 2)
+    images = contiguous((image, transmittance, grad_image, grad_transmittance))
+    tensors = (rows, *images, *grads, grad_rows, grad_means2d)
     if n > 0:
-        run("composite_backward", means, *tensors, whole=whole, real=real, sizes=sizes)
-    if poses == 1:
-        samples, _, width = features.shape
-        slopes = slopes.reshape(n, samples, width).permute(1, 0, 2).contiguous()
-    return (*filled(grads, means), slopes, screen)
+        run_on_plan(
+            "composite_backward", buffers, gaussians, poses, settings, *tensors, channels=rows.shape[2]
+        )
+    if count == 1:
+        grad_rows = grad_rows.reshape(n, samples, channels).permute(1, 0, 2).contiguous()
+    return grads, grad_rows, grad_means2d
 
 
 def weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
+    gaussians: Gaussians, poses: Poses, buffers: Buffers, settings: KernelSettings
 ) -> tuple[Tensor, Tensor]:
     """`gsparc::weights`."""
-    poses, n = positions.shape[0], means.shape[0]
-    sums = means.new_empty(poses, n, 2)
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    tensors = [*view_of(means, buffers, whole, real), *model, sums, None, None]
-    if n > 0:
-        sizes = {"poses": poses, "count": n, "capacity": capacity_of(buffers, poses, whole)}
-        run("weights", means, *tensors, whole=whole, real=real, sizes=sizes)
+    sums = gaussians.means.new_empty(len(poses.positions), len(gaussians.means), 2)
+    if sums.numel():
+        run_on_plan("weights", buffers, gaussians, poses, settings, sums, None, None)
     return sums[..., 0].clone(), sums[..., 1].clone()
 
 
 def weights_backward(
     grad_seen: Tensor,
     grad_total: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    gaussians: Gaussians,
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
+) -> Gaussians:
     """`gsparc::weights_backward`."""
-    poses, n, capacity = positions.shape[0], means.shape[0], capacity_of(buffers, positions.shape[0], whole)
-    check_memory(capacity, means.element_size() * (layout().MOMENTS + 1))
-    model = model_of(means, quats, scales, opacities, extinctions, positions, rotations)
-    grads = gradients(means, quats, scales, opacities, extinctions)
-    slopes = [grad_seen.contiguous(), grad_total.contiguous()]
-    tensors = [*view_of(means, buffers, whole, real), *model, *slopes, *grads]
-    if n > 0:
-        sizes = {"poses": poses, "count": n, "channels": 1, "capacity": capacity}
-        run("weights_backward", means, *tensors, whole=whole, real=real, sizes=sizes)
-    return filled(grads, means)
+    entries = capacity_of(buffers, len(poses.positions), settings)
+    check_memory(entries, gaussians.means.element_size() * (_native.MOMENTS + 1))
+    grads = empty_like(gaussians)
+    tensors = (*contiguous((grad_seen, grad_total)), *grads)
+    if len(gaussians.means) > 0:
+        run_on_plan("weights_backward", buffers, gaussians, poses, settings, *tensors, channels=1)
+    return grads
 
 
-def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+def _sizes(encoded: Tensor, layers: Layers) -> dict[str, int]:
+    count, inputs, hidden = layers.weight1.shape
+    sizes = {"samples": len(encoded), "count": count, "channels": layers.weight2.shape[2]}
+    return {**sizes, "inputs": inputs, "hidden": hidden}
+
+
+def networks(encoded: Tensor, layers: Layers) -> Tensor:
     """`gsparc::networks`."""
-    inputs = [t.contiguous() for t in (encoded, weight1, bias1, weight2, bias2)]
-    samples, (count, width, hidden), channels = encoded.shape[0], weight1.shape, weight2.shape[2]
-    out = encoded.new_empty(samples, count, channels)
-    sizes = {"samples": samples, "count": count, "channels": channels}
+    out = encoded.new_empty(len(encoded), len(layers.weight1), layers.weight2.shape[2])
     if out.numel():
-        run("networks", encoded, *inputs, out, whole=(width, hidden), sizes=sizes)
+        run("networks", encoded, *contiguous((encoded, *layers)), out, **_sizes(encoded, layers))
     return out
 
 
-def networks_backward(
-    slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def networks_backward(slope: Tensor, encoded: Tensor, layers: Layers) -> Layers:
     """`gsparc::networks_backward`."""
-    inputs = [t.contiguous() for t in (encoded, weight1, bias1, weight2, bias2, slope)]
-    samples, (count, width, hidden), channels = encoded.shape[0], weight1.shape, weight2.shape[2]
-    grads = [torch.zeros_like(t, memory_format=torch.contiguous_format) for t in inputs[1:5]]
-    sizes = {"samples": samples, "count": count, "channels": channels}
+    grads = Layers(*(layer.new_zeros(layer.shape) for layer in layers))
+    tensors = (*contiguous((encoded, *layers, slope)), *grads)
     if slope.numel():
-        run("networks_backward", encoded, *inputs, *grads, whole=(width, hidden), sizes=sizes)
-    return grads[0], grads[1], grads[2], grads[3]
+        run("networks_backward", encoded, *tensors, **_sizes(encoded, layers))
+    return grads
 
 
 def similarity(
     prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Tensor, Tensor | None]:
     """`gsparc::similarity` (ValueError: a window that is not symmetric, or wider than the kernels take)."""
     half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
     radius = len(half) - 1
-    if radius > MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
-        most = 2 * MOST_RADIUS + 1
+    if radius > _native.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
+        most = 2 * _native.MOST_RADIUS + 1
         raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
     rows, columns = height - 2 * radius, width - 2 * radius
-    sums = prediction.new_empty(samples, -(-rows // SIMILARITY_TILE[0]) * -(-columns // SIMILARITY_TILE[1]))
+    blocks = -(-rows // _native.SIMILARITY_HEIGHT) * -(-columns // _native.SIMILARITY_WIDTH)
+    sums = prediction.new_empty(samples, blocks)
     slopes = torch.empty_like(prediction, memory_format=torch.contiguous_format) if slope else None
     inputs = [prediction.contiguous(), target.contiguous(), target.mean(dim=(-2, -1))]
-    whole, real = (height, width, radius), (*stability, *half)
+    sizes = {"samples": samples, "height": height, "width": width, "radius": radius}
     if samples:
-        tensors = (*inputs, sums, slopes)
-        run("similarity", prediction, *tensors, whole=whole, real=real, sizes={"samples": samples})
-    value = sums.sum(1) / (rows * columns)
-    return value, prediction.new_empty(0) if slopes is None else slopes
+        run("similarity", prediction, *inputs, sums, slopes, window=(*stability, *half), **sizes)
+    return sums.sum(1) / (rows * columns), slopes

@@ -1,4 +1,4 @@
-"""The CUDA kernels as a shared library: found or built when first asked for, or a line that says why not.
+"""The CUDA kernels as a shared library: found in the cache or built on first use.
 
 The library is plain C (no Python, no libtorch): addresses of tensors go in, and torch's own stream.
 """
@@ -14,8 +14,11 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import torch
+
+from gsparc.ops.settings import KernelSettings
 
 SOURCES = Path(__file__).parent / "csrc"
 UNITS = ("plan", "composite", "frozen", "networks", "similarity")
@@ -24,22 +27,31 @@ LOG = logging.getLogger(__name__)
 
 
 class LibraryUnavailable(RuntimeError):
-    """There are no CUDA kernels here; the message says why in one line."""
+    """The CUDA kernels are not available; the message says why in one line."""
+
+
+_C_TYPES: dict[type, Any] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: ctypes.c_double}
+
+
+class _Settings(ctypes.Structure):
+    """`KernelSettings<double>` of csrc/layout.h."""
+
+    _fields_ = tuple((name, _C_TYPES[kind]) for name, kind in get_type_hints(KernelSettings).items())
+
+
+_NUMBERS = (
+    *("twice", "poses", "count", "samples", "channels", "capacity", "device", "height", "width"),
+    *("inputs", "hidden", "radius", "built_for", "driver"),
+)
 
 
 class Call(ctypes.Structure):
     """One call into the library; `Call` of csrc/cuda/view.h."""
 
     _fields_ = (
-        ("twice", ctypes.c_int32),
-        ("poses", ctypes.c_int32),
-        ("count", ctypes.c_int32),
-        ("samples", ctypes.c_int32),
-        ("channels", ctypes.c_int32),
-        ("capacity", ctypes.c_int32),
-        ("device", ctypes.c_int32),
-        ("whole", ctypes.c_int32 * 6),
-        ("real", ctypes.c_double * 10),
+        *((name, ctypes.c_int32) for name in _NUMBERS),
+        ("settings", _Settings),
+        ("window", ctypes.c_double * 8),
         ("tensors", ctypes.c_uint64 * 32),
         ("scratch", ctypes.c_uint64),
         ("stream", ctypes.c_uint64),
@@ -76,7 +88,9 @@ class Library:
         try:
             self.run("check", call)
         except RuntimeError as error:
-            built, driver = (f"{version // 1000}.{version % 1000 // 10}" for version in call.whole[:2])
+            built, driver = (
+                f"{version // 1000}.{version % 1000 // 10}" for version in (call.built_for, call.driver)
+            )
             raise LibraryUnavailable(
                 f"{error}; the kernels were built with CUDA {built} and the driver is of CUDA {driver}: "
                 "update the driver, or set CUDA_HOME to a toolkit no newer than it"
@@ -136,7 +150,7 @@ def library_path(*architectures: str) -> Path:
 
 
 def fingerprint(*also: str) -> str:
-    """Hash of the sources and of whatever else decides what comes out."""
+    """Hash of the sources and of `also`, such as compiler flags."""
     digest = hashlib.sha256(repr(also).encode())
     for source in sorted([*SOURCES.glob("*.h"), *(SOURCES / "cuda").glob("*")]):
         digest.update(source.name.encode() + source.read_bytes())
@@ -164,9 +178,9 @@ def build(path: Path, *architectures: str) -> None:
 
 
 def target(nvcc: str, arch: str) -> str:
-    """What nvcc is told for a GPU: its own code, or for one newer than nvcc what the driver translates."""
-    told = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
-    known = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", told)})
+    """nvcc's option for a GPU: native code, or PTX for one newer than nvcc."""
+    listed = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
+    known = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", listed)})
     if not known or int(arch) in known:
         return f"-gencode=arch=compute_{arch},code=sm_{arch}"
     older = [number for number in known if number < int(arch)]
@@ -179,7 +193,7 @@ def target(nvcc: str, arch: str) -> str:
 
 
 def compile_to(path: Path, command: list[str]) -> None:
-    """Run a compiler whose output appears at `path` whole or not at all (LibraryUnavailable)."""
+    """Run a compiler; its output replaces `path` atomically (LibraryUnavailable)."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -1,4 +1,4 @@
-"""A static receiver at inference: everything but the emission, frozen to one sparse matrix."""
+"""A static receiver at inference: compositing weights as one sparse matrix applied to the features."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class FrozenPlan:
 
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
-        """Image (C, H, W) or (B, C, H, W) of the features (V, C) or (B, V, C) of those in `order` alone."""
+        """As `render`, of features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
         batch = seen if seen.dim() == 3 else seen.unsqueeze(0)
         samples, count, channels = batch.shape
         columns = batch.transpose(0, 1).reshape(count, samples * channels)

@@ -1,12 +1,31 @@
-"""Where a receiver stands and which directions it looks at."""
+"""Gaussians, receiver poses, and the grid of directions that a receiver looks at."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+
+
+class Gaussians(NamedTuple):
+    """N Gaussians, of one floating dtype on one device.
+
+    Attributes:
+        means: (N, 3) [m].
+        quats: (N, 4) w x y z, any length; the zero quaternion means no rotation.
+        scales: (N, 3) standard deviations [m].
+        opacities: (N,) in [0, 1].
+        extinctions: (N,) in [0, 1], what occludes, or None where that is the opacity.
+    """
+
+    means: Tensor
+    quats: Tensor
+    scales: Tensor
+    opacities: Tensor
+    extinctions: Tensor | None
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
-from torch.library import custom_op
 
 from gsparc.ops import backends, built
-from gsparc.ops.operators import KERNELS
-
-MOST_INPUTS, MOST_OUTPUTS = 256, 4  # of the CUDA kernels, whose weights pass through registers
+from gsparc.ops.operators import empty_like, operator
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
@@ -22,10 +21,11 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     """
     if encoded.requires_grad or encoded.dtype != weight1.dtype:
         return products(encoded, weight1, bias1, weight2, bias2)
-    fits = encoded.dtype in (torch.float32, torch.float64) and built.kernels() is not None
-    if encoded.is_cuda:
+    kernels = built.kernels()
+    fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None
+    if fits and encoded.is_cuda:
         fits = encoded.dtype == torch.float32
-        fits &= weight1.shape[1] <= MOST_INPUTS and weight2.shape[2] <= MOST_OUTPUTS
+        fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
         backends.named(encoded.device.type)  # its kernels are then in the table
         return networks_op(encoded, weight1, bias1, weight2, bias2)
@@ -33,7 +33,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
 
 
 def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
-    """The same (B, N, C) as matrix products; the definition of truth."""
+    """The same (B, N, C) as matrix products; the reference."""
     count, width, hidden = weight1.shape
     # One product for all Gaussians: the encoded position is the same for each of them.
     inner = (encoded @ weight1.permute(1, 0, 2).reshape(width, count * hidden)).view(
@@ -42,29 +42,25 @@ def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     return torch.einsum("bnh,nhc->bnc", torch.relu(inner + bias1), weight2) + bias2
 
 
-@custom_op("gsparc::networks", mutates_args=())
-def networks_op(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
+class Layers(NamedTuple):
+    """The weights and biases of `networks`."""
+
+    weight1: Tensor
+    bias1: Tensor
+    weight2: Tensor
+    bias2: Tensor
+
+
+@operator
+def networks_op(encoded: Tensor, layers: Layers) -> Tensor:
     """`networks`, without a gradient for `encoded`."""
-    return KERNELS[encoded.device.type].networks(encoded, weight1, bias1, weight2, bias2)
+    return encoded.new_empty(encoded.shape[0], layers.weight1.shape[0], layers.weight2.shape[2])
 
 
-@networks_op.register_fake
-def _(encoded, weight1, bias1, weight2, bias2):
-    return encoded.new_empty(encoded.shape[0], weight1.shape[0], weight2.shape[2])
-
-
-@custom_op("gsparc::networks_backward", mutates_args=())
-def networks_backward_op(
-    slope: Tensor, encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of weight1, bias1, weight2, bias2 for the gradient `slope` (B, N, C) of the outputs."""
-    return KERNELS[encoded.device.type].networks_backward(slope, encoded, weight1, bias1, weight2, bias2)
-
-
-@networks_backward_op.register_fake
-def _(slope, encoded, weight1, bias1, weight2, bias2):
-    shapes = (weight1.shape, bias1.shape, weight2.shape, bias2.shape)
-    return tuple(slope.new_empty(shape) for shape in shapes)
+@operator
+def networks_backward_op(slope: Tensor, encoded: Tensor, layers: Layers) -> Layers:
+    """Gradients of the layers for the gradient `slope` (B, N, C) of the outputs."""
+    return empty_like(layers)
 
 
 def _setup(ctx, inputs, output):

@@ -1,46 +1,137 @@
-"""The rasterizer's operators, defined once for every device: names, shapes and gradients.
+"""The rasterizer's operators `gsparc::...`, each signature stated once: names, shapes and gradients.
 
-Operators are named `gsparc::...` and carry everything as tensors and numbers. What computes them on a device
-is a module with a function of each operator's name, entered in `KERNELS`.
+An operator is a function that returns empty tensors of the right shapes, which is also its fake. What
+computes it on a device is the function of the same name and parameters in that device's module of `KERNELS`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple, get_type_hints
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
+from torch.library import CustomOpDef, custom_op
 
 from gsparc.ops import built
-from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
-from gsparc.ops.settings import ALPHA_MAX, HORIZON_COSINE, Optics
+from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
 
 KERNELS: dict[str, ModuleType] = {}
-"""By type of device; backends enter theirs when they are loaded."""
+"""Modules of kernels by type of device; each backend adds its own when it is loaded."""
 
 MEMORY_BOUND = 8 * 2**30
 """Bytes that one call may need for entries and gradient slots [B]; more is refused before it is allocated."""
 
 
+class Poses(NamedTuple):
+    """P receiver poses: positions (P, 3) [m] and local-to-world rotations (P, 3, 3)."""
+
+    positions: Tensor
+    rotations: Tensor
+
+
+class Buffers(NamedTuple):
+    """A plan as the CPU kernels lay it out (cuda_kernels.py says what differs there).
+
+    Attributes:
+        records: (P, N, RECORD) footprints, by depth.
+        boxes: (P, N, 4) int32 rows and columns that each touches, by depth.
+        order: (P, N) int32, Gaussian of each rank in depth.
+        shown: (P,) int32, number of visible ranks.
+        slots: (P, N + 1) int64, first entry of each rank.
+        starts: (P strips + 1) int64, first entry of each strip of rows.
+        entries: (E,) int32 ranks, front to back within each strip.
+    """
+
+    records: Tensor
+    boxes: Tensor
+    order: Tensor
+    shown: Tensor
+    slots: Tensor
+    starts: Tensor
+    entries: Tensor
+
+
+def _leaves(values: Iterable[Any]) -> list[Any]:
+    """Values with the fields of named tuples in their places."""
+    return [leaf for value in values for leaf in (value if isinstance(value, tuple) else (value,))]
+
+
+def _outputs(outputs: Any, like: Tensor) -> Any:
+    """As an operator returns them: flat, with an empty tensor in the place of None."""
+    if isinstance(outputs, Tensor):
+        return outputs
+    return tuple(like.new_empty(0) if leaf is None else leaf for leaf in _leaves(outputs))
+
+
+_KINDS = tuple(get_type_hints(KernelSettings).values())
+
+
+def packed(settings: KernelSettings) -> list[float]:
+    """Settings as an operator takes them."""
+    return list(map(float, settings))
+
+
+@lru_cache(maxsize=64)
+def _named(numbers: tuple[float, ...]) -> KernelSettings:
+    return KernelSettings(*(kind(number) for kind, number in zip(_KINDS, numbers, strict=True)))
+
+
+def _unpacked(packed: tuple[Sequence[float]]) -> KernelSettings:
+    return _named(tuple(packed[0]))
+
+
+def operator(shapes: Callable[..., Any]) -> CustomOpDef:
+    """Define `gsparc::NAME` of a function `NAME_op`.
+
+    Each field of a named tuple becomes an argument; `KernelSettings` become one list of numbers (`packed`),
+    for torch's time per call grows with the square of the number of arguments.
+
+    The first argument of every operator is a tensor, whose device selects the kernel.
+    """
+    name = shapes.__name__.removesuffix("_op")
+    hints = get_type_hints(shapes)
+    returned = hints.pop("return")
+    arguments: dict[str, Any] = {}
+    groups: list[tuple[Any, int, int]] = []  # named tuple or None, first and last argument
+    for parameter, hint in hints.items():
+        make, fields = getattr(hint, "_make", None), {parameter: hint}
+        if hint is KernelSettings:
+            make, fields = _unpacked, {parameter: Sequence[float]}
+        elif make:
+            fields = get_type_hints(hint)
+        groups.append((make, len(arguments), len(arguments) + len(fields)))
+        arguments |= fields
+
+    def grouped(flat: tuple[Any, ...]) -> list[Any]:
+        return [make(flat[first:last]) if make else flat[first] for make, first, last in groups]
+
+    def compute(*flat: Any) -> Any:
+        kernel = getattr(KERNELS[flat[0].device.type], name)
+        return _outputs(kernel(*grouped(flat)), flat[0])
+
+    kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
+    parameters = [inspect.Parameter(key, kind, annotation=hint) for key, hint in arguments.items()]
+    if returned is not Tensor:
+        parts = (returned,) if hasattr(returned, "_fields") else returned.__args__
+        count = sum(len(getattr(part, "_fields", (0,))) for part in parts)
+        returned = tuple[(Tensor,) * count]  # type: ignore[misc]
+    compute.__signature__ = inspect.Signature(parameters, return_annotation=returned)  # type: ignore[attr-defined]
+    compute.__doc__ = shapes.__doc__
+    defined = custom_op(f"gsparc::{name}", compute, mutates_args=())
+    defined.register_fake(lambda *flat: _outputs(shapes(*grouped(flat)), flat[0]))
+    return defined
+
+
 def layout() -> Any:
-    """Constants that the kernels of all devices share: RECORD, MOMENTS, STRIP_ROWS, UNSOUND_POSE."""
+    """The compiled kernels' module, for the constants of csrc/layout.h that all devices share."""
     return built.kernels()
-
-
-def numbers(grid: SphereGrid, optics: Optics) -> tuple[list[int], list[float]]:
-    """What the kernels' `Lens` is made of."""
-    tangent = optics.projection == "tangent"
-    flags = [grid.periodic, tangent, optics.compensate, optics.cutoff.relative]
-    return [grid.height, grid.width, *map(int, flags)], [
-        *(grid.first_elevation, grid.first_azimuth, grid.elevation_step, grid.azimuth_step),
-        *(optics.low_pass, optics.near, optics.cutoff.alpha, optics.cutoff.transmittance),
-        *(ALPHA_MAX, HORIZON_COSINE),
-    ]
 
 
 def strips(height: int) -> int:
@@ -48,365 +139,160 @@ def strips(height: int) -> int:
     return -(-height // layout().STRIP_ROWS)
 
 
-def plan_tensors(means: Tensor, poses: int, height: int) -> tuple[Tensor, ...]:
-    """A plan's buffers before its entries, then means2d, radii and visible."""
+def empty_like(tensors: Any) -> Any:
+    """The named tuple of contiguous empty tensors shaped as those of `tensors`, None where there is none."""
+    return type(tensors)(*(None if t is None else t.new_empty(t.shape) for t in tensors))
+
+
+def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
+    """Detached, contiguous tensors, as kernels read them."""
+    return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors]
+
+
+def plan_tensors(
+    means: Tensor, poses: int, height: int, entries: int | torch.SymInt
+) -> tuple[Buffers, Tensor, Tensor, Tensor]:
+    """Empty tensors of a plan as the CPU lays it out, then of means2d, radii and visible."""
     n = means.shape[0]
-    return (
-        means.new_empty(poses, n, layout().RECORD),
-        means.new_empty(poses, n, 4, dtype=torch.int32),
-        means.new_empty(poses, n, dtype=torch.int32),
-        means.new_empty(poses, dtype=torch.int32),
-        means.new_empty(poses, n + 1, dtype=torch.int64),
-        means.new_empty(poses * strips(height) + 1, dtype=torch.int64),
-        means.new_empty(poses, n, 2),
-        means.new_empty(poses, n),
-        means.new_empty(poses, n, dtype=torch.bool),
+    buffers = Buffers(
+        records=means.new_empty(poses, n, layout().RECORD),
+        boxes=means.new_empty(poses, n, 4, dtype=torch.int32),
+        order=means.new_empty(poses, n, dtype=torch.int32),
+        shown=means.new_empty(poses, dtype=torch.int32),
+        slots=means.new_empty(poses, n + 1, dtype=torch.int64),
+        starts=means.new_empty(poses * strips(height) + 1, dtype=torch.int64),
+        entries=means.new_empty(entries, dtype=torch.int32),
     )
+    screen = means.new_empty(poses, n, 2), means.new_empty(poses, n)
+    return buffers, *screen, means.new_empty(poses, n, dtype=torch.bool)
 
 
-@custom_op("gsparc::plan", mutates_args=())
+@operator
 def plan_op(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    strongest: Tensor,
-    ids: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Records, boxes, order, shown, slots, strip starts, entries; means2d, radii, visible."""
-    return KERNELS[means.device.type].plan(
-        means, quats, scales, strongest, ids, positions, rotations, whole, real
-    )
-
-
-@plan_op.register_fake
-def _(means, quats, scales, strongest, ids, positions, rotations, whole, real):
-    *buffers, means2d, radii, visible = plan_tensors(means, positions.shape[0], whole[0])
+    gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings
+) -> tuple[Buffers, Tensor, Tensor, Tensor]:
+    """Plan, means2d (P, N, 2), radii and visible (P, N); opacities: the larger of opacity and extinction."""
     count = torch.library.get_ctx().new_dynamic_size()
-    return (*buffers, means.new_empty(count, dtype=torch.int32), means2d, radii, visible)
+    return plan_tensors(gaussians.means, poses.positions.shape[0], settings.height, count)
 
 
-@custom_op("gsparc::composite", mutates_args=())
+@operator
 def composite_op(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    features: Tensor,
     means2d: Tensor,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
+    gaussians: Gaussians,
+    features: Tensor,
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
 ) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W); `means2d` only receives a gradient."""
-    return KERNELS[means.device.type].composite(
-        means,
-        quats,
-        scales,
-        opacities,
-        extinctions,
-        features,
-        means2d,
-        positions,
-        rotations,
-        buffers,
-        whole,
-        real,
-    )
+    size = (settings.height, settings.width)
+    image = features.new_empty(features.shape[0], features.shape[2], *size)
+    return image, means2d.new_empty(means2d.shape[0], *size)
 
 
-@composite_op.register_fake
-def _(
-    means,
-    quats,
-    scales,
-    opacities,
-    extinctions,
-    features,
-    means2d,
-    positions,
-    rotations,
-    buffers,
-    whole,
-    real,
-):
-    image = features.new_empty(features.shape[0], features.shape[2], whole[0], whole[1])
-    return image, means.new_empty(positions.shape[0], whole[0], whole[1])
-
-
-@custom_op("gsparc::composite_backward", mutates_args=())
+@operator
 def composite_backward_op(
     grad_image: Tensor,
     grad_transmittance: Tensor | None,
     image: Tensor,
     transmittance: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
+    gaussians: Gaussians,
     features: Tensor,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means, quats, scales, opacities, extinctions (empty if absent), features, means2d."""
-    return KERNELS[grad_image.device.type].composite_backward(
-        grad_image,
-        grad_transmittance,
-        image,
-        transmittance,
-        means,
-        quats,
-        scales,
-        opacities,
-        extinctions,
-        features,
-        positions,
-        rotations,
-        buffers,
-        whole,
-        real,
-    )
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
+) -> tuple[Gaussians, Tensor, Tensor]:
+    """Gradients of the Gaussians (extinctions empty if absent), features and means2d."""
+    screen = image.new_empty(poses.positions.shape[0], gaussians.means.shape[0], 2)
+    return empty_like(gaussians), features.new_empty(features.shape), screen
 
 
-@composite_backward_op.register_fake
-def _(
-    grad_image,
-    grad_transmittance,
-    image,
-    transmittance,
-    means,
-    quats,
-    scales,
-    opacities,
-    extinctions,
-    features,
-    positions,
-    rotations,
-    buffers,
-    whole,
-    real,
-):
-    grads = filled(gradients(means, quats, scales, opacities, extinctions), means)
-    return (*grads, _like(features), means.new_empty(positions.shape[0], means.shape[0], 2))
+@operator
+def weights_op(
+    gaussians: Gaussians, poses: Poses, buffers: Buffers, settings: KernelSettings
+) -> tuple[Tensor, Tensor]:
+    """Sums over pixels of alpha T and of alpha, both (P, N)."""
+    size = (poses.positions.shape[0], gaussians.means.shape[0])
+    return gaussians.means.new_empty(size), gaussians.means.new_empty(size)
+
+
+@operator
+def weights_backward_op(
+    grad_seen: Tensor,
+    grad_total: Tensor,
+    gaussians: Gaussians,
+    poses: Poses,
+    buffers: Buffers,
+    settings: KernelSettings,
+) -> Gaussians:
+    """Gradients of the Gaussians (extinctions empty if absent)."""
+    return empty_like(gaussians)
+
+
+def _gradients(gaussians: tuple[Tensor, ...], tensors: list[Tensor | None]) -> list[Tensor | None]:
+    """Gradients of the Gaussians, which are the first `tensors`: None for an absent one."""
+    return [g if t is not None else None for g, t in zip(gaussians, tensors, strict=False)]
 
 
 def _composite_setup(ctx, inputs, output):
-    means, quats, scales, opacities, extinctions, features, _, positions, rotations, buffers, whole, real = (
-        inputs
-    )
-    ctx.hides = extinctions is not None
-    ctx.save_for_backward(
-        *(*output, means, quats, scales, opacities, *([extinctions] if ctx.hides else [])),
-        *(features, positions, rotations, *buffers),
-    )
-    ctx.whole, ctx.real = whole, real
+    ctx.save_for_backward(*output, *inputs[1:-1])
+    ctx.settings = inputs[-1]
 
 
 def _composite_backward(ctx, grad_image, grad_transmittance):
-    image, transmittance, means, quats, scales, opacities, *rest = ctx.saved_tensors
-    extinctions = rest.pop(0) if ctx.hides else None
-    features, positions, rotations, *buffers = rest
+    image, transmittance, *tensors = ctx.saved_tensors
     if grad_image is None:
         grad_image = torch.zeros_like(image)
-    *geometry, hidden, grad_features, grad_screen = composite_backward_op(
-        *(grad_image, grad_transmittance, image, transmittance, means, quats, scales, opacities, extinctions),
-        *(features, positions, rotations, buffers, ctx.whole, ctx.real),
+    *gaussians, features, means2d = composite_backward_op(
+        grad_image, grad_transmittance, image, transmittance, *tensors, ctx.settings
     )
-    return (
-        *(*geometry, hidden if ctx.hides else None, grad_features, grad_screen),
-        *(None, None, [None] * len(buffers), None, None),
-    )
+    rest = [None] * (len(tensors) - 5)
+    return means2d, *_gradients(gaussians, tensors), features, *rest
 
 
 composite_op.register_autograd(_composite_backward, setup_context=_composite_setup)
 
 
-@custom_op("gsparc::weights", mutates_args=())
-def weights_op(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor]:
-    """Sums over pixels of alpha T and of alpha, both (P, N)."""
-    return KERNELS[means.device.type].weights(
-        means, quats, scales, opacities, extinctions, positions, rotations, buffers, whole, real
-    )
-
-
-@weights_op.register_fake
-def _(means, quats, scales, opacities, extinctions, positions, rotations, buffers, whole, real):
-    size = (positions.shape[0], means.shape[0])
-    return means.new_empty(size), means.new_empty(size)
-
-
-@custom_op("gsparc::weights_backward", mutates_args=())
-def weights_backward_op(
-    grad_seen: Tensor,
-    grad_total: Tensor,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    positions: Tensor,
-    rotations: Tensor,
-    buffers: Sequence[Tensor],
-    whole: Sequence[int],
-    real: Sequence[float],
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Gradients of means, quats, scales, opacities, extinctions (empty if absent)."""
-    return KERNELS[grad_seen.device.type].weights_backward(
-        grad_seen,
-        grad_total,
-        means,
-        quats,
-        scales,
-        opacities,
-        extinctions,
-        positions,
-        rotations,
-        buffers,
-        whole,
-        real,
-    )
-
-
-@weights_backward_op.register_fake
-def _(
-    grad_seen,
-    grad_total,
-    means,
-    quats,
-    scales,
-    opacities,
-    extinctions,
-    positions,
-    rotations,
-    buffers,
-    whole,
-    real,
-):
-    return filled(gradients(means, quats, scales, opacities, extinctions), means)
-
-
 def _weights_setup(ctx, inputs, output):
-    means, quats, scales, opacities, extinctions, positions, rotations, buffers, whole, real = inputs
-    ctx.hides = extinctions is not None
-    ctx.save_for_backward(
-        *(means, quats, scales, opacities, *([extinctions] if ctx.hides else [])),
-        *(positions, rotations, *buffers),
-    )
-    ctx.whole, ctx.real, ctx.size = whole, real, output[0].shape
+    ctx.save_for_backward(*inputs[:-1])
+    ctx.settings, ctx.size = inputs[-1], output[0].shape
 
 
-def _weights_backward(ctx, grad_seen, grad_total):
-    means, quats, scales, opacities, *rest = ctx.saved_tensors
-    extinctions = rest.pop(0) if ctx.hides else None
-    positions, rotations, *buffers = rest
-    grads = [means.new_zeros(ctx.size) if g is None else g for g in (grad_seen, grad_total)]
-    *geometry, hidden = weights_backward_op(
-        *(
-            *grads,
-            means,
-            quats,
-            scales,
-            opacities,
-            extinctions,
-            positions,
-            rotations,
-            buffers,
-            ctx.whole,
-            ctx.real,
-        )
-    )
-    return *geometry, hidden if ctx.hides else None, None, None, [None] * len(buffers), None, None
+def _weights_backward(ctx, *grads):
+    tensors = ctx.saved_tensors
+    filled = [tensors[0].new_zeros(ctx.size) if grad is None else grad for grad in grads]
+    gaussians = weights_backward_op(*filled, *tensors, ctx.settings)
+    return *_gradients(gaussians, tensors), *[None] * (len(tensors) - 4)
 
 
 weights_op.register_autograd(_weights_backward, setup_context=_weights_setup)
 
 
-def make_plan(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    strongest: Tensor,
-    ids: Tensor | None,
-    pose: Pose,
-    grid: SphereGrid,
-    optics: Optics,
-) -> Plan:
+def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Project, cull, order and bin."""
-    whole, real = numbers(grid, optics)
     *buffers, means2d, radii, visible = plan_op(
-        means, quats, scales, strongest, ids, pose.position, pose.rotation, whole, real
+        *gaussians, ids, pose.position, pose.rotation, packed(kernel_settings(grid, optics))
     )
-    return Plan(pose, grid, optics, means.device.type, means2d, radii, visible, tuple(buffers))
+    device = gaussians.means.device.type
+    return Plan(pose, grid, optics, device, means2d, radii, visible, Buffers(*buffers))
 
 
-def composite(
-    plan: Plan,
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor | None,
-    features: Tensor,
-    means2d: Tensor,
-) -> tuple[Tensor, Tensor]:
+def view_of(plan: Plan) -> tuple[Any, ...]:
+    """The last arguments of an operator on a plan."""
+    settings = kernel_settings(plan.grid, plan.optics)
+    return plan.pose.position, plan.pose.rotation, *plan.buffers, packed(settings)
+
+
+def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
-    return composite_op(
-        *(means, quats, scales, opacities, extinctions, features, means2d),
-        *(plan.pose.position, plan.pose.rotation, plan.buffers, *numbers(plan.grid, plan.optics)),
-    )
+    return composite_op(means2d, *gaussians, features, *view_of(plan))
 
 
-def mean_weights(
-    plan: Plan, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, extinctions: Tensor | None
-) -> tuple[Tensor, Tensor]:
+def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    seen, total = weights_op(
-        *(means, quats, scales, opacities, extinctions, plan.pose.position, plan.pose.rotation),
-        *(plan.buffers, *numbers(plan.grid, plan.optics)),
-    )
+    seen, total = weights_op(*gaussians, *view_of(plan))
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
-
-
-def model_of(means, quats, scales, opacities, extinctions, positions, rotations) -> list[Tensor | None]:
-    """What kernels read as a model: detached and contiguous."""
-    tensors = (means, quats, scales, opacities, extinctions, positions, rotations)
-    return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors]
-
-
-def _like(tensor: Tensor) -> Tensor:
-    return tensor.new_empty(tensor.shape)
-
-
-def gradients(means, quats, scales, opacities, extinctions) -> list[Tensor | None]:
-    """Room for a model's gradients, None where there is no tensor."""
-    tensors = (means, quats, scales, opacities, extinctions)
-    return [None if tensor is None else _like(tensor) for tensor in tensors]
-
-
-def filled(grads: list[Tensor | None], means: Tensor) -> Any:
-    """As an operator returns them: an empty tensor in the place of None."""
-    return tuple(means.new_empty(0) if grad is None else grad for grad in grads)
 
 
 def check_memory(entries: int, bytes_each: int) -> None:

@@ -1,4 +1,4 @@
-"""What is known about a view before any emission: who is seen where, in which order."""
+"""Geometry of a view: footprints, visibility and depth order, independent of the features."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class Plan:
 
     Attributes:
         pose: P poses; one without a leading axis is shared by a whole batch.
-        grid, optics: what was asked for.
-        backend: name of the backend that made it and that must composite it.
+        grid, optics: pixel directions and projection it was made for.
+        backend: name of the backend that made it; the same one must composite it.
         means2d: (P, N, 2) (column, row) [px].
         radii: (P, N) [px], 0 where culled.
         visible: (P, N) bool.

@@ -1,13 +1,13 @@
-"""The public face: plan, composite, weights, freeze, whichever backend does the work."""
+"""The public functions: plan, composite, mean weights and freeze, on any backend."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends, door
+from gsparc.ops import backends, validation
 from gsparc.ops.frozen import FrozenPlan
-from gsparc.ops.geometry import Pose, SphereGrid
+from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import Raster, Weights
 from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, Projection
@@ -40,20 +40,31 @@ def make_plan(
         pose: one pose for a whole batch, or P of them.
         grid: directions of the pixels.
         projection, low_pass, compensate, near, cutoff: see `Optics`.
-        extinctions: (N,) in [0, 1], what hides, where it differs from what emits (`opacities`).
-        ids: (N,) int64, permanent names that decide between equal distances; the row number by default.
+        extinctions: (N,) in [0, 1], what occludes; `opacities` by default.
+        ids: (N,) int64, permanent ids that break ties of distance; the row number by default.
         backend: "reference", "cpu" or "cuda"; by default the one of the tensors' device.
 
     Raises:
-        ValueError, TypeError: for inputs that no footprint can be made of.
+        ValueError, TypeError: for invalid shapes, dtypes, devices or values.
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
-    door.gaussians(means, quats, scales, opacities, extinctions, ids)
+    gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
     with torch.no_grad():
-        strongest = opacities if extinctions is None else door.strongest(opacities, extinctions)
         chosen = backends.choose(backend, means.device)
         optics = Optics(projection, low_pass, compensate, near, cutoff)
-        return chosen.make_plan(means, quats, scales, strongest, ids, door.poses(pose, means), grid, optics)
+        return chosen.make_plan(
+            validation.strongest(gaussians), ids, validation.poses(pose, means), grid, optics
+        )
+
+
+def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
+    """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
+    gaussians = validation.gaussians(*parameters, ids=None)  # type: ignore[arg-type]
+    if plan.num_gaussians != len(gaussians.means):
+        raise ValueError(
+            f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan again"
+        )
+    return gaussians
 
 
 def composite(
@@ -73,16 +84,11 @@ def composite(
     Raises:
         ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
     """
-    door.gaussians(means, quats, scales, opacities, extinctions, None)
-    values = door.features(features, means, plan.pose)
-    if plan.num_gaussians != means.shape[0]:
-        raise ValueError(f"this plan holds {plan.num_gaussians} Gaussians, got {means.shape[0]}; plan again")
-    trained = (means, quats, scales, opacities, features, *([] if extinctions is None else [extinctions]))
-    wanted = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in trained)
-    means2d = plan.means2d.clone().requires_grad_() if wanted else plan.means2d
-    image, transmittance = backends.named(plan.backend).composite(
-        plan, means, quats, scales, opacities, extinctions, values, means2d
-    )
+    gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    values = validation.features(features, means, plan.pose)
+    trained = any(tensor is not None and tensor.requires_grad for tensor in (*gaussians, features))
+    means2d = plan.means2d.clone().requires_grad_() if trained and torch.is_grad_enabled() else plan.means2d
+    image, transmittance = backends.named(plan.backend).composite(plan, gaussians, values, means2d)
     return Raster(image, transmittance, plan.radii, plan.visible, means2d)
 
 
@@ -128,17 +134,13 @@ def mean_weights(
     *,
     extinctions: Tensor | None = None,
 ) -> Weights:
-    """How much of each Gaussian every pose sees, over a plan made from the same Gaussians; differentiable.
+    """Visible weight of each Gaussian for each pose, by a plan of the same Gaussians; differentiable.
 
     Raises:
         ValueError, TypeError: as `composite`.
     """
-    door.gaussians(means, quats, scales, opacities, extinctions, None)
-    if plan.num_gaussians != means.shape[0]:
-        raise ValueError(f"this plan holds {plan.num_gaussians} Gaussians, got {means.shape[0]}; plan again")
-    return Weights(
-        *backends.named(plan.backend).mean_weights(plan, means, quats, scales, opacities, extinctions)
-    )
+    gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    return Weights(*backends.named(plan.backend).mean_weights(plan, gaussians))
 
 
 @torch.no_grad()
@@ -152,7 +154,7 @@ def freeze(
     version: int,
     extinctions: Tensor | None = None,
 ) -> FrozenPlan:
-    """The view of one static receiver as a sparse pixel x Gaussian matrix for the parameters of `version`.
+    """Compositing weights of one static receiver as a sparse pixel x Gaussian matrix, valid for `version`.
 
     `version` is the field's own counter, raised whenever its geometry or opacity changes; a tensor's hidden
     counter misses writes through `.data`.
@@ -162,5 +164,6 @@ def freeze(
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
-    order, buffers = backends.named(plan.backend).freeze(plan, means, quats, scales, opacities, extinctions)
+    gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    order, buffers = backends.named(plan.backend).freeze(plan, gaussians)
     return FrozenPlan(plan.grid, plan.backend, version, order, buffers)

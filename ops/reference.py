@@ -1,4 +1,4 @@
-"""The rasterizer in plain PyTorch: the definition of truth. Dense, so for small scenes only.
+"""The rasterizer in plain PyTorch, which the kernels are tested against. Dense, so for small scenes only.
 
 Everything is differentiable by autograd, in float32 and float64. Notation: mu mean, n unit direction from
 the receiver, r distance, M = R^T R_q diag(s) / r the angular square root of the covariance, K2 the covariance
@@ -136,7 +136,7 @@ def project(
 def _offsets(
     seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Offsets (N, H W) of every pixel from every centre in columns and rows [px], and whether it faces it.
+    """Offsets (N, H W) of every pixel from every centre in columns and rows [px], and whether it is in front.
 
     `shift` (N, 2) [px] moves the footprints; it is zero and carries the screen-space gradient.
     """
@@ -184,7 +184,7 @@ def depth_order(seen: Projected, ids: Tensor | None) -> Tensor:
 def layers(
     seen: Projected, shapes: Tensor, opacities: Tensor, extinctions: Tensor, optics: Optics
 ) -> tuple[Tensor, Tensor]:
-    """What each layer emits and hides at each pixel, alpha and gamma (N, H W), before occlusion."""
+    """Opacity alpha and extinction gamma of each layer at each pixel (N, H W), before occlusion."""
     emits, hides = (seen.gain * opacities)[:, None] * shapes, (seen.gain * extinctions)[:, None] * shapes
     strongest = torch.maximum(emits, hides)
     strength = shapes if optics.cutoff.relative else strongest
@@ -196,32 +196,12 @@ def layers(
 
 
 def transmittances(gamma: Tensor, floor: float) -> tuple[Tensor, Tensor]:
-    """Light before each ordered layer, (N, H W), zero once below the floor, and behind all, (H W,)."""
+    """Transmittance before each layer (N, H W), 0 once below `floor`, and behind all layers (H W,)."""
     clear = gamma.new_ones(1, gamma.shape[1])
     with torch.no_grad():
         lit = torch.cumprod(torch.cat([clear, 1 - gamma]), 0)[:-1] >= floor
     light = torch.cumprod(torch.cat([clear, 1 - torch.where(lit, gamma, 0.0)]), 0)
     return torch.where(lit, light[:-1], 0.0), light[-1]
-
-
-def composite_weights(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    extinctions: Tensor,
-    order: Tensor,
-    shift: Tensor,
-    pose: Pose,
-    grid: SphereGrid,
-    optics: Optics,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """For one pose and the Gaussians in `order`: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
-    seen = project(means[order], quats[order], scales[order], pose, grid, optics)
-    shapes = footprints(seen, grid, optics, shift[order])
-    alpha, gamma = layers(seen, shapes, opacities[order], extinctions[order], optics)
-    before, behind = transmittances(gamma, optics.cutoff.transmittance)
-    return alpha * before, alpha, behind
 
 
 def radii(seen: Projected, strongest: Tensor, optics: Optics) -> Tensor:

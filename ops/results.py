@@ -1,4 +1,4 @@
-"""What the rasterizer returns."""
+"""Outputs of the rasterizer."""
 
 from __future__ import annotations
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from functools import lru_cache
+from typing import Literal, NamedTuple
+
+from gsparc.ops.geometry import SphereGrid
 
 Projection = Literal["equirect", "tangent"]
 
@@ -79,3 +82,47 @@ class Optics:
             raise ValueError(f"projection is 'equirect' or 'tangent', got {self.projection!r}")
         if not self.low_pass >= 0.0 or not self.near > 0.0:
             raise ValueError(f"low_pass >= 0 and near > 0 are needed, got {self.low_pass} and {self.near}")
+
+
+class KernelSettings(NamedTuple):
+    """Grid, optics and thresholds as the kernels take them; the struct of that name in csrc/layout.h."""
+
+    height: int
+    width: int
+    periodic: bool
+    tangent: bool
+    compensate: bool
+    relative: bool
+    first_elevation: float
+    first_azimuth: float
+    elevation_step: float
+    azimuth_step: float
+    low_pass: float
+    near: float
+    alpha_min: float
+    transmittance_min: float
+    alpha_max: float
+    horizon_cosine: float
+
+
+@lru_cache(maxsize=64)
+def kernel_settings(grid: SphereGrid, optics: Optics) -> KernelSettings:
+    """What a grid and optics are to the kernels."""
+    return KernelSettings(
+        height=grid.height,
+        width=grid.width,
+        periodic=grid.periodic,
+        tangent=optics.projection == "tangent",
+        compensate=optics.compensate,
+        relative=optics.cutoff.relative,
+        first_elevation=grid.first_elevation,
+        first_azimuth=grid.first_azimuth,
+        elevation_step=grid.elevation_step,
+        azimuth_step=grid.azimuth_step,
+        low_pass=optics.low_pass,
+        near=optics.near,
+        alpha_min=optics.cutoff.alpha,
+        transmittance_min=optics.cutoff.transmittance,
+        alpha_max=ALPHA_MAX,
+        horizon_cosine=HORIZON_COSINE,
+    )

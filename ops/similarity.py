@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
 
 from gsparc.ops import backends, built
-from gsparc.ops.operators import KERNELS
+from gsparc.ops.operators import KERNELS, operator
 
 
 def served(images: Tensor) -> bool:
-    """Whether a kernel takes these images: float32, on a CPU or on a GPU that renders."""
+    """Whether a kernel supports these images: float32, on a device whose kernels are loaded."""
     if images.dtype != torch.float32:
         return False
     if images.device.type == "cpu" and built.kernels() is not None:
@@ -21,7 +20,7 @@ def served(images: Tensor) -> bool:
     return images.device.type in KERNELS
 
 
-@custom_op("gsparc::similarity", mutates_args=())
+@operator
 def similarity_op(
     prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
 ) -> tuple[Tensor, Tensor]:
@@ -29,9 +28,4 @@ def similarity_op(
 
     `taps` is one axis of a separable, symmetric window of odd length, `stability` the constants C1 and C2.
     """
-    return KERNELS[prediction.device.type].similarity(prediction, target, taps, stability, slope)
-
-
-@similarity_op.register_fake
-def _(prediction, target, taps, stability, slope):
     return prediction.new_empty(prediction.shape[0]), prediction.new_empty(prediction.shape if slope else 0)

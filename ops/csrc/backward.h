@@ -14,13 +14,13 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>&
                               S* cells, S* sums_memory, S* moments, S* feature_slots) {
     constexpr int n = Lanes<S>::n;
     const CompositeArgs<S>& a = b.forward;
-    const Strip<S> strip(a.plan, a.lens.height, task);
+    const Strip<S> strip(a.plan, a.settings.height, task);
     const int k_count = kChannels ? kChannels : channels_of(a), cell = (2 + k_count) * n;
-    const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
-    const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
+    const Vec<S> alpha_max = splat(a.settings.alpha_max), floor = splat(a.settings.transmittance_min);
+    const int64_t pixels = int64_t(a.settings.height) * a.settings.width;
     fill(cells, int64_t(stage.tiles) * cell, S(0));
     for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
-    each_stretch<S>(strip, a.lens.width, [&](int tile, int lane, int64_t pixel, int count) {
+    each_stretch<S>(strip, a.settings.width, [&](int tile, int lane, int64_t pixel, int count) {
         S *behind = cells + int64_t(tile) * cell + n + lane, *g = behind;
         for (int k = 0; k < k_count; ++k) {
             const int64_t at = (int64_t(strip.pose) * k_count + k) * pixels + pixel;
@@ -69,7 +69,7 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>&
 
 // Adds the slots of each Gaussian and chains them into its parameters; poses are added in order.
 template <class S>
-void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, int threads, const S* moments, S* means, S* quats,
+void chain(const PlanView<S>& plan, const Model<S>& model, const KernelSettings<S>& settings, int threads, const S* moments, S* means, S* quats,
            S* scales, S* opacities, S* extinctions, S* screen) {
     Buffer<int32_t> rank_of(int64_t(plan.poses) * plan.count);
     auto invert = [&](int pose, int) {
@@ -79,7 +79,7 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, 
     parallel_for(plan.poses, threads, invert);
     constexpr int chunk = 256, n = Pack<S>::n;
     static_assert(chunk % n == 0, "a chunk is whole lanes");
-    const Lens<Pack<S>> wide = widened(lens);
+    const KernelSettings<Pack<S>> wide = widened(settings);
     auto run = [&](int task, int) {
         const int64_t end = int64_t(task + 1) * chunk < plan.count ? int64_t(task + 1) * chunk : plan.count;
         for (int64_t i = int64_t(task) * chunk; i < end; i += n) {
@@ -132,13 +132,13 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const Lens<S>& lens, 
 template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
     const CompositeArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
-    const Rises<S> stage(a.lens);
-    const Lines<S> lines(plan, a.model, stage, a.lens, a.features, a.samples, a.channels, a.threads);
+    const Rises<S> stage(a.settings);
+    const Lines<S> lines(plan, a.model, stage, a.settings, a.features, a.samples, a.channels, a.threads);
     const int k_count = channels_of(a);
     const int64_t area = int64_t(stage.tiles) * Lanes<S>::n * (2 + k_count), scratch = area + int64_t(k_count) * Lanes<S>::n;
     const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
     Buffer<S> memory(scratch * a.threads), moments(entries * kMoments), feature_slots(entries * k_count);
-    with_switches(a.lens.tangent, a.model.extinctions, k_count, [&](auto tangent, auto hides, auto channels) {
+    with_switches(a.settings.tangent, a.model.extinctions, k_count, [&](auto tangent, auto hides, auto channels) {
         Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             S* mine = memory.data + worker * scratch;
@@ -163,7 +163,7 @@ template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
         }
     };
     if (k_count > 0) parallel_for(plan.poses * chunks, a.threads, gather);
-    chain(plan, a.model, a.lens, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, b.screen);
+    chain(plan, a.model, a.settings, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, b.screen);
 }
 
 template <class S, bool kTangent, bool kHides>
@@ -171,8 +171,8 @@ void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines,
                           S* moments) {
     constexpr int n = Lanes<S>::n;
     const WeightArgs<S>& a = b.forward;
-    const Strip<S> strip(a.plan, a.lens.height, task);
-    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
+    const Strip<S> strip(a.plan, a.settings.height, task);
+    const Vec<S> floor = splat(a.settings.transmittance_min), alpha_max = splat(a.settings.alpha_max), none = splat(S(0));
     fill(cells, int64_t(stage.tiles) * 2 * n, S(0));
     for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
         for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
@@ -208,21 +208,21 @@ void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines,
 template <class S> void weights_backward(const WeightBackwardArgs<S>& b) {
     const WeightArgs<S>& a = b.forward;
     const PlanView<S>& plan = a.plan;
-    const Rises<S> stage(a.lens);
+    const Rises<S> stage(a.settings);
     const int64_t all = int64_t(plan.poses) * plan.count;
     Buffer<S> upstream(2 * all, false);
     for (int64_t i = 0; i < all; ++i) upstream[2 * i] = b.grad_visible_sum[i], upstream[2 * i + 1] = b.grad_total[i];
-    const Lines<S> lines(plan, a.model, stage, a.lens, upstream.data, 1, 2, a.threads);
+    const Lines<S> lines(plan, a.model, stage, a.settings, upstream.data, 1, 2, a.threads);
     const int64_t area = int64_t(stage.tiles) * 2 * Lanes<S>::n;
     Buffer<S> memory(area * a.threads, false), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
-    with_switches(a.lens.tangent, a.model.extinctions, 2, [&](auto tangent, auto hides, auto) {
+    with_switches(a.settings.tangent, a.model.extinctions, 2, [&](auto tangent, auto hides, auto) {
         Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             weigh_backward_strip<S, tangent.value, hides.value>(b, lines, stage, task, batches[worker], memory.data + area * worker, moments.data);
         };
         parallel_for(plan.poses * plan.strips, a.threads, strip);
     });
-    chain(plan, a.model, a.lens, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, static_cast<S*>(nullptr));
+    chain(plan, a.model, a.settings, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, static_cast<S*>(nullptr));
 }
 
 }  // namespace GSPARC_ISA

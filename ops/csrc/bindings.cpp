@@ -10,162 +10,135 @@
 namespace nb = nanobind;
 using namespace gsparc;
 
-namespace {
-
-using Addresses = std::vector<uintptr_t>;
-
-template <class S> Lens<S> lens_from(const std::vector<int>& whole, const std::vector<double>& real) {
-    return {whole[0], whole[1], whole[2] != 0, whole[3] != 0, whole[4] != 0, whole[5] != 0,
-            S(real[0]), S(real[1]), S(real[2]), S(real[3]),
-            S(real[4]), S(real[5]), S(real[6]), S(real[7]), S(real[8]), S(real[9])};
-}
-
-// Reads addresses one after the other.
-struct Reader {
-    const Addresses& all;
-    size_t at = 0;
-    template <class T> T* next() { return reinterpret_cast<T*>(all.at(at++)); }
+// Python's `KernelSettings`, read by the names of its fields.
+template <> struct nb::detail::type_caster<KernelSettings<double>> {
+    NB_TYPE_CASTER(KernelSettings<double>, const_name("KernelSettings"))
+    bool from_python(handle from, uint8_t, cleanup_list*) {
+        using S = double;
+#define X(type, name) value.name = nb::cast<type>(from.attr(#name));
+        GSPARC_SETTINGS(X)
+#undef X
+        return true;
+    }
 };
 
-template <class S> Model<S> read_model(Reader& in) {
-    Model<S> m;
-    m.means = in.next<const S>(), m.quats = in.next<const S>(), m.scales = in.next<const S>();
-    m.opacities = in.next<const S>(), m.extinctions = in.next<const S>();
-    m.positions = in.next<const S>(), m.rotations = in.next<const S>();
-    return m;
-}
+namespace {
+
+using Addresses = std::vector<uint64_t>;
+using Settings = KernelSettings<double>;
+using Ints = std::vector<int>;
+using Reals = std::vector<double>;
 
 int strips_of(int height) { return (height + kStripRows - 1) / kStripRows; }
 
 template <class S> PlanView<S> read_plan(Reader& in, int poses, int count, int height) {
     PlanView<S> p;
     p.poses = poses, p.count = count, p.strips = strips_of(height);
-    p.records = in.next<const S>(), p.boxes = in.next<const Box>();
-    p.order = in.next<const int32_t>(), p.shown = in.next<const int32_t>();
-    p.slots = in.next<const int64_t>(), p.strip_starts = in.next<const int64_t>();
-    p.entries = in.next<const int32_t>();
+    in.read(p.records, p.boxes, p.order, p.shown, p.slots, p.strip_starts, p.entries);
     return p;
 }
 
-// Calls run(S()) with S double or float, without holding Python's lock.
-template <class F> auto with_scalar(bool twice, F run) {
+// Calls run(S(), reader of the tensors) with S double or float, without holding Python's lock.
+template <class F> auto with_scalar(bool twice, const Addresses& tensors, F run) {
     nb::gil_scoped_release unlocked;
-    return twice ? run(double()) : run(float());
+    Reader in{tensors.data(), tensors.data() + tensors.size()};
+    return twice ? run(double(), in) : run(float(), in);
 }
 
-using Ints = std::vector<int>;
-using Reals = std::vector<double>;
-
-int64_t plan(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    return with_scalar(twice, [&](auto zero) {
+int64_t plan(bool twice, int poses, int count, int threads, const Settings& settings, const Addresses& tensors) {
+    return with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         PlanArgs<S> a;
         a.model = read_model<S>(in);
-        a.ids = in.next<const int64_t>();
-        a.poses = poses, a.count = count, a.strips = strips_of(whole[0]), a.threads = threads;
-        a.lens = lens_from<S>(whole, real);
-        a.records = in.next<S>(), a.boxes = in.next<Box>(), a.order = in.next<int32_t>(), a.shown = in.next<int32_t>();
-        a.slots = in.next<int64_t>(), a.strip_starts = in.next<int64_t>();
-        a.means2d = in.next<S>(), a.radii = in.next<S>(), a.visible = in.next<bool>();
+        a.poses = poses, a.count = count, a.strips = strips_of(settings.height), a.threads = threads;
+        a.settings = in_precision<S>(settings);
+        in.read(a.ids, a.records, a.boxes, a.order, a.shown, a.slots, a.strip_starts, a.means2d, a.radii, a.visible);
         return make_plan(a);
     });
 }
 
 void entries(bool twice, int poses, int count, int threads, int height, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
-        using S = decltype(zero);
-        Reader in{tensors};
-        const PlanView<S> view = read_plan<S>(in, poses, count, height);
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
+        const auto view = read_plan<decltype(zero)>(in, poses, count, height);
         fill_entries(view, threads, const_cast<int32_t*>(view.entries));
     });
 }
 
 template <class S>
-CompositeArgs<S> read_composite(Reader& in, int poses, int count, int samples, int channels, int threads, const Ints& whole, const Reals& real) {
+CompositeArgs<S> read_composite(Reader& in, int poses, int count, int threads, int samples, int channels, const Settings& settings) {
     CompositeArgs<S> a;
-    a.plan = read_plan<S>(in, poses, count, whole[0]);
+    a.plan = read_plan<S>(in, poses, count, settings.height);
     a.model = read_model<S>(in);
-    a.lens = lens_from<S>(whole, real);
+    a.settings = in_precision<S>(settings);
     a.samples = samples, a.channels = channels, a.threads = threads;
-    a.features = in.next<const S>(), a.image = in.next<S>(), a.transmittance = in.next<S>();
+    in.read(a.features, a.image, a.transmittance);
     return a;
 }
 
-void composite(bool twice, int poses, int count, int samples, int channels, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+void composite(bool twice, int poses, int count, int threads, int samples, int channels, const Settings& settings, const Addresses& tensors) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
-        kernels<S>().composite(read_composite<S>(in, poses, count, samples, channels, threads, whole, real));
+        kernels<S>().composite(read_composite<S>(in, poses, count, threads, samples, channels, settings));
     });
 }
 
-void composite_backward(bool twice, int poses, int count, int samples, int channels, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+void composite_backward(bool twice, int poses, int count, int threads, int samples, int channels, const Settings& settings, const Addresses& tensors) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         CompositeBackwardArgs<S> b;
-        b.forward = read_composite<S>(in, poses, count, samples, channels, threads, whole, real);
-        b.grad_image = in.next<const S>(), b.grad_transmittance = in.next<const S>();
-        b.means = in.next<S>(), b.quats = in.next<S>(), b.scales = in.next<S>(), b.opacities = in.next<S>();
-        b.extinctions = in.next<S>(), b.features = in.next<S>(), b.screen = in.next<S>();
+        b.forward = read_composite<S>(in, poses, count, threads, samples, channels, settings);
+        in.read(b.grad_image, b.grad_transmittance);
+        in.read(b.means, b.quats, b.scales, b.opacities, b.extinctions, b.features, b.screen);
         kernels<S>().composite_backward(b);
     });
 }
 
-template <class S> WeightArgs<S> read_weights(Reader& in, int poses, int count, int threads, const Ints& whole, const Reals& real) {
+template <class S> WeightArgs<S> read_weights(Reader& in, int poses, int count, int threads, const Settings& settings) {
     WeightArgs<S> a;
-    a.plan = read_plan<S>(in, poses, count, whole[0]);
+    a.plan = read_plan<S>(in, poses, count, settings.height);
     a.model = read_model<S>(in);
-    a.lens = lens_from<S>(whole, real);
+    a.settings = in_precision<S>(settings);
     a.threads = threads;
-    a.visible_sum = in.next<S>(), a.total = in.next<S>();
+    in.read(a.visible_sum, a.total);
     return a;
 }
 
-void weights(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+void weights(bool twice, int poses, int count, int threads, const Settings& settings, const Addresses& tensors) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
-        kernels<S>().weights(read_weights<S>(in, poses, count, threads, whole, real));
+        kernels<S>().weights(read_weights<S>(in, poses, count, threads, settings));
     });
 }
 
-void weights_backward(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+void weights_backward(bool twice, int poses, int count, int threads, const Settings& settings, const Addresses& tensors) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         WeightBackwardArgs<S> b;
-        b.forward = read_weights<S>(in, poses, count, threads, whole, real);
-        b.grad_visible_sum = in.next<const S>(), b.grad_total = in.next<const S>();
-        b.means = in.next<S>(), b.quats = in.next<S>(), b.scales = in.next<S>(), b.opacities = in.next<S>();
-        b.extinctions = in.next<S>();
+        b.forward = read_weights<S>(in, poses, count, threads, settings);
+        in.read(b.grad_visible_sum, b.grad_total, b.means, b.quats, b.scales, b.opacities, b.extinctions);
         kernels<S>().weights_backward(b);
     });
 }
 
-int freeze(bool twice, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    return with_scalar(twice, [&](auto zero) {
+int freeze(bool twice, int count, int threads, const Settings& settings, const Addresses& tensors) {
+    return with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         FreezeArgs<S> a;
-        a.plan = read_plan<S>(in, 1, count, whole[0]);
+        a.plan = read_plan<S>(in, 1, count, settings.height);
         a.model = read_model<S>(in);
-        a.lens = lens_from<S>(whole, real);
+        a.settings = in_precision<S>(settings);
         a.threads = threads;
-        a.starts = in.next<int64_t>(), a.heads = in.next<int32_t>(), a.weights = in.next<S>();
+        in.read(a.starts, a.heads, a.weights);
         return kernels<S>().freeze(a);
     });
 }
 
-void thaw(bool twice, int height, int width, int channels, int threads, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+void thaw(bool twice, int channels, int height, int width, int threads, const Addresses& tensors) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         ThawArgs<S> a;
         a.height = height, a.width = width, a.channels = channels, a.threads = threads;
-        a.starts = in.next<const int64_t>(), a.heads = in.next<const int32_t>();
-        a.weights = in.next<const S>(), a.features = in.next<const S>(), a.image = in.next<S>();
+        in.read(a.starts, a.heads, a.weights, a.features, a.image);
         kernels<S>().thaw(a);
     });
 }
@@ -174,70 +147,63 @@ template <class S> NetworkArgs<S> read_networks(Reader& in, const Ints& sizes, i
     NetworkArgs<S> a;
     a.samples = sizes.at(0), a.count = sizes.at(1), a.inputs = sizes.at(2), a.hidden = sizes.at(3), a.outputs = sizes.at(4);
     a.threads = threads;
-    a.encoded = in.next<const S>(), a.weight1 = in.next<const S>(), a.bias1 = in.next<const S>();
-    a.weight2 = in.next<const S>(), a.bias2 = in.next<const S>(), a.out = in.next<S>();
+    in.read(a.encoded, a.weight1, a.bias1, a.weight2, a.bias2, a.out);
     return a;
 }
 
 void networks(bool twice, const Ints& sizes, int threads, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         kernels<S>().networks(read_networks<S>(in, sizes, threads));
     });
 }
 
 void networks_backward(bool twice, const Ints& sizes, int threads, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         NetworkBackwardArgs<S> b;
         b.forward = read_networks<S>(in, sizes, threads);
-        b.slope = in.next<const S>();
-        b.weight1 = in.next<S>(), b.bias1 = in.next<S>(), b.weight2 = in.next<S>(), b.bias2 = in.next<S>();
+        in.read(b.slope, b.weight1, b.bias1, b.weight2, b.bias2);
         kernels<S>().networks_backward(b);
     });
 }
 
 void similarity(const Ints& sizes, const Reals& stability, int threads, const Addresses& tensors) {
-    nb::gil_scoped_release unlocked;
-    Reader in{tensors};
-    SimilarityArgs a;
-    a.count = sizes.at(0), a.height = sizes.at(1), a.width = sizes.at(2), a.radius = sizes.at(3), a.threads = threads;
-    a.c1 = float(stability.at(0)), a.c2 = float(stability.at(1));
-    a.taps = in.next<const float>(), a.prediction = in.next<const float>(), a.target = in.next<const float>();
-    a.value = in.next<float>(), a.slope = in.next<float>();
-    kernels<float>().similarity(a);
+    with_scalar(false, tensors, [&](auto, Reader& in) {
+        SimilarityArgs a;
+        a.count = sizes.at(0), a.height = sizes.at(1), a.width = sizes.at(2), a.radius = sizes.at(3), a.threads = threads;
+        a.c1 = float(stability.at(0)), a.c2 = float(stability.at(1));
+        in.read(a.taps, a.prediction, a.target, a.value, a.slope);
+        kernels<float>().similarity(a);
+    });
 }
 
 template <class S> ChannelArgs<S> read_channels(Reader& in, const Ints& sizes, const Reals& tones, int threads) {
     ChannelArgs<S> a;
     a.samples = sizes.at(0), a.count = sizes.at(1), a.antennas = sizes.at(2), a.subcarriers = sizes.at(3), a.threads = threads;
     a.first = tones.at(0), a.step = tones.at(1);
-    a.gains = in.next<const S>(), a.steering = in.next<const S>(), a.delays = in.next<const double>(), a.out = in.next<S>();
+    in.read(a.gains, a.steering, a.delays, a.out);
     return a;
 }
 
 void channels(bool twice, const Ints& sizes, const Reals& tones, int threads, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         kernels<S>().channels(read_channels<S>(in, sizes, tones, threads));
     });
 }
 
 void channels_backward(bool twice, const Ints& sizes, const Reals& tones, int threads, const Addresses& tensors) {
-    with_scalar(twice, [&](auto zero) {
+    with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
         ChannelBackwardArgs<S> b;
         b.forward = read_channels<S>(in, sizes, tones, threads);
-        b.slope = in.next<const S>(), b.gains = in.next<S>(), b.steering = in.next<S>(), b.delays = in.next<double>();
+        in.read(b.slope, b.gains, b.steering, b.delays);
         kernels<S>().channels_backward(b);
     });
 }
 
-// Exponentials accumulated by `tasks` tasks of the yardstick.
+// Exponentials accumulated by `tasks` tasks of the roofline.
 int64_t mark_exponentials(int tasks, int threads) {
     nb::gil_scoped_release unlocked;
     std::vector<float> sums(tasks);
@@ -250,11 +216,10 @@ void mark_copy(uintptr_t from, uintptr_t to, int64_t bytes, int threads) {
     kernels<float>().mark_copy(reinterpret_cast<const char*>(from), reinterpret_cast<char*>(to), bytes, threads);
 }
 
-int64_t mark_pairs(bool twice, int poses, int count, int threads, const Ints& whole, const Reals& real, const Addresses& tensors) {
-    return with_scalar(twice, [&](auto zero) {
+int64_t mark_pairs(bool twice, int poses, int count, int threads, const Settings& settings, const Addresses& tensors) {
+    return with_scalar(twice, tensors, [&](auto zero, Reader& in) {
         using S = decltype(zero);
-        Reader in{tensors};
-        return kernels<S>().mark_pairs(read_plan<S>(in, poses, count, whole[0]), lens_from<S>(whole, real), threads);
+        return kernels<S>().mark_pairs(read_plan<S>(in, poses, count, settings.height), in_precision<S>(settings), threads);
     });
 }
 
@@ -266,6 +231,13 @@ NB_MODULE(_native, module) {
     module.attr("MOMENTS") = kMoments;
     module.attr("STRIP_ROWS") = kStripRows;
     module.attr("UNSOUND_POSE") = kUnsoundPose;
+    module.attr("TILE_WIDTH") = kTileWidth;
+    module.attr("TILE_HEIGHT") = kTileHeight;
+    module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;
+    module.attr("SIMILARITY_HEIGHT") = kSimilarityHeight;
+    module.attr("MOST_RADIUS") = kMostRadius;
+    module.attr("MOST_INPUTS") = kMostInputs;
+    module.attr("MOST_OUTPUTS") = kMostOutputs;
     module.def("plan", &plan);
     module.def("entries", &entries);
     module.def("composite", &composite);

@@ -33,17 +33,17 @@ template <class S> GSPARC_HD Gaussian<S> gaussian(const Model<S>& model, int64_t
 template <class S> struct Frame {
     S bottom, top, left, right;
 };
-template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S elevation, S column, S row, S reach, const Lens<S>& lens) {
+template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S elevation, S column, S row, S reach, const KernelSettings<S>& settings) {
     const S margin = S(0.01), wide = reach * S(1.0001);
-    if (lens.tangent) {
-        const S unit = wide * lens.elevation_step * lens.elevation_step;
+    if (settings.tangent) {
+        const S unit = wide * settings.elevation_step * settings.elevation_step;
         const S a11 = f.k11 * unit, a12 = f.k12 * unit, a22 = f.k22 * unit;
         const Truth<S> below = f.n[2] < 0;
         const Extent<S> up = elevation_extent(pick(below, -elevation, elevation), pick(below, -f.n[2], f.n[2]), f.cosine, root(a11), root(a22));
         const S bottom = pick(below, -up.high, up.low), top = pick(below, -up.low, up.high);
         const Extent<S> across = azimuth_extent(f.n[2], f.cosine, a11, a12, a22);
-        const S per_row = 1 / lens.elevation_step, per_column = 1 / lens.azimuth_step;
-        return {(bottom - lens.first_elevation) * per_row - margin, (top - lens.first_elevation) * per_row + margin,
+        const S per_row = 1 / settings.elevation_step, per_column = 1 / settings.azimuth_step;
+        return {(bottom - settings.first_elevation) * per_row - margin, (top - settings.first_elevation) * per_row + margin,
                 column + across.low * per_column - margin, column + across.high * per_column + margin};
     }
     const S half = root(wide * f.k22), across = root(wide * f.k11);
@@ -56,11 +56,11 @@ template <class S> struct Extents {
 };
 
 // Columns [low, high] (fractional) of the circle; the full row where they are nearly that many.
-template <class S> GSPARC_HD void set_columns(S low, S high, const Lens<S>& lens, S width, Extents<S>& box) {
-    const S turn = lens.periodic ? width : S(6.283185307179586) / lens.azimuth_step, none = S(0);
+template <class S> GSPARC_HD void set_columns(S low, S high, const KernelSettings<S>& settings, S width, Extents<S>& box) {
+    const S turn = settings.periodic ? width : S(6.283185307179586) / settings.azimuth_step, none = S(0);
     const S first = upward(low), last = downward(high);
     const Truth<S> apart = last - first < turn - S(kLanes + 1);
-    if (lens.periodic) {
+    if (settings.periodic) {
         const S start = first - downward(first / turn) * turn;
         box.column0 = pick(apart & (start < turn), start, none);
         box.columns = pick(apart, pick(last < first, none, last - first + S(1)), width);
@@ -78,19 +78,19 @@ template <class S> GSPARC_HD void set_columns(S low, S high, const Lens<S>& lens
     box.column0 = pick(full, none, from), box.columns = pick(full, width, to - from + S(1));
 }
 
-template <class S> GSPARC_HD Extents<S> extents_of(const Frame<S>& frame, const Lens<S>& lens) {
-    const S height = S(lens.height), none = S(0);
+template <class S> GSPARC_HD Extents<S> extents_of(const Frame<S>& frame, const KernelSettings<S>& settings) {
+    const S height = S(settings.height), none = S(0);
     Extents<S> box;
     box.row0 = clamped(upward(frame.bottom), none, height), box.row1 = clamped(downward(frame.top) + S(1), none, height);
-    set_columns(frame.left, frame.right, lens, S(lens.width), box);
+    set_columns(frame.left, frame.right, settings, S(settings.width), box);
     const Truth<S> some = (box.row1 > box.row0) & (box.columns > none);
     box.row0 = pick(some, box.row0, none), box.row1 = pick(some, box.row1, none);
     box.column0 = pick(some, box.column0, none), box.columns = pick(some, box.columns, none);
     return box;
 }
 
-template <class S> GSPARC_HD Box box_of(const Frame<S>& frame, const Lens<S>& lens) {
-    const Extents<S> box = extents_of(frame, lens);
+template <class S> GSPARC_HD Box box_of(const Frame<S>& frame, const KernelSettings<S>& settings) {
+    const Extents<S> box = extents_of(frame, settings);
     return {int32_t(box.row0), int32_t(box.row1), int32_t(box.column0), int32_t(box.columns)};
 }
 
@@ -100,18 +100,18 @@ template <class S> struct Sight {
     Frame<S> frame;
     S record[kRecord];
 };
-template <class S> GSPARC_HD Sight<S> sight_of(const Gaussian<S>& g, S opacity, const S* position, const S* rotation, const Lens<S>& lens) {
+template <class S> GSPARC_HD Sight<S> sight_of(const Gaussian<S>& g, S opacity, const S* position, const S* rotation, const KernelSettings<S>& settings) {
     Sight<S> s;
-    const Footprint<S> f = project(g, position, rotation, lens);
+    const Footprint<S> f = project(g, position, rotation, settings);
     s.depth = f.r;
     const S azimuth = pick(f.cosine > 0, angle(f.n[1], f.n[0]), S(0)), elevation = angle(f.n[2], f.cosine);
-    s.column = pick(f.present, (azimuth - lens.first_azimuth) * (1 / lens.azimuth_step), S(0));
-    s.row = pick(f.present, (elevation - lens.first_elevation) * (1 / lens.elevation_step), S(0));
-    s.reach = pick(f.present, reach2(f, opacity, lens), S(-1));
-    s.frame = frame_of(f, elevation, s.column, s.row, s.reach, lens);
+    s.column = pick(f.present, (azimuth - settings.first_azimuth) * (1 / settings.azimuth_step), S(0));
+    s.row = pick(f.present, (elevation - settings.first_elevation) * (1 / settings.elevation_step), S(0));
+    s.reach = pick(f.present, reach2(f, opacity, settings), S(-1));
+    s.frame = frame_of(f, elevation, s.column, s.row, s.reach, settings);
     const S middle = (f.k11 + f.k22) / 2, half = (f.k11 - f.k22) / 2;
     s.radius = root(s.reach * (middle + root(half * half + f.k12 * f.k12)));
-    write_record(f, s.column, s.row, s.reach, lens, s.record);
+    write_record(f, s.column, s.row, s.reach, settings, s.record);
     return s;
 }
 
@@ -121,12 +121,12 @@ template <class S> GSPARC_HD int project_one(const ProjectArgs<S>& a, int64_t i)
     const S opacity = a.model.opacities[i];
     const int wrong = unsound(g, opacity);
     if (wrong >= 0) return wrong;
-    const Sight<S> s = sight_of(g, opacity, a.model.positions + 3 * a.pose, a.model.rotations + 9 * a.pose, a.lens);
+    const Sight<S> s = sight_of(g, opacity, a.model.positions + 3 * a.pose, a.model.rotations + 9 * a.pose, a.settings);
     a.depths[i] = s.depth, a.radii[i] = 0;
     a.means2d[2 * i] = s.column, a.means2d[2 * i + 1] = s.row;
     a.visible[i] = false;
     if (!(s.reach >= 0)) return -1;
-    a.boxes[i] = box_of(s.frame, a.lens);
+    a.boxes[i] = box_of(s.frame, a.settings);
     a.visible[i] = a.boxes[i].row1 > a.boxes[i].row0;
     if (!a.visible[i]) return -1;
     a.radii[i] = s.radius;

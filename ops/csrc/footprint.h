@@ -98,12 +98,12 @@ template <class S> GSPARC_HD void rotation_of(const S* q, S m[9]) {
     m[6] = 2 * (x * z - w * y), m[7] = 2 * (y * z + w * x), m[8] = 1 - 2 * (x * x + y * y);
 }
 
-template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S* position, const S* rotation, const Lens<S>& lens) {
+template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S* position, const S* rotation, const KernelSettings<S>& settings) {
     Footprint<S> f;
     S x[3], d[3] = {g.mean[0] - position[0], g.mean[1] - position[1], g.mean[2] - position[2]};
     for (int k = 0; k < 3; ++k) x[k] = rotation[k] * d[0] + rotation[3 + k] * d[1] + rotation[6 + k] * d[2];
     f.r = root(dot(x, x));
-    f.present = f.r > lens.near;  // of one that is not present the rest means nothing
+    f.present = f.r > settings.near;  // of one that is not present the rest means nothing
     const S per_r = 1 / f.r;  // one division instead of many: they take longest
     for (int k = 0; k < 3; ++k) f.n[k] = x[k] * per_r;
     f.cosine = root(f.n[0] * f.n[0] + f.n[1] * f.n[1]);
@@ -125,10 +125,10 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
         for (int k = 0; k < 3; ++k)
             f.axis[i][k] = rotation[k] * turn[i] + rotation[3 + k] * turn[3 + i] + rotation[6 + k] * turn[6 + i];
 
-    f.stretch2 = 1 / lens.elevation_step;
-    f.bound2 = f.cosine * f.cosine + lens.elevation_step * lens.elevation_step;
-    f.stretch1 = lens.tangent ? f.stretch2 : 1 / (root(f.bound2) * lens.azimuth_step);
-    f.k11 = lens.low_pass, f.k12 = S(0), f.k22 = lens.low_pass;
+    f.stretch2 = 1 / settings.elevation_step;
+    f.bound2 = f.cosine * f.cosine + settings.elevation_step * settings.elevation_step;
+    f.stretch1 = settings.tangent ? f.stretch2 : 1 / (root(f.bound2) * settings.azimuth_step);
+    f.k11 = settings.low_pass, f.k12 = S(0), f.k22 = settings.low_pass;
     S spread = 0;
     for (int i = 0; i < 3; ++i) {
         f.sigma[i] = g.scale[i] * per_r;
@@ -141,14 +141,14 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
     for (int i = 0; i < 3; ++i) f.y[i] = f.sigma[(i + 1) % 3] * f.sigma[(i + 2) % 3] * f.b[i];
     f.length_y = root(dot(f.y, f.y));
     f.area = f.stretch1 * f.stretch2 * f.length_y;
-    f.det = f.area * f.area + lens.low_pass * spread + lens.low_pass * lens.low_pass;
+    f.det = f.area * f.area + settings.low_pass * spread + settings.low_pass * settings.low_pass;
     f.present = f.present & (f.det > smallest(S())) & (f.k22 > smallest(S()));
     const S b = 1 / f.k22;
     f.root_a = root(f.k22 / f.det), f.root_b = root(b), f.rho = f.k12 * b;
 
-    const S near = clamped((f.r - lens.near) * (1 / lens.near), S(0), S(1));
+    const S near = clamped((f.r - settings.near) * (1 / settings.near), S(0), S(1));
     f.fade = near * near * (3 - 2 * near);
-    f.compensation = lens.compensate ? f.area / root(f.det) : S(1);
+    f.compensation = settings.compensate ? f.area / root(f.det) : S(1);
     f.gain = f.fade * f.compensation;
     return f;
 }
@@ -164,23 +164,23 @@ template <class S> struct Gradients {
 };
 
 template <class S> GSPARC_HD Gradients<S> project_backward(
-    const Footprint<S>& f, const Moments<S>& m, S opacity, S extinction, const S* rotation, const Lens<S>& lens) {
+    const Footprint<S>& f, const Moments<S>& m, S opacity, S extinction, const S* rotation, const KernelSettings<S>& settings) {
     Gradients<S> out;
     out.opacity = f.gain * m.emits, out.extinction = f.gain * m.hides;
-    const S step = lens.elevation_step;
+    const S step = settings.elevation_step;
     // On the axis itself azimuth and elevation have no slope; of what `equirect` needs only the area has one.
-    const Truth<S> smooth = lens.tangent ? f.cosine >= 0 : f.cosine > 0;
+    const Truth<S> smooth = settings.tangent ? f.cosine >= 0 : f.cosine > 0;
 
     // Displacement (d1, d2) of n along (e1, e2) [rad]; for `tangent` p and q move by -(d + q (q . d)).
     const S dp = f.root_a * m.tau1, dq = f.root_b * m.tau2 - f.root_a * f.rho * m.tau1;
     S g1, g2;
-    if (lens.tangent) {
+    if (settings.tangent) {
         const S hq = m.h_tau2 / f.root_b, hp = m.h_tau1 / f.root_a + f.rho * hq;
         g1 = dp / step + hp * step, g2 = dq / step + hq * step;
         out.screen[0] = g1 * step, out.screen[1] = g2 * step;
     } else {
         out.screen[0] = dp, out.screen[1] = dq;
-        g1 = pick(smooth, dp / (f.cosine * lens.azimuth_step), S(0)), g2 = pick(smooth, dq / step, S(0));
+        g1 = pick(smooth, dp / (f.cosine * settings.azimuth_step), S(0)), g2 = pick(smooth, dq / step, S(0));
     }
 
     // (A, B, rho) and the gain -> (k11, k12, k22, area), written so that no square of det appears.
@@ -188,10 +188,10 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
     const S b = f.root_b * f.root_b, g_rho = m.tau12 * f.root_a / f.root_b;
     const S g_k12 = g_rho * b;
     S g_det = m.tau11 / (2 * f.det), g_area = 0;
-    if (lens.compensate) g_area = g_gain * f.fade / root(f.det), g_det -= g_gain * f.gain / (2 * f.det);
+    if (settings.compensate) g_area = g_gain * f.fade / root(f.det), g_det -= g_gain * f.gain / (2 * f.det);
     g_area += 2 * f.area * g_det;
-    const S g_k11 = lens.low_pass * g_det;
-    const S g_k22 = b * ((m.tau22 - m.tau11) / 2 - g_rho * f.rho) + lens.low_pass * g_det;
+    const S g_k11 = settings.low_pass * g_det;
+    const S g_k22 = b * ((m.tau22 - m.tau11) / 2 - g_rho * f.rho) + settings.low_pass * g_det;
 
     S g_sigma[3] = {0, 0, 0}, g_axis[3][3], g_stretch1 = 0, twist = 0;
     S g_b[3], g_cofactor[3];
@@ -214,7 +214,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
         g2 += g_b[i] * f.along2[i] - pick(smooth, u2 * f.sigma[i] * f.b[i], S(0));
         twist += f.sigma[i] * (u1 * f.along2[i] - u2 * f.along1[i]);
     }
-    if (!lens.tangent) {
+    if (!settings.tangent) {
         // East and north turn about n by d1 tan(elevation), and the stretch of the columns depends on it.
         g1 += pick(smooth, twist * f.n[2] / f.cosine, S(0));
         g_stretch1 += g_area * f.area / f.stretch1;
@@ -223,8 +223,8 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
 
     S g_r = 0;
     for (int i = 0; i < 3; ++i) out.scale[i] = g_sigma[i] / f.r, g_r -= g_sigma[i] * f.sigma[i] / f.r;
-    const S near = (f.r - lens.near) / lens.near;
-    g_r += pick(near < 1, g_gain * f.compensation * 6 * near * (1 - near) / lens.near, S(0));
+    const S near = (f.r - settings.near) / settings.near;
+    g_r += pick(near < 1, g_gain * f.compensation * 6 * near * (1 - near) / settings.near, S(0));
     S g_x[3];
     for (int c = 0; c < 3; ++c) g_x[c] = (g1 * f.e1[c] + g2 * f.e2[c]) / f.r + g_r * f.n[c];
     for (int c = 0; c < 3; ++c) out.mean[c] = dot(rotation + 3 * c, g_x);
@@ -245,9 +245,9 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
 }
 
 // Squared reach of the footprint in standardised offsets, or negative if it reaches nothing.
-template <class S> GSPARC_HD S reach2(const Footprint<S>& f, S strongest, const Lens<S>& lens) {
-    const S strength = f.gain * strongest, peak = lens.relative ? pick(strength > 0, S(1), S(0)) : strength;
-    return pick((peak >= lens.alpha_min) & (peak > 0), 2 * logarithm(peak / lens.alpha_min), S(-1));
+template <class S> GSPARC_HD S reach2(const Footprint<S>& f, S strongest, const KernelSettings<S>& settings) {
+    const S strength = f.gain * strongest, peak = settings.relative ? pick(strength > 0, S(1), S(0)) : strength;
+    return pick((peak >= settings.alpha_min) & (peak > 0), 2 * logarithm(peak / settings.alpha_min), S(-1));
 }
 
 template <class S> struct Extent {

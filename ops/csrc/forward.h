@@ -26,9 +26,9 @@ template <class F> inline void with_switches(bool tangent, bool hides, int chann
 template <class S, bool kTangent, bool kHides, int kChannels>
 void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells) {
     constexpr int n = Lanes<S>::n;
-    const Strip<S> strip(a.plan, a.lens.height, task);
+    const Strip<S> strip(a.plan, a.settings.height, task);
     const int k_count = kChannels ? kChannels : channels_of(a), cell = (1 + k_count) * n;
-    const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
+    const Vec<S> alpha_max = splat(a.settings.alpha_max), floor = splat(a.settings.transmittance_min);
     fill(cells, int64_t(stage.tiles) * cell, S(0));
     for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
     const Lights<S> lights = {cells, cell, floor};
@@ -51,9 +51,9 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
         }
     };
     sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
-    const int64_t pixels = int64_t(a.lens.height) * a.lens.width;
+    const int64_t pixels = int64_t(a.settings.height) * a.settings.width;
     S *image = a.image + strip.pose * k_count * pixels, *transmittance = a.transmittance + strip.pose * pixels;
-    each_stretch<S>(strip, a.lens.width, [&](int tile, int lane, int64_t pixel, int count) {
+    each_stretch<S>(strip, a.settings.width, [&](int tile, int lane, int64_t pixel, int count) {
         const S* mine = cells + int64_t(tile) * cell + lane;
         copy_stretch(transmittance + pixel, mine, count);
         for (int k = 0; k < k_count; ++k) copy_stretch(image + k * pixels + pixel, mine + (1 + k) * n, count);
@@ -61,10 +61,10 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
 }
 
 template <class S> void composite(const CompositeArgs<S>& a) {
-    const Rises<S> stage(a.lens);
-    const Lines<S> lines(a.plan, a.model, stage, a.lens, a.features, a.samples, a.channels, a.threads);
+    const Rises<S> stage(a.settings);
+    const Lines<S> lines(a.plan, a.model, stage, a.settings, a.features, a.samples, a.channels, a.threads);
     const int64_t scratch = int64_t(stage.tiles) * Lanes<S>::n * (1 + channels_of(a));
-    with_switches(a.lens.tangent, a.model.extinctions, channels_of(a), [&](auto tangent, auto hides, auto channels) {
+    with_switches(a.settings.tangent, a.model.extinctions, channels_of(a), [&](auto tangent, auto hides, auto channels) {
         Buffer<S> memory(scratch * a.threads, false);
         Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
@@ -77,8 +77,8 @@ template <class S> void composite(const CompositeArgs<S>& a) {
 template <class S, bool kTangent, bool kHides>
 void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before, S* sums) {
     constexpr int n = Lanes<S>::n;
-    const Strip<S> strip(a.plan, a.lens.height, task);
-    const Vec<S> floor = splat(a.lens.transmittance_min), alpha_max = splat(a.lens.alpha_max), none = splat(S(0));
+    const Strip<S> strip(a.plan, a.settings.height, task);
+    const Vec<S> floor = splat(a.settings.transmittance_min), alpha_max = splat(a.settings.alpha_max), none = splat(S(0));
     fill(before, int64_t(stage.tiles) * n, S(1));
     const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
@@ -100,11 +100,11 @@ void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& 
 }
 
 template <class S> void weights(const WeightArgs<S>& a) {
-    const Rises<S> stage(a.lens);
-    const Lines<S> lines(a.plan, a.model, stage, a.lens, nullptr, 0, 0, a.threads);
+    const Rises<S> stage(a.settings);
+    const Lines<S> lines(a.plan, a.model, stage, a.settings, nullptr, 0, 0, a.threads);
     const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
     Buffer<S> memory(area * a.threads, false), sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
-    with_switches(a.lens.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
+    with_switches(a.settings.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
         Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             weigh_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area, sums.data);

@@ -9,8 +9,8 @@ namespace GSPARC_ISA {
 template <class S, bool kTangent, bool kHides>
 void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before) {
     constexpr int n = Lanes<S>::n;
-    const Strip<S> strip(a.plan, a.lens.height, task);
-    const Vec<S> alpha_max = splat(a.lens.alpha_max), floor = splat(a.lens.transmittance_min);
+    const Strip<S> strip(a.plan, a.settings.height, task);
+    const Vec<S> alpha_max = splat(a.settings.alpha_max), floor = splat(a.settings.transmittance_min);
     const Lights<S> lights = {before, n, floor};
     Buffer<int64_t> next(stage.tiles);
     for (int pass = 0; pass < (a.heads ? 2 : 1); ++pass) {  // how many blocks each tile has, then the blocks
@@ -47,11 +47,11 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
 }
 
 template <class S> int freeze(const FreezeArgs<S>& a) {
-    const Rises<S> stage(a.lens);
-    const Lines<S> lines(a.plan, a.model, stage, a.lens, nullptr, 0, 0, a.threads);
+    const Rises<S> stage(a.settings);
+    const Lines<S> lines(a.plan, a.model, stage, a.settings, nullptr, 0, 0, a.threads);
     const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
     Buffer<S> memory(area * a.threads, false);
-    with_switches(a.lens.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
+    with_switches(a.settings.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
         Workers<Batch> batches(a.threads, stage.tiles);
         auto strip = [&](int task, int worker) {
             freeze_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area);

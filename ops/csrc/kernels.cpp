@@ -7,7 +7,7 @@
 #include "networks.h"
 #include "project.h"
 #include "similarity.h"
-#include "yardstick.h"
+#include "machine_limits.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {

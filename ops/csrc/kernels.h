@@ -7,7 +7,7 @@ namespace gsparc {
 template <class S> struct ProjectArgs {
     Model<S> model;                 // opacities here: the larger of opacity and extinction
     int count;
-    Lens<S> lens;
+    KernelSettings<S> settings;
     S *records, *depths, *means2d, *radii;  // (N, kRecord), (N,), (N, 2), (N,)
     Box* boxes;                     // (N,), rows empty where culled
     bool* visible;                  // (N,)
@@ -17,7 +17,7 @@ template <class S> struct ProjectArgs {
 template <class S> struct CompositeArgs {
     PlanView<S> plan;
     Model<S> model;
-    Lens<S> lens;
+    KernelSettings<S> settings;
     int samples, channels, threads;
     const S* features;              // (B, N, C)
     S *image, *transmittance;       // (B, C, H, W), (P, H, W)
@@ -35,7 +35,7 @@ template <class S> struct CompositeBackwardArgs {
 template <class S> struct WeightArgs {
     PlanView<S> plan;
     Model<S> model;
-    Lens<S> lens;
+    KernelSettings<S> settings;
     int threads;
     S *visible_sum, *total;         // (P, N): sums over pixels of alpha T and alpha
 };
@@ -49,7 +49,7 @@ template <class S> struct WeightBackwardArgs {
 template <class S> struct FreezeArgs {
     PlanView<S> plan;               // of one pose
     Model<S> model;
-    Lens<S> lens;
+    KernelSettings<S> settings;
     int threads;
     int64_t* starts;                // (strips + 1), first block of each strip; [1:] is counted while heads is null
     int32_t* heads;                 // (blocks, 2) rank and tile of the strip
@@ -114,9 +114,9 @@ template <class S> struct Kernels {
     void (*similarity)(const SimilarityArgs&);
     void (*channels)(const ChannelArgs<S>&);
     void (*channels_backward)(const ChannelBackwardArgs<S>&);
-    void (*mark_exponentials)(int tasks, int threads, float* sums);  // see yardstick.h
+    void (*mark_exponentials)(int tasks, int threads, float* sums);  // see machine_limits.h
     void (*mark_copy)(const char* from, char* to, int64_t bytes, int threads);
-    int64_t (*mark_pairs)(const PlanView<S>&, const Lens<S>&, int threads);
+    int64_t (*mark_pairs)(const PlanView<S>&, const KernelSettings<S>&, int threads);
     void (*bin_strip)(const int16_t* first, const int16_t* last, int count, int strip, int32_t* to);  // see bins.h; may be null
 };
 

@@ -4,13 +4,25 @@
 
 namespace gsparc {
 
-// Grid and optics: settings.py and geometry.py are where these numbers come from.
-template <class S> struct Lens {
-    int height, width;
-    bool periodic, tangent, compensate, relative;
-    S first_elevation, first_azimuth, elevation_step, azimuth_step;
-    S low_pass, near, alpha_min, transmittance_min, alpha_max, horizon_cosine;
+// Grid, optics and thresholds; `KernelSettings` of settings.py has the same fields in the same order.
+#define GSPARC_SETTINGS(X) \
+    X(int, height) X(int, width) X(bool, periodic) X(bool, tangent) X(bool, compensate) X(bool, relative) \
+    X(S, first_elevation) X(S, first_azimuth) X(S, elevation_step) X(S, azimuth_step) X(S, low_pass) X(S, near) \
+    X(S, alpha_min) X(S, transmittance_min) X(S, alpha_max) X(S, horizon_cosine)
+
+template <class S> struct KernelSettings {
+#define X(type, name) type name;
+    GSPARC_SETTINGS(X)
+#undef X
 };
+
+template <class S> KernelSettings<S> in_precision(const KernelSettings<double>& from) {
+    KernelSettings<S> to;
+#define X(type, name) to.name = type(from.name);
+    GSPARC_SETTINGS(X)
+#undef X
+    return to;
+}
 
 constexpr int kRecord = 12;     // scalars of one footprint, see pixels.h
 constexpr int kMoments = 9;     // scalars of Moments
@@ -18,10 +30,16 @@ constexpr int kLanes = 16;      // most pixels done at a time by any instruction
 
 constexpr int64_t kUnsoundPose = int64_t(1) << 62;  // what a plan returns of a pose; of a Gaussian 4 i + parameter
 
-constexpr int kMarkPixels = 384, kMarkRounds = 64, kMarkPairs = kMarkPixels * kMarkRounds;  // see yardstick.h
+constexpr int kMarkPixels = 384, kMarkRounds = 64, kMarkPairs = kMarkPixels * kMarkRounds;  // see machine_limits.h
 
 // A strip is kStripRows rows of the image, the unit of work. Row-wise strips let azimuth wrap without tiles.
 constexpr int kStripRows = 4;
+
+// Of the CUDA kernels: pixels of a tile, which a warp takes at a time; of a block of the similarity, and its widest
+// window; the most inputs and outputs of a network, whose weights pass through registers.
+constexpr int kTileWidth = 8, kTileHeight = 4;
+constexpr int kSimilarityWidth = 32, kSimilarityHeight = 8, kMostRadius = 5;
+constexpr int kMostInputs = 256, kMostOutputs = 4;
 
 // A footprint's rows [row0, row1) and columns column0 + [0, columns), modulo the width.
 struct Box {
@@ -44,5 +62,18 @@ template <class S> struct Model {
     const S *means, *quats, *scales, *opacities, *extinctions;  // extinctions may be null
     const S *positions, *rotations;                             // (P, 3), (P, 3, 3)
 };
+
+// Reads addresses of tensors one after the other; 0, or one left out at the end, is an absent tensor.
+struct Reader {
+    const uint64_t *at, *end;
+    template <class T> T* next() { return at < end ? reinterpret_cast<T*>(uintptr_t(*at++)) : nullptr; }
+    template <class... T> void read(T*&... to) { ((to = next<T>()), ...); }
+};
+
+template <class S> Model<S> read_model(Reader& in) {
+    Model<S> m;
+    in.read(m.means, m.quats, m.scales, m.opacities, m.extinctions, m.positions, m.rotations);
+    return m;
+}
 
 }  // namespace gsparc

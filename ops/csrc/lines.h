@@ -15,25 +15,25 @@ template <class S> struct Rises {
     Buffer<S> tile_cos, tile_sin;                // (tiles + n): of the middle of a tile; NaN beyond the last
     const S across;                              // [rad] from there to its outermost columns
     const Tables<S> tables;
-    const Lens<Pack<S>> lens;
+    const KernelSettings<Pack<S>> settings;
 
-    explicit Rises(const Lens<S>& lens)
-        : tiles(tiles_across<S>(lens.width)), strips((lens.height + kStripRows - 1) / kStripRows), plain(table_size(lens)),
+    explicit Rises(const KernelSettings<S>& settings)
+        : tiles(tiles_across<S>(settings.width)), strips((settings.height + kStripRows - 1) / kStripRows), plain(table_size(settings)),
           rise(int64_t(strips) * n), level(int64_t(strips) * n), middle(strips), half(strips), tile_cos(tiles + n), tile_sin(tiles + n),
-          across(S(kTileColumns<S> - 1) / 2 * lens.azimuth_step), tables(tables_at(lens, plain.data)), lens(widened(lens)) {
-        fill_tables(lens, plain.data);
-        const double columns = kTileColumns<S>, step = lens.azimuth_step;
-        fill_circle(lens.first_azimuth + (columns - 1) / 2 * step, columns * step, tiles, tile_cos.data, tile_sin.data);
+          across(S(kTileColumns<S> - 1) / 2 * settings.azimuth_step), tables(tables_at(settings, plain.data)), settings(widened(settings)) {
+        fill_tables(settings, plain.data);
+        const double columns = kTileColumns<S>, step = settings.azimuth_step;
+        fill_circle(settings.first_azimuth + (columns - 1) / 2 * step, columns * step, tiles, tile_cos.data, tile_sin.data);
         for (int k = tiles; k < tiles + n; ++k) tile_cos[k] = tile_sin[k] = S(NAN);
         const S least = sizeof(S) == 4 ? S(1e-7) : S(1e-12);  // a row through the pole, seen from that close to it
         for (int strip = 0; strip < strips; ++strip) {
             S low = INFINITY, high = -INFINITY;
             for (int k = 0; k < n; ++k) {
                 const int row = strip * kStripRows + k / kTileColumns<S>;
-                const bool real = row < lens.height;
+                const bool real = row < settings.height;
                 const S cosine = real && tables.cos_row[row] > least ? tables.cos_row[row] : least;
-                const S here = real ? (lens.tangent ? tables.sin_row[row] / cosine : S(row)) : S(NAN);
-                rise[strip * n + k] = here, level[strip * n + k] = lens.horizon_cosine / cosine;
+                const S here = real ? (settings.tangent ? tables.sin_row[row] / cosine : S(row)) : S(NAN);
+                rise[strip * n + k] = here, level[strip * n + k] = settings.horizon_cosine / cosine;
                 if (here < low) low = here;
                 if (here > high) high = here;
             }
@@ -55,7 +55,7 @@ template <class S> struct Lines {
     const int width;
     Buffer<S> rows, outlines;
 
-    Lines(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const Lens<S>& lens, const S* features, int samples, int channels, int threads)
+    Lines(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const KernelSettings<S>& settings, const S* features, int samples, int channels, int threads)
         : width(padded(kFeatures + per_pose(plan, samples, channels))), rows(int64_t(plan.poses) * plan.count * width, false),
           outlines(int64_t(plan.poses) * plan.count * kOutline, false) {
         constexpr int chunk = 512;
@@ -73,7 +73,7 @@ template <class S> struct Lines {
                     __builtin_prefetch(soon), __builtin_prefetch(soon + kReach), __builtin_prefetch(model.opacities + later);
                     if (features) __builtin_prefetch(features + (int64_t(first) * plan.count + later) * channels);
                 }
-                fill_some(plan, model, stage, lens, pose, rank, some);
+                fill_some(plan, model, stage, settings, pose, rank, some);
                 for (int b = 0; b < count; ++b) {
                     S* to = rows.data + at * width + kFeatures + b * channels;
                     const S* from = features + int64_t(first + b) * plan.count * channels;
@@ -100,7 +100,7 @@ template <class S> struct Lines {
 
 private:
     // Ranks [rank, rank + some): everything but their features.
-    void fill_some(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const Lens<S>& lens, int pose, int rank, int some) {
+    void fill_some(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const KernelSettings<S>& settings, int pose, int rank, int some) {
         const int64_t at = int64_t(pose) * plan.count + rank;
         int32_t who[n];
         S opacities[n], extinctions[n];
@@ -111,15 +111,15 @@ private:
         }
         Pack<S> record[kRecord];
         gather_at(plan.records + int64_t(pose) * plan.count * kRecord, kRecord, who, kRecord, record);
-        const Outline<Pack<S>> outline = lens.tangent ? outline_of<S, true>(record, stage.lens) : outline_of<S, false>(record, stage.lens);
+        const Outline<Pack<S>> outline = settings.tangent ? outline_of<S, true>(record, stage.settings) : outline_of<S, false>(record, stage.settings);
         const Pack<S> numbers[kOutline] = {outline.column, outline.middle, outline.height, outline.lean, outline.width, outline.left, outline.right, outline.stretch};
         for (int c = 0; c < kOutline; c += 4) scatter_fours(numbers + c, kOutline, some, outlines.data + at * kOutline + c);
         const Pack<S> gain = record[kGain];
         record[kOpacity] = gain * Pack<S>(load(opacities));
         record[kExtinction] = model.extinctions ? gain * Pack<S>(load(extinctions)) : record[kOpacity];
         record[kReach] = record[kReach] * S(kHalvings);
-        for (int k = lens.tangent ? 0 : 2; k < 6; ++k) record[k] = record[k] * S(1 / kOffset);
-        if (!lens.tangent) {
+        for (int k = settings.tangent ? 0 : 2; k < 6; ++k) record[k] = record[k] * S(1 / kOffset);
+        if (!settings.tangent) {
             const Pack<S> turn = stage.tables.turn, column = record[0] - downward(record[0] / turn) * turn, half = turn * S(0.5);
             const Which<S> low = column < half;
             record[0] = pick(low, column, column - turn), record[kSeam] = pick(low, column + half, column - half);

@@ -14,8 +14,8 @@ namespace GSPARC_ISA {
 
 constexpr int kReach = 9, kGain = 10;
 
-template <class S> GSPARC_HD void write_record(const Footprint<S>& f, S column, S row, S reach, const Lens<S>& lens, S* out) {
-    if (lens.tangent) {
+template <class S> GSPARC_HD void write_record(const Footprint<S>& f, S column, S row, S reach, const KernelSettings<S>& settings, S* out) {
+    if (settings.tangent) {
         for (int k = 0; k < 3; ++k) {
             out[k] = f.root_a * (f.e1[k] - f.rho * f.e2[k]) * f.stretch2;
             out[3 + k] = f.root_b * f.e2[k] * f.stretch2;
@@ -35,13 +35,13 @@ template <class S> struct Tables {
     S turn, per_turn;                           // columns in a full circle and its inverse
 };
 
-template <class S> GSPARC_HD int64_t table_size(const Lens<S>& lens) { return 3 * int64_t(lens.width + kLanes) + 2 * lens.height; }
+template <class S> GSPARC_HD int64_t table_size(const KernelSettings<S>& settings) { return 3 * int64_t(settings.width + kLanes) + 2 * settings.height; }
 
 // Tables over numbers (table_size) that `fill_tables` has filled.
-template <class S> inline Tables<S> tables_at(const Lens<S>& lens, const S* numbers) {
-    const int padded = lens.width + kLanes;
-    const S turn = lens.periodic ? S(lens.width) : S(6.283185307179586) / lens.azimuth_step;
-    return {numbers, numbers + padded, numbers + 2 * padded, numbers + 3 * padded, numbers + 3 * padded + lens.height, turn, 1 / turn};
+template <class S> inline Tables<S> tables_at(const KernelSettings<S>& settings, const S* numbers) {
+    const int padded = settings.width + kLanes;
+    const S turn = settings.periodic ? S(settings.width) : S(6.283185307179586) / settings.azimuth_step;
+    return {numbers, numbers + padded, numbers + 2 * padded, numbers + 3 * padded, numbers + 3 * padded + settings.height, turn, 1 / turn};
 }
 
 // cos and sin of first + k step for k < count, to 1e-15: some by the library, those between by turning.
@@ -56,14 +56,14 @@ template <class S> inline void fill_circle(double first, double step, int count,
     }
 }
 
-template <class S> inline void fill_tables(const Lens<S>& lens, S* numbers) {
-    const int padded = lens.width + kLanes;
-    fill_circle(double(lens.first_azimuth), double(lens.azimuth_step), lens.width, numbers, numbers + padded);
+template <class S> inline void fill_tables(const KernelSettings<S>& settings, S* numbers) {
+    const int padded = settings.width + kLanes;
+    fill_circle(double(settings.first_azimuth), double(settings.azimuth_step), settings.width, numbers, numbers + padded);
     for (int j = 0; j < padded; ++j) {
-        if (j >= lens.width) numbers[j] = S(NAN), numbers[padded + j] = S(NAN);
-        numbers[2 * padded + j] = j < lens.width ? S(j) : S(NAN);
+        if (j >= settings.width) numbers[j] = S(NAN), numbers[padded + j] = S(NAN);
+        numbers[2 * padded + j] = j < settings.width ? S(j) : S(NAN);
     }
-    fill_circle(double(lens.first_elevation), double(lens.elevation_step), lens.height, numbers + 3 * padded, numbers + 3 * padded + lens.height);
+    fill_circle(double(settings.first_elevation), double(settings.elevation_step), settings.height, numbers + 3 * padded, numbers + 3 * padded + settings.height);
 }
 
 // Where a block of pixels lies: a lane each. NaN in a lane beyond the grid.
@@ -81,12 +81,12 @@ template <class S> struct RowView<S, true> {
     };
     Vec<S> x1, y1, z1, x2, y2, z2, xn, yn, zn, reach, horizon;
 
-    GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>&, const Lens<S>& lens) {
+    GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>&, const KernelSettings<S>& settings) {
         const Vec<S> c = at.cos_row, s = at.sin_row;
         x1 = r[0] * c, y1 = r[1] * c, z1 = r[2] * s;
         x2 = r[3] * c, y2 = r[4] * c, z2 = r[5] * s;
         xn = r[6] * c, yn = r[7] * c, zn = r[8] * s;
-        reach = splat(r[kReach]), horizon = splat(lens.horizon_cosine);
+        reach = splat(r[kReach]), horizon = splat(settings.horizon_cosine);
     }
     GSPARC_INLINE Mask<S> look(const Place<S>& at, Seen& seen) const {
         const Vec<S> c = at.cos_column, s = at.sin_column;
@@ -124,7 +124,7 @@ template <class S> struct RowView<S, false> {
     };
     Vec<S> center, root_a, shift, tau2_row, square2, reach, turn, per_turn;
 
-    GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>& t, const Lens<S>&) {
+    GSPARC_INLINE RowView(const S* r, const Place<S>& at, const Tables<S>& t, const KernelSettings<S>&) {
         const Vec<S> q = at.row - r[1];
         center = splat(r[0]), root_a = splat(r[2]), shift = r[3] * q, tau2_row = r[4] * q;
         square2 = tau2_row * tau2_row, reach = splat(r[kReach]), turn = splat(t.turn), per_turn = splat(t.per_turn);

@@ -120,7 +120,7 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     auto project = [&](int task, int) {
         const int pose = task / chunks;
         const int64_t base = pose * count;
-        const ProjectArgs<S> one = {a.model, a.count, a.lens, a.records + base * kRecord, depths.data + base,
+        const ProjectArgs<S> one = {a.model, a.count, a.settings, a.records + base * kRecord, depths.data + base,
                                     a.means2d + 2 * base, a.radii + base, boxes.data + base, a.visible + base, pose};
         const int begin = task % chunks * chunk;
         const int64_t bad = kernels<S>().project(one, begin, std::min(begin + chunk, a.count));

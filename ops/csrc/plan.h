@@ -8,7 +8,7 @@ template <class S> struct PlanArgs {
     Model<S> model;                    // opacities: the larger of opacity and extinction
     const int64_t* ids;                // (N,) or null: the row number
     int poses, count, strips, threads;
-    Lens<S> lens;
+    KernelSettings<S> settings;
     S *records, *means2d, *radii;      // (P, N, kRecord) by depth; (P, N, 2) and (P, N) by Gaussian
     bool* visible;                     // (P, N)
     Box* boxes;                        // (P, N) by depth

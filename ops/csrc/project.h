@@ -6,8 +6,8 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
-// The lens with every number in all lanes.
-template <class S> Lens<Pack<S>> widened(const Lens<S>& l) {
+// The settings with every number in all lanes.
+template <class S> KernelSettings<Pack<S>> widened(const KernelSettings<S>& l) {
     return {l.height, l.width, l.periodic, l.tangent, l.compensate, l.relative, l.first_elevation, l.first_azimuth,
             l.elevation_step, l.azimuth_step, l.low_pass, l.near, l.alpha_min, l.transmittance_min, l.alpha_max, l.horizon_cosine};
 }
@@ -39,7 +39,7 @@ template <class S> struct Stand {
 };
 
 // `project_one` for rows [i, i + count), count at most the lanes.
-template <class S> int64_t project_some(const ProjectArgs<S>& a, const Lens<Pack<S>>& lens, const Stand<S>& stand, int64_t i, int count) {
+template <class S> int64_t project_some(const ProjectArgs<S>& a, const KernelSettings<Pack<S>>& settings, const Stand<S>& stand, int64_t i, int count) {
     Pack<S> opacity;
     gather_rows(a.model.opacities + i, 1, count, &opacity);
     const Gaussian<Pack<S>> g = gaussians(a.model, i, count);
@@ -49,12 +49,12 @@ template <class S> int64_t project_some(const ProjectArgs<S>& a, const Lens<Pack
             if (wrong >= 0) return 4 * k + wrong;
         }
     }
-    const Sight<Pack<S>> s = sight_of(g, opacity, stand.position, stand.rotation, lens);
+    const Sight<Pack<S>> s = sight_of(g, opacity, stand.position, stand.rotation, settings);
     const Pack<S> place[2] = {s.column, s.row};
     scatter_rows(place, 2, count, a.means2d + 2 * i);
     scatter_rows(&s.depth, 1, count, a.depths + i);
     const Pack<S> zero = S(0);
-    Extents<Pack<S>> extents = extents_of(s.frame, lens);
+    Extents<Pack<S>> extents = extents_of(s.frame, settings);
     const Which<S> seen = (s.reach >= zero) & (extents.row1 > extents.row0);
     const Pack<S> ends[4] = {extents.row0, extents.row1, extents.column0, extents.columns};
     Pack<S> kept[4];
@@ -73,10 +73,10 @@ template <class S> int64_t project_some(const ProjectArgs<S>& a, const Lens<Pack
 
 template <class S> int64_t project_range(const ProjectArgs<S>& a, int begin, int end) {
     constexpr int n = Pack<S>::n;
-    const Lens<Pack<S>> lens = widened(a.lens);
+    const KernelSettings<Pack<S>> settings = widened(a.settings);
     const Stand<S> stand(a.model, a.pose);
     for (int64_t i = begin; i < end; i += n) {
-        const int64_t wrong = project_some(a, lens, stand, i, end - i < n ? int(end - i) : n);
+        const int64_t wrong = project_some(a, settings, stand, i, end - i < n ? int(end - i) : n);
         if (wrong >= 0) return wrong;
     }
     return -1;

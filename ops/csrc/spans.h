@@ -21,7 +21,7 @@ template <class N> struct Outline {
 };
 
 // The outline of records in lanes, their offsets in any unit; a little larger than life.
-template <class S, bool kTangent> GSPARC_INLINE Outline<Pack<S>> outline_of(const Pack<S>* record, const Lens<Pack<S>>& lens) {
+template <class S, bool kTangent> GSPARC_INLINE Outline<Pack<S>> outline_of(const Pack<S>* record, const KernelSettings<Pack<S>>& settings) {
     const Pack<S> reach = root(record[kReach]) * S(1.001), one = S(1);
     Outline<Pack<S>> o;
     if (!kTangent) {
@@ -35,7 +35,7 @@ template <class S, bool kTangent> GSPARC_INLINE Outline<Pack<S>> outline_of(cons
     const Pack<S> a = (n[0] * f1[1] - n[1] * f1[0]) * per_cosine, b = f2[2] * per_cosine;  // f1 . e1 and f2 . e2
     const Pack<S> slant = (n[0] * f1[0] + n[1] * f1[1]) * n[2] * per_cosine - f1[2] * cosine;  // -f1 . e2: a times rho
     const Pack<S> high = reach / b, per_a = one / a;
-    o.column = (angle(n[1], n[0]) - lens.first_azimuth) * (one / lens.azimuth_step);
+    o.column = (angle(n[1], n[0]) - settings.first_azimuth) * (one / settings.azimuth_step);
     o.middle = n[2] * per_cosine, o.height = high, o.width = reach * per_a * per_cosine, o.lean = slant * per_a * high * per_cosine;
     const Pack<S> bend = o.middle * high, straight = one - bend * bend;
     const Pack<S> far = root(o.lean * o.lean + o.width * o.width * straight), per_straight = one / straight;
@@ -55,7 +55,7 @@ template <class S> struct Spans {
 };
 
 // The columns of outlines at rows whose tangents of elevation (`equirect`: whose numbers) are low to high.
-template <class S, bool kTangent> GSPARC_INLINE Spans<S> spans_of(const Outline<Pack<S>>& o, S low, S high, const Lens<Pack<S>>& lens) {
+template <class S, bool kTangent> GSPARC_INLINE Spans<S> spans_of(const Outline<Pack<S>>& o, S low, S high, const KernelSettings<Pack<S>>& settings) {
     const Pack<S> none = S(0), one = S(1), bend = kTangent ? o.middle * o.height : none;
     const Pack<S> from = kTangent && low < 0 ? o.stretch * low : Pack<S>(low), to = kTangent && high > 0 ? o.stretch * high : Pack<S>(high);
     const S rounding = sizeof(S) == 4 ? S(4e-7) : S(1e-15);
@@ -68,11 +68,11 @@ template <class S, bool kTangent> GSPARC_INLINE Spans<S> spans_of(const Outline<
         return (o.lean * v + side * o.width * root(one - v * v)) / (one - bend * v);
     };
     Pack<S> left = edge(o.left, S(-1)), right = edge(o.right, S(1));
-    const Pack<S> margin = kTangent ? S(0.01) + S(1e-6) / lens.azimuth_step : Pack<S>(S(0.01));
-    if (kTangent) left = short_angle(left, one) / lens.azimuth_step, right = short_angle(right, one) / lens.azimuth_step;
+    const Pack<S> margin = kTangent ? S(0.01) + S(1e-6) / settings.azimuth_step : Pack<S>(S(0.01));
+    if (kTangent) left = short_angle(left, one) / settings.azimuth_step, right = short_angle(right, one) / settings.azimuth_step;
     Extents<Pack<S>> box;
-    const Pack<S> width = S(lens.width);
-    set_columns(o.column + left - margin, o.column + right + margin, lens, width, box);
+    const Pack<S> width = S(settings.width);
+    set_columns(o.column + left - margin, o.column + right + margin, settings, width, box);
     const Which<S> some = (bottom <= one) & (top >= -one) & (box.columns > none);
     const S per_tile = S(1) / kTileColumns<S>;
     const Pack<S> end = box.column0 + box.columns, inner = pick(end < width, end, width), first = downward(box.column0 * per_tile);

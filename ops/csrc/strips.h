@@ -30,10 +30,10 @@ template <class S> struct TileTables {
     Buffer<S> plain, across, along;  // across: cos, sin, column of (tiles, n); along: cos, sin, row of (strips, n)
     const Tables<S> tables;
 
-    explicit TileTables(const Lens<S>& lens)
-        : tiles(tiles_across<S>(lens.width)), strips((lens.height + kStripRows - 1) / kStripRows), plain(table_size(lens)),
-          across(int64_t(3) * tiles * n), along(int64_t(3) * strips * n), tables(tables_at(lens, plain.data)) {
-        fill_tables(lens, plain.data);
+    explicit TileTables(const KernelSettings<S>& settings)
+        : tiles(tiles_across<S>(settings.width)), strips((settings.height + kStripRows - 1) / kStripRows), plain(table_size(settings)),
+          across(int64_t(3) * tiles * n), along(int64_t(3) * strips * n), tables(tables_at(settings, plain.data)) {
+        fill_tables(settings, plain.data);
         for (int at = 0; at < tiles * n; ++at) {
             const int column = at / n * columns + at % columns;
             across[at] = tables.cos_column[column], across[tiles * n + at] = tables.sin_column[column];
@@ -41,7 +41,7 @@ template <class S> struct TileTables {
         }
         for (int at = 0; at < strips * n; ++at) {
             const int row = at / n * kStripRows + at % n / columns;
-            const bool real = row < lens.height;
+            const bool real = row < settings.height;
             along[at] = real ? tables.cos_row[row] : S(NAN), along[strips * n + at] = real ? tables.sin_row[row] : S(NAN);
             along[2 * strips * n + at] = real ? S(row) : S(NAN);
         }
@@ -82,13 +82,13 @@ template <class S> struct Strip {
 // inside it, and wanted(tile). Without kSlopes tau1 and tau2 mean nothing. Tiles are first found without a branch,
 // then visited: an unpredictable branch per tile costs as much as the visit.
 template <class S, bool kTangent, bool kSlopes, class Wanted, class Visit>
-GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S>& grid, const Lens<S>& lens, Wanted&& wanted, Visit&& visit) {
+GSPARC_INLINE void each_tile(const Strip<S>& strip, int rank, const TileTables<S>& grid, const KernelSettings<S>& settings, Wanted&& wanted, Visit&& visit) {
     constexpr int most = 16, n = Lanes<S>::n, kept = 3 * n;
     using View = RowView<S, kTangent>;
-    const Runs runs = runs_of(strip.boxes[rank], lens.width);
+    const Runs runs = runs_of(strip.boxes[rank], settings.width);
     Place<S> at;
     grid.strip(strip.index, at);
-    const View view(strip.records + int64_t(strip.order[rank]) * kRecord, at, grid.tables, lens);
+    const View view(strip.records + int64_t(strip.order[rank]) * kRecord, at, grid.tables, settings);
     int hits[most];
     Mask<S> counts[most];
     alignas(64) S memory[most * kept];

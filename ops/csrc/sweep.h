@@ -104,7 +104,7 @@ GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, 
         Pack<S> numbers[kOutline];
         gather_at(outlines, kOutline, ranks + first, kOutline, numbers);
         const Outline<Pack<S>> outline = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7]};
-        spans[first / n] = spans_of<S, kTangent>(outline, middle - half, middle + half, stage.lens);
+        spans[first / n] = spans_of<S, kTangent>(outline, middle - half, middle + half, stage.settings);
     }
     int32_t* hit = batch.hits.data;
     int owners = 0;
@@ -116,7 +116,7 @@ GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, 
         const int lane = k % n;
         const int32_t* const before = hit;
         if (kTangent && span.open >> lane & 1) {
-            const Runs runs = runs_of(strip.boxes[ranks[k]], stage.lens.width);
+            const Runs runs = runs_of(strip.boxes[ranks[k]], stage.settings.width);
             for (int run = 0; run < runs.count; ++run) hit = append_near(hit, bits, runs.from[run] / columns, (runs.to[run] - 1) / columns + 1, line, stage, strip.index);
         } else {
             hit = append(hit, bits, int(span.first[lane]), int(span.count[lane]));

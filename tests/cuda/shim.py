@@ -14,16 +14,24 @@ import torch
 
 from gsparc.ops import backends, cuda, cuda_kernels, cuda_library, operators
 
-KEPT = Path(__file__).parents[2] / "build" / "shim"
+HERE = Path(__file__).parent
+KEPT = HERE.parents[1] / "build" / "shim"
+SHIM = HERE / "host_shim.cpp"
+INCLUDES = (f"-I{cuda_library.SOURCES}", f"-I{HERE}")
 FLAGS = ("-std=c++17", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-x", "c++")
+
+
+def fingerprint(*also: str) -> str:
+    """Hash of the kernels' sources, the shim and `also`."""
+    texts = (SHIM.read_text(), SHIM.with_suffix(".h").read_text())
+    return cuda_library.fingerprint(*FLAGS, *texts, *also)
 
 
 def library() -> cuda_library.Library:
     """The sources of the kernels, executed by fibers; built when they have changed."""
-    path = KEPT / f"{cuda_library.fingerprint(*FLAGS)}.so"
+    path = KEPT / f"{fingerprint()}.so"
     if not path.exists():
-        sources = [*cuda_library.units(), str(cuda_library.SOURCES / "cuda" / "host_shim.cpp")]
-        cuda_library.compile_to(path, ["g++", *FLAGS, f"-I{cuda_library.SOURCES}", *sources])
+        cuda_library.compile_to(path, ["g++", *FLAGS, *INCLUDES, *cuda_library.units(), str(SHIM)])
     return cuda_library.Library(path)
 
 

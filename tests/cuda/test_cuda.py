@@ -10,7 +10,8 @@ import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
 from gsparc.field.losses import _Kernel, _Similarity
-from gsparc.ops import SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
+from gsparc.ops import Optics, SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
+from gsparc.ops.settings import kernel_settings
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 
@@ -161,7 +162,7 @@ def test_captured_plan_without_room_is_nan_never_wrong(where, monkeypatch):
     scene, grid = random_scene(n=40).to(torch.float32), GRIDS["hemisphere"]
     render(scene, poses(0), grid)
     monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
-    monkeypatch.setattr(cuda_kernels, "_roomy", lambda entries: 5)
+    monkeypatch.setattr(cuda_kernels, "_with_headroom", lambda entries: 5)
     got = render(scene, poses(0), grid)
     for name in ("image", "transmittance", "d_means", "d_quats", "d_scales", "d_opacities", "d_features"):
         assert torch.isnan(got[name]).all(), name
@@ -176,19 +177,17 @@ def test_captured_plan_needs_an_earlier_one(where, monkeypatch):
 
 
 def test_unsound_input_is_named(where):
-    scene, optics = (
-        random_scene(n=40),
-        ([30, 120, 1, 1, 1, 0], [0.0, 0.0, 0.05, 0.05, 0.3, 0.01, 0.004, 1e-4, 0.99, 0.01]),
-    )
+    scene = random_scene(n=40)
+    settings = operators.packed(kernel_settings(GRIDS["hemisphere"], Optics()))
     model = [scene.means, scene.quats, scene.scales, scene.opacities]
     place, turn = torch.zeros(1, 3).double(), torch.eye(3).double()[None]
     for part, (name, row) in enumerate([("means", 7), ("quats", 39), ("scales", 0), ("opacities", 12)]):
         wrong = [tensor.clone() for tensor in model]
         wrong[part][row] = math.nan
         with pytest.raises(ValueError, match=f"Gaussian {row} has {name}"):
-            operators.plan_op(*wrong, None, place, turn, *optics)
+            operators.plan_op(*wrong, None, None, place, turn, settings)
     with pytest.raises(ValueError, match="pose is not finite"):
-        operators.plan_op(*model, None, place * math.nan, turn, *optics)
+        operators.plan_op(*model, None, None, place * math.nan, turn, settings)
 
 
 def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
@@ -205,4 +204,7 @@ def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
 
 
 def test_call_has_the_layout_of_the_kernels(where):
-    assert ctypes.sizeof(cuda_kernels.cuda_library.Call) == 7 * 4 + 6 * 4 + 4 + 10 * 8 + 32 * 8 + 2 * 8
+    assert (
+        ctypes.sizeof(cuda_kernels.cuda_library.Call)
+        == 14 * 4 + (2 * 4 + 4 + 4 + 10 * 8) + 8 * 8 + 32 * 8 + 2 * 8
+    )

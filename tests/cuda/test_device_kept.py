@@ -11,7 +11,7 @@ import pytest
 import torch
 from modules import module
 
-from gsparc.ops import Pose, backends, door
+from gsparc.ops import Pose, backends, validation
 from gsparc.ops.plan import Plan
 
 
@@ -19,24 +19,26 @@ class Shapes:
     """A rasterizer that computes nothing."""
 
     @staticmethod
-    def make_plan(means, quats, scales, strongest, ids, pose, grid, optics) -> Plan:
+    def make_plan(gaussians, ids, pose, grid, optics) -> Plan:
+        means = gaussians.means
         size = (pose.position.shape[0], means.shape[0])
         places, visible = means.new_empty(*size, 2), means.new_empty(size, dtype=torch.bool)
         return Plan(pose, grid, optics, "meta", places, means.new_empty(size), visible, ())
 
     @staticmethod
-    def composite(plan, means, quats, scales, opacities, extinctions, features, means2d):
+    def composite(plan, gaussians, features, means2d):
+        means, quats, scales, opacities, _ = gaussians
         one = (features.sum(1) + (means + scales).sum() + quats.sum() + opacities.sum())[..., None, None]
         image = one.expand(*one.shape[:2], plan.grid.height, plan.grid.width)
         return image, means.new_empty(plan.num_poses, plan.grid.height, plan.grid.width)
 
     @staticmethod
-    def mean_weights(plan, means, quats, scales, opacities, extinctions):
-        return tuple(opacities.expand(plan.num_poses, -1) for _ in range(2))
+    def mean_weights(plan, gaussians):
+        return tuple(gaussians.opacities.expand(plan.num_poses, -1) for _ in range(2))
 
 
 def unlooked(pose: Pose, means: torch.Tensor) -> Pose:
-    """`door.poses`, which does not look at poses on a GPU, either."""
+    """`validation.poses`, which does not look at poses on a GPU, either."""
     return Pose(pose.position.to(means).reshape(-1, 3), pose.rotation.to(means).reshape(-1, 3, 3))
 
 
@@ -44,7 +46,7 @@ def unlooked(pose: Pose, means: torch.Tensor) -> Pose:
 def test_a_training_loss_and_its_gradients_stay_on_the_models_device(kind, campaign, tmp_path, monkeypatch):
     monkeypatch.setattr(backends, "choose", lambda name, device: Shapes)
     monkeypatch.setattr(backends, "named", lambda name: Shapes)
-    monkeypatch.setattr(door, "poses", unlooked)
+    monkeypatch.setattr(validation, "poses", unlooked)
     data = campaign(kind)
     made = module(data, tmp_path).to("meta")
     batch = data.batch(np.arange(6)).to("meta")

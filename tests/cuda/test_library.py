@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from shim import INCLUDES, SHIM
 
 from gsparc.ops import BackendUnavailable, backends, cuda_kernels, cuda_library
 
@@ -118,7 +119,7 @@ def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(
             pass
 
         def run(self, name: str, call: cuda_library.Call) -> int:
-            call.whole[:2] = [13000, 12080]
+            call.built_for, call.driver = 13000, 12080
             raise RuntimeError("CUDA driver version is insufficient for CUDA runtime version")
 
     monkeypatch.setattr(cuda_library, "missing_device", lambda: None)
@@ -145,9 +146,8 @@ def test_the_shim_reports_barriers_that_not_all_threads_meet_and_grids_that_no_g
     source = tmp_path / "unmet.cpp"
     source.write_text(UNMET)
     library = tmp_path / "unmet.so"
-    shim = cuda_library.SOURCES / "cuda" / "host_shim.cpp"
-    flags = ["-std=c++17", "-shared", "-fPIC", f"-I{cuda_library.SOURCES}"]
-    subprocess.run(["g++", *flags, str(source), str(shim), "-o", str(library)], check=True)
+    flags = ["-std=c++17", "-shared", "-fPIC", *INCLUDES]
+    subprocess.run(["g++", *flags, str(source), str(SHIM), "-o", str(library)], check=True)
     code = f"import ctypes; print(ctypes.CDLL({str(library)!r}).gsparc_unmet())"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1"

@@ -17,12 +17,11 @@ from pathlib import Path
 import pytest
 import torch
 from rasters import GRIDS, origin, poses, random_scene, render
-from shim import FLAGS, KEPT, serving
+from shim import INCLUDES, KEPT, SHIM, fingerprint, serving
 
 from gsparc.ops import SphereGrid, cuda_kernels, cuda_library, freeze, make_plan, mean_weights, networks
 from gsparc.ops.similarity import similarity_op
 
-SHIM = cuda_library.SOURCES / "cuda" / "host_shim.cpp"
 REPLAY = Path(__file__).parent / "replay.cpp"
 THREADS = ("-fsanitize=thread",)
 MEMORY = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all")
@@ -57,7 +56,7 @@ int main() { return launch(kernel, 1, 1, 64, nullptr, new int[64]); }
 
 def compiled(path: Path, watch: tuple[str, ...], *sources: str) -> Path:
     """An executable of watched sources over a shim that is not watched itself."""
-    common = ["g++", "-std=c++17", "-O1", "-g1", "-ffp-contract=off", f"-I{cuda_library.SOURCES}"]
+    common = ["g++", "-std=c++17", "-O1", "-g1", "-ffp-contract=off", *INCLUDES]
     defines = ["-DGSPARC_WATCHED", *(["-DGSPARC_WATCH_THREADS"] if watch == THREADS else [])]
     path.parent.mkdir(parents=True, exist_ok=True)
     parts = []
@@ -81,9 +80,8 @@ def recording(path: Path) -> Iterator[None]:
     """Every call of the kernels goes into a file as replay.cpp reads it, then runs."""
     run = cuda_kernels.run
 
-    def kept(name, like, *tensors, whole=(), real=(), sizes):
-        call = cuda_library.Call(twice=like.dtype == torch.float64, **sizes)
-        call.whole[: len(whole)], call.real[: len(real)] = list(whole), list(real)
+    def kept(name, like, *tensors, **numbers):
+        call = cuda_kernels.call_for(like, (), **numbers)
         with path.open("ab") as file:
             file.write(name.encode().ljust(32, b"\0") + bytes(call) + len(tensors).to_bytes(8, "little"))
             for tensor in tensors:
@@ -91,7 +89,7 @@ def recording(path: Path) -> Iterator[None]:
                 size = -1 if flat is None else len(flat)
                 file.write(size.to_bytes(8, "little", signed=True))
                 file.write(b"" if flat is None else flat.numpy().tobytes())
-        run(name, like, *tensors, whole=whole, real=real, sizes=sizes)
+        run(name, like, *tensors, **numbers)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(cuda_kernels, "run", kept)
@@ -135,7 +133,7 @@ def record(tmp_path_factory):
 @pytest.mark.slow
 @pytest.mark.parametrize("watch", [THREADS, MEMORY], ids=["threads", "memory"])
 def test_watched_kernels_have_nothing_to_report(watch, record):
-    path = KEPT / f"watched-{cuda_library.fingerprint(*FLAGS, *watch, REPLAY.read_text())}"
+    path = KEPT / f"watched-{fingerprint(*watch, REPLAY.read_text())}"
     if not path.exists():
         compiled(path, watch, *cuda_library.units(), str(REPLAY))
     done = ends(str(path), str(record))

@@ -4,13 +4,24 @@ import inspect
 import subprocess
 import sys
 from pathlib import Path
+from typing import get_type_hints
 
 import pytest
 import torch
 from rasters import poses, random_scene
 from torch.library import opcheck
 
-from gsparc.ops import SphereGrid, composite, cpu_kernels, cuda_kernels, make_plan, networks, operators
+from gsparc.ops import (
+    SphereGrid,
+    composite,
+    cpu_kernels,
+    cuda_kernels,
+    make_plan,
+    networks,
+    operators,
+    similarity,
+)
+from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
 
 ROOT = Path(__file__).parents[2]
 GRID = SphereGrid.hemisphere(10, 40)
@@ -22,14 +33,14 @@ def test_opcheck(hides):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
     view = (pose.position, pose.rotation)
-    numbers = operators.numbers(GRID, plan.optics)
+    settings = operators.packed(kernel_settings(GRID, plan.optics))
     leaves = [tensor.clone().requires_grad_() for tensor in model]
     hidden = scene.extinctions.clone().requires_grad_() if hides else None
     features, means2d = scene.features.clone().requires_grad_(), plan.means2d.clone().requires_grad_()
-    buffers = list(plan.buffers)
-    opcheck(operators.plan_op, (*model, None, *view, *numbers))
-    opcheck(operators.composite_op, (*leaves, hidden, features, means2d, *view, buffers, *numbers))
-    opcheck(operators.weights_op, (*leaves, hidden, *view, buffers, *numbers))
+    opcheck(operators.plan_op, (*model, None, None, *view, settings))
+    rest = (*view, *plan.buffers, settings)
+    opcheck(operators.composite_op, (means2d, *leaves, hidden, features, *rest))
+    opcheck(operators.weights_op, (*leaves, hidden, *rest))
 
 
 @pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
@@ -39,13 +50,12 @@ def test_opcheck_of_the_gradients(hides, behind):
     model = (scene.means, scene.quats, scene.scales, scene.opacities)
     plan = make_plan(*model, pose, GRID, extinctions=scene.extinctions)
     common = (*model, scene.extinctions)
-    view = (pose.position, pose.rotation, list(plan.buffers), *operators.numbers(GRID, plan.optics))
-    before, buffers = (pose.position, pose.rotation), list(plan.buffers)
+    view = (pose.position, pose.rotation, *plan.buffers, operators.packed(kernel_settings(GRID, plan.optics)))
     raster = composite(plan, *model, scene.features, extinctions=scene.extinctions)
     light = torch.ones_like(raster.transmittance) if behind else None
     images = (torch.ones_like(raster.image), light, raster.image, raster.transmittance)
     opcheck(operators.composite_backward_op, (*images, *common, scene.features, *view))
-    seen = operators.weights_op(*common, *before, buffers, *operators.numbers(GRID, plan.optics))
+    seen = operators.weights_op(*common, *view)
     opcheck(operators.weights_backward_op, (*[torch.ones_like(part) for part in seen], *common, *view))
 
 
@@ -61,7 +71,7 @@ def test_importing_twice_registers_once():
         "import gsparc.ops.native, importlib, sys, gsparc.ops; importlib.import_module('gsparc.ops.native');"
         "import torch;"
         "ops = [o for o in torch._C._dispatch_get_all_op_names() if o.startswith('gsparc::')];"
-        "assert len(ops) == len(set(ops)) == 5, ops"
+        "assert len(ops) == len(set(ops)) == 7, ops"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -88,10 +98,22 @@ def test_inputs_on_strides_are_understood():
 
 
 def test_every_device_has_every_operator_with_the_same_signature():
-    defined = {**vars(operators), **vars(networks)}
-    names = [name.removesuffix("_op") for name in defined if name.endswith("_op") and name != "custom_op"]
-    assert len(names) == 7
-    for name in names:
-        expected = list(inspect.signature(defined[f"{name}_op"]._init_fn).parameters)
-        for kernels in (cpu_kernels, cuda_kernels):
-            assert list(inspect.signature(getattr(kernels, name)).parameters) == expected, (name, kernels)
+    defined = {**vars(operators), **vars(networks), **vars(similarity)}
+    names = ["plan", "composite", "composite_backward", "weights", "weights_backward"]
+    for name in [*names, "networks", "networks_backward", "similarity"]:
+        first, second = (inspect.signature(getattr(of, name)) for of in (cpu_kernels, cuda_kernels))
+        assert first == second, name
+        flat = defined[f"{name}_op"]._opoverload._schema.arguments
+        hints = [hint for key, hint in get_type_hints(getattr(cpu_kernels, name)).items() if key != "return"]
+        tensors = [hint for hint in hints if hint is not KernelSettings]
+        count = sum(len(getattr(hint, "_fields", (0,))) for hint in tensors) + len(hints) - len(tensors)
+        assert len(flat) == count, name
+
+
+def test_arguments_of_an_operator_have_names():
+    """Settings travel as one list and arrive by name, each in its own type."""
+    schema = str(torch.ops.gsparc.weights.default._schema)
+    assert "Tensor? extinctions" in schema and "Tensor entries, float[] settings" in schema
+    settings = kernel_settings(GRID, Optics(projection="equirect"))
+    again = operators._unpacked((operators.packed(settings),))
+    assert again == settings and list(map(type, again)) == list(map(type, settings))

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsparc.methods.timing import ClockSettings
-from gsparc.ops import composite, make_plan, marks
+from gsparc.ops import composite, machine_limits, make_plan
 from gsparc.studies.bench import kernels, steps
 from gsparc.studies.bench.case import Case, Work
 from gsparc.studies.bench.claims import Claim
@@ -37,12 +37,12 @@ def test_pairs_are_the_pixels_inside_the_footprints(projection):
         one = [tensor[i : i + 1] for tensor in field.geometry]
         made = make_plan(*one, receiver(), plan.grid, projection=projection, backend="reference")
         alone += int((composite(made, *one, torch.ones(1, 1)).image > 0).sum())
-    assert abs(marks.pairs(plan) - alone) <= 2 + alone // 1000  # float32 at the edge
+    assert abs(machine_limits.pairs(plan) - alone) <= 2 + alone // 1000  # float32 at the edge
 
 
 def test_a_case_is_divided_by_the_larger_of_its_bounds():
     clock = ClockSettings(rounds=3, least=3, warmup=1)
-    pairs = Case("x", "-", 0, 1, Work(1, 10**7), kernel=lambda: marks.exponentials(4))
+    pairs = Case("x", "-", 0, 1, Work(1, 10**7), kernel=lambda: machine_limits.exponentials(4))
     moved = Case("x", "-", 0, 1, Work(10**9, 1), kernel=lambda: None)
     assert measure(pairs, Machine(), 1, clock).bound == "pairs"
     row = measure(moved, Machine(), 1, clock)

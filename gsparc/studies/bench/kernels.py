@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from gsparc.field.frozen import frozen_view
-from gsparc.ops import composite, freeze, marks, mean_weights
+from gsparc.ops import composite, freeze, machine_limits, mean_weights
 from gsparc.ops.geometry import Pose
 from gsparc.studies.bench.case import Call, Case, Work, size
 from gsparc.studies.bench.scene import COMPLEX, GRID, Scene, places, receiver, receivers
@@ -119,7 +119,7 @@ def backward(scene: Scene, batch: int) -> Case:
 def weights(scene: Scene, batch: int) -> Case:
     """Visible shares for channels: plan and weights (kernel)."""
     poses = receivers(batch)
-    pairs = marks.pairs(scene.plan(poses, channels=True))
+    pairs = machine_limits.pairs(scene.plan(poses, channels=True))
     return Case(
         *("weights, moving receiver", scene.projection, len(scene), batch),
         work=Work(size(scene.geometry) + 8 * batch * len(scene), pairs),
@@ -130,7 +130,9 @@ def weights(scene: Scene, batch: int) -> Case:
 
 def _blending(scene: Scene, poses: Pose, channels: int) -> Work:
     read = size(scene.geometry) + 4 * len(scene) * channels
-    return Work(read + _image_bytes(channels) + _image_bytes(len(poses)), marks.pairs(scene.plan(poses)))
+    return Work(
+        read + _image_bytes(channels) + _image_bytes(len(poses)), machine_limits.pairs(scene.plan(poses))
+    )
 
 
 def _image_bytes(planes: int) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from gsparc.methods.timing import ClockSettings, interleaved
-from gsparc.ops import marks
+from gsparc.ops import machine_limits
 from gsparc.studies.bench.case import Case
 
 COPY_BYTES = 48 * 2**20  # with its copy, beyond every cache
@@ -39,7 +39,7 @@ class Row:
 
 
 def undisturbed(times: np.ndarray) -> float:
-    """The fastest fifth of the rounds: a competing process stretches long calls more than short marks."""
+    """The fastest fifth of the rounds: a competing process stretches long calls more than short ones."""
     return float(np.quantile(times, 0.2))
 
 
@@ -52,11 +52,11 @@ class Machine:
 
     def copy(self, _: int = 0) -> int:
         """Returns the bytes moved."""
-        return marks.copy(self._source, self._target)
+        return machine_limits.copy(self._source, self._target)
 
     def exponentials(self, _: int = 0) -> int:
         """Returns how many."""
-        return marks.exponentials(MARK_TASKS)
+        return machine_limits.exponentials(MARK_TASKS)
 
 
 @torch.no_grad()

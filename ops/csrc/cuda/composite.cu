@@ -14,7 +14,7 @@ template <class S> struct Picture {
     S *image, *transmittance;  // (P, K, H, W), (P, H, W); the second may be absent
 };
 
-template <class S> GSPARC_HD int64_t pixels_of(const Lens<S>& lens) { return int64_t(lens.height) * lens.width; }
+template <class S> GSPARC_HD int64_t pixels_of(const KernelSettings<S>& settings) { return int64_t(settings.height) * settings.width; }
 
 template <class S, bool kTangent, int kChannels>
 __global__ void __launch_bounds__(kBlock) composite_kernel(View<S> v, Model<S> model, Picture<S> out) {
@@ -42,7 +42,7 @@ __global__ void __launch_bounds__(kBlock) composite_kernel(View<S> v, Model<S> m
     for (int k = 0; k < kChannels; ++k) desk.forms[walk.warp][k][walk.lane] = sums[k];
     block_sync();
     if (!walk.pixel.real) return;
-    const int64_t pixels = pixels_of(v.lens), at = walk.pixel.place(v.lens);
+    const int64_t pixels = pixels_of(v.settings), at = walk.pixel.place(v.settings);
     for (int k = walk.warp; k < used; k += kWarps) {
         S total = 0;
         for (int w = 0; w < kWarps; ++w) total += desk.forms[w][k][walk.lane];
@@ -67,7 +67,7 @@ __global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> mo
     if (v.overflows()) return;
     Walk<S, kTangent, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
     const int from = blockIdx.y * kChannels, used = forward.channels - from < kChannels ? forward.channels - from : kChannels;
-    const int64_t pixels = pixels_of(v.lens), at = walk.pixel.place(v.lens), row0 = int64_t(blockIdx.y) * v.capacity;
+    const int64_t pixels = pixels_of(v.settings), at = walk.pixel.place(v.settings), row0 = int64_t(blockIdx.y) * v.capacity;
     S g[kChannels] = {}, behind = 0;  // what is still to come of the loss, behind the batch's front
     if (walk.pixel.real) {
         for (int k = 0; k < used; ++k) {
@@ -110,7 +110,7 @@ __global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> mo
                 S values[power_of_two(kRow)] = {};
                 if (counts) {
                     S tau1, tau2, form;
-                    walk.pixel.offsets(walk.entry(j).record, v.lens, tau1, tau2, form);
+                    walk.pixel.offsets(walk.entry(j).record, v.settings, tau1, tau2, form);
                     const Layer<S, true> layer = walk.layer(j, form);
                     const S gain = lit ? gain_of(j) : S(0), weight = light * layer.alpha, through = S(1) - layer.gamma;
                     if (lit) rest -= weight * gain;
@@ -245,9 +245,9 @@ __global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunk
     const Gaussian<S> g = gaussian(model, i);
     const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : opacity;
     const S* rotation = model.rotations + 9 * pose;
-    const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, v.lens);
+    const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, v.settings);
     const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
-    const Gradients<S> one = project_backward(f, moments, opacity, extinction, rotation, v.lens);
+    const Gradients<S> one = project_backward(f, moments, opacity, extinction, rotation, v.settings);
     for (int k = 0; k < 3; ++k) to[k] = one.mean[k], to[7 + k] = one.scale[k];
     for (int k = 0; k < 4; ++k) to[3 + k] = one.quat[k];
     to[10] = one.opacity, to[11] = one.extinction;
@@ -287,7 +287,7 @@ template <class S, bool kTangent> auto backward_of(int width) {
 
 template <class S> int64_t blend(const View<S>& v, const Model<S>& model, const Picture<S>& picture, void* stream) {
     const int width = width_for<S>(picture.channels), chunks = chunks_for(picture.channels, width);
-    const auto kernel = v.lens.tangent ? composite_of<S, true>(width) : composite_of<S, false>(width);
+    const auto kernel = v.settings.tangent ? composite_of<S, true>(width) : composite_of<S, false>(width);
     return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, picture);
 }
 
@@ -298,11 +298,12 @@ int64_t add(const View<S>& v, int chunks, void* stream, const S* rows, int width
 }
 
 template <class S> int64_t composite(const Call& call) {
-    Reader in{call};
-    const View<S> v = read_view<S>(in);
+    auto in = reader(call);
+    const View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     Picture<S> out;
-    out.features = in.next<const S>(), out.channels = call.channels, out.image = in.next<S>(), out.transmittance = in.next<S>();
+    out.channels = call.channels;
+    in.read(out.features, out.image, out.transmittance);
     if (!call.scratch) return 1;
     return -blend(v, model, out, reinterpret_cast<void*>(uintptr_t(call.stream)));
 }
@@ -310,36 +311,31 @@ template <class S> int64_t composite(const Call& call) {
 // Backward of `composite`, or, where `weights`, of the weights: then features are the slopes of the sums of
 // alpha T, and the image they make is the total that the pass runs down from.
 template <class S> int64_t backward(const Call& call, bool weights) {
-    Reader in{call};
-    const View<S> v = read_view<S>(in);
+    auto in = reader(call);
+    const View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     Picture<S> forward{};
     Upstream<S> up{};
-    forward.features = in.next<const S>(), forward.channels = call.channels;
-    if (weights) {
-        up.per_alpha = in.next<const S>();
-    } else {
-        forward.image = in.next<S>(), forward.transmittance = in.next<S>();
-        up.image = in.next<const S>(), up.transmittance = in.next<const S>();
-    }
+    forward.channels = call.channels;
+    if (weights) in.read(forward.features, up.per_alpha);
+    else in.read(forward.features, forward.image, forward.transmittance, up.image, up.transmittance);
     Slopes<S> out;
-    out.means = in.next<S>(), out.quats = in.next<S>(), out.scales = in.next<S>(), out.opacities = in.next<S>();
-    out.extinctions = in.next<S>();
-    S* features = weights ? nullptr : in.next<S>();
-    S* screen = weights ? nullptr : in.next<S>();  // (P, N, 2)
+    in.read(out.means, out.quats, out.scales, out.opacities, out.extinctions);
+    S *features = nullptr, *screen = nullptr;
+    if (!weights) in.read(features, screen);  // (P, N, K), (P, N, 2)
 
     const int64_t all = int64_t(v.poses) * v.count;
     const int width = width_for<S>(call.channels), chunks = chunks_for(call.channels, width), row = kMoments + width;
     Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
     up.rows = arena.take<S>(int64_t(chunks) * v.capacity * row);
     S *sums = arena.take<S>(int64_t(chunks) * all * kMoments), *slopes = arena.take<S>(all * kSlopes);
-    if (weights) forward.image = arena.take<S>(v.poses * pixels_of(v.lens));
+    if (weights) forward.image = arena.take<S>(v.poses * pixels_of(v.settings));
     if (arena.measuring()) return arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     Steps steps;
     if (weights) steps.then([&] { return blend(v, model, forward, stream); });
-    const auto kernel = v.lens.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
+    const auto kernel = v.settings.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
     steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up); });
     steps.then([&] { return add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : call.channels); });
     steps.then([&] { return launch(chain_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, sums, chunks, slopes, screen); });
@@ -348,19 +344,19 @@ template <class S> int64_t backward(const Call& call, bool weights) {
 }
 
 template <class S> int64_t weigh(const Call& call) {
-    Reader in{call};
-    const View<S> v = read_view<S>(in);
+    auto in = reader(call);
+    const View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     Weighed<S> out{};
-    S* sums = in.next<S>();  // (P, N, 2), or absent for blocks
-    out.blocks = in.next<S>(), out.ends = in.next<int32_t>();
+    S* sums;  // (P, N, 2), or absent for blocks
+    in.read(sums, out.blocks, out.ends);
     Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
     if (sums) out.rows = arena.take<S>(int64_t(v.capacity) * 2);
     if (arena.measuring()) return arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     Steps steps;
-    const auto kernel = v.lens.tangent ? weigh_kernel<S, true> : weigh_kernel<S, false>;
+    const auto kernel = v.settings.tangent ? weigh_kernel<S, true> : weigh_kernel<S, false>;
     steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, 1, kBlock, stream, v, model, out); });
     if (sums)
         steps.then([&] { return add<S>(v, 1, stream, out.rows, 2, 2, sums, nullptr, 0); });

@@ -18,7 +18,7 @@
 #define GSPARC_INLINE inline
 #define GSPARC_UNROLL
 #define GSPARC_UNROLL_BY(n)
-#include "host_shim.h"
+#include "host_shim.h"  // of tests/cuda
 #endif
 
 namespace gsparc {

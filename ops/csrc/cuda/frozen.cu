@@ -96,12 +96,11 @@ template <class S> __global__ void __launch_bounds__(kBlock, 8) thaw_many(Frozen
 }
 
 template <class S> int64_t thaw(const Call& call) {
-    Reader in{call};
+    auto in = reader(call);
     Frozen<S> f;
-    f.height = call.whole[0], f.width = call.whole[1], f.columns = call.channels;
+    f.height = call.height, f.width = call.width, f.columns = call.channels;
     f.tiles_x = (f.width + kTileWidth - 1) / kTileWidth;
-    f.starts = in.next<const int32_t>(), f.ends = in.next<const int32_t>(), f.ranks = in.next<const int32_t>();
-    f.blocks = in.next<const S>(), f.features = in.next<const S>(), f.image = in.next<S>();
+    in.read(f.starts, f.ends, f.ranks, f.blocks, f.features, f.image);
     if (!call.scratch) return 1;
     const int tiles = f.tiles_x * ((f.height + kTileHeight - 1) / kTileHeight);
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));

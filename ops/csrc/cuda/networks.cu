@@ -6,7 +6,7 @@ namespace gsparc {
 namespace GSPARC_ISA {
 namespace {
 
-constexpr int kInputs = 256, kOutputs = 4, kMany = 16;  // the most this kernel takes; networks.py refuses more
+constexpr int kMany = 16;  // positions at a time
 #ifdef __CUDACC__
 constexpr int64_t kMostRows = 65535;  // of a grid; blocks go on to further positions
 #else
@@ -19,7 +19,7 @@ struct Networks {
 };
 
 // Positions [from, from + kSamples) into shared memory, by input; zeros beyond the batch.
-template <int kSamples> __device__ void read_inputs(const Networks& n, int from, float (&x)[kInputs][kSamples]) {
+template <int kSamples> __device__ void read_inputs(const Networks& n, int from, float (&x)[kMostInputs][kSamples]) {
     block_sync();
     for (int at = threadIdx.x; at < n.inputs * kSamples; at += kBlock) {
         const int e = at / kSamples, b = at % kSamples;
@@ -29,7 +29,7 @@ template <int kSamples> __device__ void read_inputs(const Networks& n, int from,
 }
 
 // What hidden unit h of Gaussian i sees at each position, before the ReLU.
-template <int kSamples> __device__ void hidden_unit(const Networks& n, int64_t i, int h, const float (&x)[kInputs][kSamples], float (&sums)[kSamples]) {
+template <int kSamples> __device__ void hidden_unit(const Networks& n, int64_t i, int h, const float (&x)[kMostInputs][kSamples], float (&sums)[kSamples]) {
     const float bias = n.bias1[i * n.hidden + h];
     for (int b = 0; b < kSamples; ++b) sums[b] = bias;
     const float* weight = n.weight1 + i * n.inputs * n.hidden + h;
@@ -42,7 +42,7 @@ template <int kSamples> __device__ void hidden_unit(const Networks& n, int64_t i
 }
 
 template <int kSamples> __global__ void __launch_bounds__(kBlock) networks_kernel(Networks n, float* out) {
-    alignas(16) __shared__ float x[kInputs][kSamples];
+    alignas(16) __shared__ float x[kMostInputs][kSamples];
     const int lane = threadIdx.x % kWarp;
     const int64_t i = int64_t(blockIdx.x) * kWarps + threadIdx.x / kWarp;
     for (int64_t start = int64_t(blockIdx.y) * kSamples; start < n.samples; start += int64_t(gridDim.y) * kSamples) {
@@ -70,16 +70,16 @@ struct Derivatives {
 };
 
 __global__ void __launch_bounds__(kBlock) networks_backward_kernel(Networks n, Derivatives d) {
-    alignas(16) __shared__ float x[kInputs][kMany];
+    alignas(16) __shared__ float x[kMostInputs][kMany];
     const int lane = threadIdx.x % kWarp;
     const int64_t i = int64_t(blockIdx.x) * kWarps + threadIdx.x / kWarp;
     const bool there = i < n.count;  // the others only meet at the barriers
     for (int from = 0; from < n.samples; from += kMany) {
         read_inputs(n, from, x);
         if (!there) continue;
-        float up[kOutputs][kMany];
+        float up[kMostOutputs][kMany];
         GSPARC_UNROLL
-        for (int c = 0; c < kOutputs; ++c)
+        for (int c = 0; c < kMostOutputs; ++c)
             GSPARC_UNROLL
             for (int b = 0; b < kMany; ++b)
                 up[c][b] = c < n.outputs && from + b < n.samples ? d.out[(int64_t(from + b) * n.count + i) * n.outputs + c] : 0.0f;
@@ -87,7 +87,7 @@ __global__ void __launch_bounds__(kBlock) networks_backward_kernel(Networks n, D
             float sums[kMany], slope[kMany] = {};
             hidden_unit(n, i, h, x, sums);
             GSPARC_UNROLL
-            for (int c = 0; c < kOutputs; ++c) {
+            for (int c = 0; c < kMostOutputs; ++c) {
                 if (c >= n.outputs) break;
                 const int64_t at = (i * n.hidden + h) * n.outputs + c;
                 const float w = n.weight2[at];
@@ -119,12 +119,10 @@ __global__ void __launch_bounds__(kBlock) networks_backward_kernel(Networks n, D
     }
 }
 
-Networks read_networks(Reader& in) {
-    const Call& c = in.call;
+Networks read_networks(const Call& c, Reader& in) {
     Networks n;
-    n.samples = c.samples, n.count = c.count, n.inputs = c.whole[0], n.hidden = c.whole[1], n.outputs = c.channels;
-    n.x = in.next<const float>(), n.weight1 = in.next<const float>(), n.bias1 = in.next<const float>();
-    n.weight2 = in.next<const float>(), n.bias2 = in.next<const float>();
+    n.samples = c.samples, n.count = c.count, n.inputs = c.inputs, n.hidden = c.hidden, n.outputs = c.channels;
+    in.read(n.x, n.weight1, n.bias1, n.weight2, n.bias2);
     return n;
 }
 
@@ -136,8 +134,8 @@ extern "C" {
 
 int64_t gsparc_networks(const gsparc::GSPARC_ISA::Call* call) {
     using namespace gsparc::GSPARC_ISA;
-    Reader in{*call};
-    const Networks n = read_networks(in);
+    auto in = reader(*call);
+    const Networks n = read_networks(*call, in);
     float* out = in.next<float>();
     if (!call->scratch) return 1;
     if (const int64_t error = use_device(call->device)) return -error;
@@ -150,11 +148,10 @@ int64_t gsparc_networks(const gsparc::GSPARC_ISA::Call* call) {
 
 int64_t gsparc_networks_backward(const gsparc::GSPARC_ISA::Call* call) {
     using namespace gsparc::GSPARC_ISA;
-    Reader in{*call};
-    const Networks n = read_networks(in);
+    auto in = reader(*call);
+    const Networks n = read_networks(*call, in);
     Derivatives d;
-    d.out = in.next<const float>(), d.weight1 = in.next<float>(), d.bias1 = in.next<float>();
-    d.weight2 = in.next<float>(), d.bias2 = in.next<float>();
+    in.read(d.out, d.weight1, d.bias1, d.weight2, d.bias2);
     if (!call->scratch) return 1;
     if (const int64_t error = use_device(call->device)) return -error;
     void* stream = reinterpret_cast<void*>(uintptr_t(call->stream));

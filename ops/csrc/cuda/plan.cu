@@ -52,7 +52,7 @@ template <class S> __global__ void project_kernel(View<S> v, Model<S> model, Out
     if (at >= uint32_t(v.poses) * v.count) return;
     const int pose = at / v.count;
     const int64_t i = at % v.count, base = int64_t(pose) * v.count;
-    const ProjectArgs<S> one = {model, v.count, v.lens, v.records + base * kRecord, out.depths + base, out.means2d + 2 * base,
+    const ProjectArgs<S> one = {model, v.count, v.settings, v.records + base * kRecord, out.depths + base, out.means2d + 2 * base,
                                 out.radii + base, v.boxes + base, out.visible + base, pose};
     const int wrong = project_one(one, i);
     if (wrong >= 0) {
@@ -118,10 +118,10 @@ struct TileRange {
         rows = box.row1 > box.row0 ? (box.row1 - 1) / kTileHeight - row0 + 1 : 0;
         column0 = box.column0 / kTileWidth;
         const int end = box.column0 + box.columns;
-        if (end <= v.lens.width)
+        if (end <= v.settings.width)
             columns = (end - 1) / kTileWidth - column0 + 1;
         else
-            columns = v.tiles_x - column0 + (end - v.lens.width - 1) / kTileWidth + 1;
+            columns = v.tiles_x - column0 + (end - v.settings.width - 1) / kTileWidth + 1;
     }
 };
 
@@ -135,7 +135,7 @@ __device__ int find_tiles(const View<S>& v, const TileRange& range, const S* rec
         const int column = range.column0 + k < v.tiles_x ? range.column0 + k : range.column0 + k - v.tiles_x;
         const Pixel<S, kTangent> pixel(v, row, column, threadIdx.x % kWarp);
         S tau1, tau2, form;
-        if (warp_any(pixel.offsets(record, v.lens, tau1, tau2, form))) keep(found++, row * v.tiles_x + column);
+        if (warp_any(pixel.offsets(record, v.settings, tau1, tau2, form))) keep(found++, row * v.tiles_x + column);
     }
     return found;
 }
@@ -217,17 +217,17 @@ template <class S>
 int64_t list(const View<S>& v, void* stream, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
     const int64_t all = int64_t(v.poses) * v.count;
     const int pieces = pieces_for(all), warps = pieces > kWarps ? pieces : kWarps, together = warps / pieces;
-    const auto kernel = v.lens.tangent ? list_tiles<S, true> : list_tiles<S, false>;
+    const auto kernel = v.settings.tangent ? list_tiles<S, true> : list_tiles<S, false>;
     return launch(kernel, (all + together - 1) / together, 1, warps * kWarp, stream, v, pieces, sorted, counts, keys, gaussians);
 }
 
 template <class S> int64_t plan(const Call& call) {
-    Reader in{call};
-    View<S> v = read_view<S>(in);
+    auto in = reader(call);
+    View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     const auto* ids = in.next<const int64_t>();
     Outputs<S> out;
-    out.means2d = in.next<S>(), out.radii = in.next<S>(), out.visible = in.next<bool>();
+    in.read(out.means2d, out.radii, out.visible);
     auto* verdict = in.next<int64_t>();
 
     const int64_t all = int64_t(v.poses) * v.count;
@@ -267,8 +267,8 @@ template <class S> int64_t plan(const Call& call) {
 }
 
 template <class S> int64_t bin(const Call& call) {
-    Reader in{call};
-    const View<S> v = read_view<S>(in);
+    auto in = reader(call);
+    const View<S> v = read_view<S>(call, in);
     const int64_t capacity = v.capacity;
     const int tiles = v.poses * v.tiles, bits = bits_for(tiles);
     Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
@@ -311,25 +311,25 @@ int64_t gsparc_tables(const gsparc::GSPARC_ISA::Call* call) {
     using namespace gsparc::GSPARC_ISA;
     return with_scalar(*call, [&](auto zero) -> int64_t {
         using S = decltype(zero);
-        if (call->tensors[0]) fill_tables(lens_of<S>(*call), reinterpret_cast<S*>(uintptr_t(call->tensors[0])));
-        return call->tensors[0] ? 0 : table_size(lens_of<S>(*call));
+        if (call->tensors[0]) fill_tables(gsparc::in_precision<S>(call->settings), reinterpret_cast<S*>(uintptr_t(call->tensors[0])));
+        return call->tensors[0] ? 0 : table_size(gsparc::in_precision<S>(call->settings));
     });
 }
 
-// Whether the driver can run these kernels on the call's device; whole[0] and whole[1] receive the CUDA versions of the
-// build and of the driver.
+// Whether the driver can run these kernels on the call's device; `built_for` and `driver` receive the CUDA versions of
+// the build and of the driver.
 int64_t gsparc_check(gsparc::GSPARC_ISA::Call* call) {
 #ifdef __CUDACC__
     using namespace gsparc::GSPARC_ISA;
     cudaFuncAttributes known;
-    call->whole[0] = CUDART_VERSION;
+    call->built_for = CUDART_VERSION;
     Steps steps;
-    steps.then([&] { return cudaDriverGetVersion(call->whole + 1); });
+    steps.then([&] { return cudaDriverGetVersion(&call->driver); });
     steps.then([&] { return use_device(call->device); });
     steps.then([&] { return cudaFuncGetAttributes(&known, look_for_disorder); });
     return steps.result();
 #else
-    return call->whole[0] = call->whole[1] = 0;
+    return call->built_for = call->driver = 0;
 #endif
 }
 
@@ -338,7 +338,7 @@ const char* gsparc_error(int64_t code) {
 #ifdef __CUDACC__
     return cudaGetErrorString(cudaError_t(code));
 #else
-    return code == shim::kUnmet ? "a barrier was not met by all threads" : code ? "a grid larger than GPUs take" : "";
+    return shim::message(code);
 #endif
 }
 

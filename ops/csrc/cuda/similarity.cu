@@ -7,8 +7,8 @@ namespace gsparc {
 namespace GSPARC_ISA {
 namespace {
 
-constexpr int kWide = 32, kHigh = 8, kRadius = 5, kTaps = 2 * kRadius + 1;  // outputs of a block; the widest window
-constexpr int kColumns = kWide + 2 * kRadius, kRows = kHigh + 2 * kRadius;
+constexpr int kWide = kSimilarityWidth, kHigh = kSimilarityHeight, kTaps = 2 * kMostRadius + 1;
+constexpr int kColumns = kWide + 2 * kMostRadius, kRows = kHigh + 2 * kMostRadius;
 constexpr int kWindowed = 5, kDerivatives = 3;
 
 struct Images {
@@ -124,12 +124,11 @@ int tiles_of(int height, int width) { return (height + kHigh - 1) / kHigh * ((wi
 extern "C" int64_t gsparc_similarity(const gsparc::GSPARC_ISA::Call* call) {
     using namespace gsparc::GSPARC_ISA;
     Images a;
-    a.height = call->whole[0], a.width = call->whole[1], a.radius = call->whole[2];
-    a.c1 = float(call->real[0]), a.c2 = float(call->real[1]);
-    for (int k = 0; k < kTaps; ++k) a.taps[k] = k > 2 * a.radius ? 0.0f : float(call->real[2 + (k <= a.radius ? k : 2 * a.radius - k)]);
-    Reader in{*call};
-    a.prediction = in.next<const float>(), a.target = in.next<const float>(), a.shift = in.next<const float>();
-    a.sums = in.next<float>(), a.slope = in.next<float>();
+    a.height = call->height, a.width = call->width, a.radius = call->radius;
+    a.c1 = float(call->window[0]), a.c2 = float(call->window[1]);
+    for (int k = 0; k < kTaps; ++k) a.taps[k] = k > 2 * a.radius ? 0.0f : float(call->window[2 + (k <= a.radius ? k : 2 * a.radius - k)]);
+    auto in = reader(*call);
+    in.read(a.prediction, a.target, a.shift, a.sums, a.slope);
     Arena arena(reinterpret_cast<void*>(uintptr_t(call->scratch)));
     a.by = a.slope ? arena.take<float>(kDerivatives * call->samples * a.places()) : nullptr;
     if (arena.measuring()) return arena.bytes();

@@ -43,7 +43,7 @@ template <class S, bool kTangent, int kChannels> struct Walk {
 
     GSPARC_HD Walk(const View<S>& view, Shared& shared, int block, int thread)
         : v(view), desk(shared), warp(thread / kWarp), lane(thread % kWarp), pose(block / view.tiles),
-          pixel(view, block % view.tiles / view.tiles_x, block % view.tiles % view.tiles_x, thread % kWarp), floor(view.lens.transmittance_min), alpha_max(view.lens.alpha_max),
+          pixel(view, block % view.tiles / view.tiles_x, block % view.tiles % view.tiles_x, thread % kWarp), floor(view.settings.transmittance_min), alpha_max(view.settings.alpha_max),
           base(view.starts[block]), end(view.starts[block + 1]) {}
 
     GSPARC_HD bool lit(S before) const { return pixel.real && floor <= before; }
@@ -75,7 +75,7 @@ template <class S, bool kTangent, int kChannels> struct Walk {
         S product = 1;
         for (int j = 0; j < taken; ++j) {
             S tau1, tau2, form;
-            const bool inside = pixel.offsets(entry(j).record, v.lens, tau1, tau2, form);
+            const bool inside = pixel.offsets(entry(j).record, v.settings, tau1, tau2, form);
             if (inside) product *= S(1) - layer(j, form).gamma;
             desk.forms[warp][j][lane] = inside ? form : S(-1);
         }

@@ -1,19 +1,20 @@
-"""What comes in is checked once, here; an error is one line saying what to change."""
+"""Input validation of the rasterizer: each error is one line that says what to change."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from gsparc.ops.geometry import Pose
+from gsparc.ops import built
+from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, WIDEST
 
 
 class UnsoundGaussian(ValueError):
-    """A Gaussian that no footprint can be made of.
+    """A Gaussian with a parameter out of range or not finite.
 
     Attributes:
-        index: its row.
+        index: its row in the tensors.
     """
 
     def __init__(self, message: str, index: int) -> None:
@@ -28,66 +29,80 @@ def gaussians(
     opacities: Tensor,
     extinctions: Tensor | None,
     ids: Tensor | None,
-) -> None:
-    """Refuse Gaussians whose shapes, dtypes or devices disagree (ValueError, TypeError)."""
+) -> Gaussians:
+    """Gaussians whose shapes, dtypes and devices agree (ValueError, TypeError)."""
     n = means.shape[0] if means.dim() else 0
-    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
-    given = {"means": means, "quats": quats, "scales": scales, "opacities": opacities}
-    if extinctions is not None:
-        expected["extinctions"], given["extinctions"] = (n,), extinctions
-    for name, tensor in given.items():
-        if tuple(tensor.shape) != expected[name]:
-            raise ValueError(f"{name} must be {expected[name]} for {n} means, got {tuple(tensor.shape)}")
-        _same_kind(name, tensor, means)
+    given = Gaussians(means, quats, scales, opacities, extinctions)
+    expected = ((n, 3), (n, 4), (n, 3), (n,), (n,))
+    for name, tensor, shape in zip(Gaussians._fields, given, expected, strict=True):
+        if tensor is None:
+            continue
+        if tuple(tensor.shape) != shape:
+            raise ValueError(f"{name} must be {shape} for {n} means, got {tuple(tensor.shape)}")
+        _check_dtype_and_device(name, tensor, means)
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"the rasterizer computes in float32 or float64, got means in {means.dtype}")
     if ids is not None and (
         tuple(ids.shape) != (n,) or ids.dtype != torch.int64 or ids.device != means.device
     ):
         raise ValueError(f"ids must be ({n},) int64 on {means.device}, got {tuple(ids.shape)} {ids.dtype}")
+    return given
 
 
-def finite(means: Tensor, quats: Tensor, scales: Tensor, strongest: Tensor, pose: Pose) -> None:
-    """Refuse what no footprint can be made of (ValueError), naming the first Gaussian, or a pose."""
+def finite(gaussians: Gaussians, pose: Pose) -> None:
+    """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
     if not all(bool(torch.isfinite(part).all()) for part in (pose.position, pose.rotation)):
         raise_for_pose()
-    sound = {
+    means, quats, scales, strongest, _ = gaussians
+    valid = {
         "means": (means.abs() <= FARTHEST).all(-1),
         "quats": torch.isfinite(quats).all(-1),
         "scales": ((scales >= 0) & (scales <= WIDEST)).all(-1),
         "opacities": (strongest >= 0) & (strongest <= 1),
     }
-    for name, ok in sound.items():
+    for name, ok in valid.items():
         if not bool(ok.all()):
             raise_for(name, int(torch.argmin(ok.to(torch.int8))))
 
 
-def strongest(opacities: Tensor, extinctions: Tensor) -> Tensor:
-    """The larger of each two; the smaller where it is negative, so that nobody hides behind the other."""
-    least = torch.minimum(opacities, extinctions)
-    return torch.where(least < 0, least, torch.maximum(opacities, extinctions))
+def strongest(gaussians: Gaussians) -> Gaussians:
+    """Gaussians with max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
+    opacities, extinctions = gaussians.opacities, gaussians.extinctions
+    if extinctions is None:
+        return gaussians
+    smaller = torch.minimum(opacities, extinctions)
+    larger = torch.where(smaller < 0, smaller, torch.maximum(opacities, extinctions))
+    return gaussians._replace(opacities=larger, extinctions=None)
+
+
+def raise_for_status(status: int) -> None:
+    """Raise for a plan's status: UNSOUND_POSE, 4 * Gaussian + index of the parameter, or -1 if valid."""
+    if status == built.kernels().UNSOUND_POSE:
+        raise_for_pose()
+    if status >= 0:
+        raise_for(Gaussians._fields[status % 4], status // 4)
 
 
 def raise_for(name: str, index: int) -> None:
-    """The error for Gaussian `index` whose `name` no footprint can be made of (UnsoundGaussian)."""
-    wanted = {
+    """Raise for the invalid parameter `name` of Gaussian `index` (UnsoundGaussian)."""
+    expected = {
         "means": f"finite and within {FARTHEST:.0e} m",
         "scales": f"finite and from 0 to {WIDEST:.0e} m",
         "opacities": "in [0, 1], extinctions included",
     }.get(name, "finite")
     raise UnsoundGaussian(
-        f"Gaussian {index} has {name} that are not {wanted}; find where they come from", index
+        f"Gaussian {index} has {name} that are not {expected}; find where they come from", index
     )
 
 
 def raise_for_pose() -> None:
-    """The error for a pose that no direction can be told from (ValueError)."""
+    """Raise for a pose that is not finite (ValueError)."""
     raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
 
 
 def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
     """Features (N, C) or (B, N, C) as (B, N, C), checked against the Gaussians and the poses (ValueError)."""
-    _same_kind("features", values, means)
+    _check_dtype_and_device("features", values, means)
     if values.dim() not in (2, 3) or values.shape[-2] != means.shape[0]:
         raise ValueError(
             f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
@@ -101,13 +116,13 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
 
 
 def poses(pose: Pose, means: Tensor) -> Pose:
-    """Poses (P,) in the Gaussians' dtype and on their device, always batched; plans look if finite."""
+    """Poses (P,) in the Gaussians' dtype and on their device, always batched; the plan checks values."""
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
     return Pose(position, rotation)
 
 
-def _same_kind(name: str, tensor: Tensor, means: Tensor) -> None:
+def _check_dtype_and_device(name: str, tensor: Tensor, means: Tensor) -> None:
     if tensor.dtype != means.dtype:
         raise TypeError(f"{name} is {tensor.dtype} but means is {means.dtype}; convert one of them")
     if tensor.device != means.device:

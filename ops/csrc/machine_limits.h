@@ -1,5 +1,5 @@
-// What this machine can do at best: the marks that timings are divided by. Written before the kernels were tuned
-// and with an exponential of their own, so that no change to the kernels moves them.
+// Roofline of this machine: peak rates that timings are divided by. Written before the kernels were tuned and with an
+// exponential of their own, so that no change to the kernels moves them.
 #pragma once
 #include <string.h>
 
@@ -49,17 +49,17 @@ inline void mark_copy(const char* from, char* to, int64_t bytes, int threads) {
 }
 
 // Pixel-Gaussian pairs inside the exact footprints of a plan: the exponentials that no renderer can avoid.
-template <class S> int64_t mark_pairs(const PlanView<S>& plan, const Lens<S>& lens, int threads) {
-    const TileTables<S> grid(lens);
+template <class S> int64_t mark_pairs(const PlanView<S>& plan, const KernelSettings<S>& settings, int threads) {
+    const TileTables<S> grid(settings);
     const int tasks = plan.poses * plan.strips;
     Buffer<int64_t> counts(tasks);
     auto run = [&](int task, int) {
-        const Strip<S> strip(plan, lens.height, task);
+        const Strip<S> strip(plan, settings.height, task);
         for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
             Vec<S> found = splat(S(0));
             const auto count = [&](int, Vec<S>, Vec<S>, Vec<S>, Mask<S> inside) { found += select(inside, splat(S(1)), splat(S(0))); };
-            if (lens.tangent) each_tile<S, true, false>(strip, *entry, grid, lens, Always<S>(), count);
-            else each_tile<S, false, false>(strip, *entry, grid, lens, Always<S>(), count);
+            if (settings.tangent) each_tile<S, true, false>(strip, *entry, grid, settings, Always<S>(), count);
+            else each_tile<S, false, false>(strip, *entry, grid, settings, Always<S>(), count);
             counts[task] += int64_t(sum<S>(found));
         }
     };

@@ -40,6 +40,7 @@ bool raised();
 template <class S> __attribute__((noinline, no_sanitize("thread"))) S peek(const S* at) { return *at; }
 
 constexpr int64_t kUnmet = 1, kTooLarge = 2;  // errors of a launch
+const char* message(int64_t error);
 // Runs `body` for every thread of blocks x rows blocks; returns 0 or an error.
 int64_t run(int64_t blocks, int64_t rows, int threads, const std::function<void()>& body);
 

@@ -159,6 +159,10 @@ const void* shown_by(unsigned lane) { return desk[thread_index.x / 32 * 32 + lan
 void raise(bool up) { flag = up; }
 bool raised() { return flag; }
 
+const char* message(int64_t error) {
+    return error == kUnmet ? "a barrier was not met by all threads" : error ? "a grid larger than GPUs take" : "";
+}
+
 int64_t run(int64_t blocks, int64_t rows, int threads, const std::function<void()>& body) {
     if (blocks > 2147483647 || rows > 65535 || threads > 1024) return kTooLarge;
     scheduler_watched = __tsan_get_current_fiber();

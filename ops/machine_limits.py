@@ -1,4 +1,4 @@
-"""What this machine can do at best, measured beside the kernels: see csrc/yardstick.h."""
+"""Roofline of this CPU: peak rates that kernel timings are divided by; see csrc/machine_limits.h."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from torch import Tensor
 
 from gsparc.ops import _native
 from gsparc.ops.cpu_kernels import addresses
-from gsparc.ops.operators import numbers
 from gsparc.ops.plan import Plan
+from gsparc.ops.settings import kernel_settings
 
 
 def exponentials(tasks: int) -> int:
-    """Accumulate bare exponentials over a row of pixels on torch's number of threads; returns how many."""
+    """Accumulate exponentials over a row of pixels in torch's threads; returns how many were evaluated."""
     return _native.mark_exponentials(tasks, torch.get_num_threads())
 
 
 def copy(source: Tensor, target: Tensor) -> int:
-    """Copy a contiguous tensor on torch's number of threads; returns the bytes read and written.
+    """Copy a contiguous tensor in torch's threads; returns the bytes read and written.
 
     Raises:
         ValueError: one is not contiguous, or their sizes differ.
@@ -37,7 +37,6 @@ def pairs(plan: Plan) -> int:
     """
     if plan.backend != "cpu":
         raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
-    whole, real = numbers(plan.grid, plan.optics)
-    twice = plan.means2d.dtype == torch.float64
+    double, settings = plan.means2d.dtype == torch.float64, kernel_settings(plan.grid, plan.optics)
     sizes = (plan.num_poses, plan.num_gaussians, torch.get_num_threads())
-    return _native.mark_pairs(twice, *sizes, whole, real, addresses(*plan.buffers))
+    return _native.mark_pairs(double, *sizes, settings, addresses(*plan.buffers))

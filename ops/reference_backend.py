@@ -1,0 +1,84 @@
+"""The `reference` backend: plans and composites with dense tensors and autograd."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsparc.ops import reference, validation
+from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
+from gsparc.ops.plan import Plan
+from gsparc.ops.results import visible_share
+from gsparc.ops.settings import Optics
+
+
+def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
+    """Depth order and radii; compositing evaluates the footprints again, differentiably."""
+    validation.finite(gaussians, pose)
+    means, quats, scales, strongest, _ = gaussians
+    orders, centers, radii, visible = [], [], [], []
+    for index in range(len(pose)):
+        seen = reference.project(means, quats, scales, pose[index], grid, optics)
+        shapes = reference.footprints(seen, grid, optics, torch.zeros_like(means[:, :2]))
+        alpha, _ = reference.layers(seen, shapes, strongest, strongest, optics)
+        orders.append(reference.depth_order(seen, ids))
+        centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
+        visible.append((alpha > 0).any(1))
+        radii.append(torch.where(visible[-1], reference.radii(seen, strongest, optics), 0.0))
+    return Plan(
+        *(pose, grid, optics, "reference"),
+        means2d=torch.stack(centers),
+        radii=torch.stack(radii),
+        visible=torch.stack(visible),
+        buffers=(torch.stack(orders),),
+    )
+
+
+def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
+    """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
+    per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
+    images, transmittances = [], []
+    for index, values in enumerate(per_pose):
+        weights, _, transmittance = _weights(plan, index, gaussians, means2d)
+        order = plan.buffers[0][index]
+        images.append(torch.einsum("nu,bnc->bcu", weights, values[:, order]))
+        transmittances.append(transmittance)
+    size = (plan.grid.height, plan.grid.width)
+    return torch.cat(images).unflatten(-1, size), torch.stack(transmittances).unflatten(-1, size)
+
+
+def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
+    means, shares = [], []
+    no_shift = torch.zeros_like(plan.means2d)
+    for index in range(plan.num_poses):
+        weights, alpha, _ = _weights(plan, index, gaussians, no_shift)
+        inverse = torch.argsort(plan.buffers[0][index])
+        means.append(weights.mean(1)[inverse])
+        shares.append(visible_share(weights.sum(1), alpha.sum(1))[inverse])
+    return torch.stack(means), torch.stack(shares)
+
+
+def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
+    """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
+    no_shift = torch.zeros_like(plan.means2d)
+    weights, _, _ = _weights(plan, 0, gaussians, no_shift)
+    return plan.buffers[0][0], (weights,)
+
+
+def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
+    """Image (K, H, W) of features (N, K) in the order of `freeze`."""
+    return (features.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
+
+
+def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """For a pose and the Gaussians in depth order: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
+    order = plan.buffers[0][index]
+    means, quats, scales, opacities, extinctions = (None if t is None else t[order] for t in gaussians)
+    seen = reference.project(means, quats, scales, plan.pose[index], plan.grid, plan.optics)
+    shift = (means2d[index] - means2d[index].detach())[order]
+    shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
+    hides = opacities if extinctions is None else extinctions
+    alpha, gamma = reference.layers(seen, shapes, opacities, hides, plan.optics)
+    before, transmittance = reference.transmittances(gamma, plan.optics.cutoff.transmittance)
+    return alpha * before, alpha, transmittance
