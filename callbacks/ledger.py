@@ -83,6 +83,12 @@ class CostLedger(L.Callback):
         """Write a row of the learning curve and go on."""
         if trainer.sanity_checking:
             return
+        if trainer.is_global_zero:
+            self._note(trainer, module)
+        if trainer.state.fn == "fit":
+            self._start()
+
+    def _note(self, trainer: L.Trainer, module: Any) -> None:
         figures = {key: float(value) for key, value in trainer.callback_metrics.items()}
         row = {key: figures.get(key, "") for key in COLUMNS}
         row |= {
@@ -91,8 +97,6 @@ class CostLedger(L.Callback):
             "num_gaussians": int(figures.get("model/num_gaussians", 0)),
         }
         self._append(module.run_dir / self.file, row)
-        if trainer.state.fn == "fit":
-            self._start()
 
     @staticmethod
     def _append(path: Path, row: dict[str, Any]) -> None:

@@ -27,6 +27,8 @@ class Pictures(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Draw when it is time."""
         step = trainer.global_step
+        if not trainer.is_global_zero:
+            return
         if (step % self.every and step != trainer.max_steps) or module.model.site.kind != "spectrum":
             return
         data = trainer.datamodule  # type: ignore[attr-defined]

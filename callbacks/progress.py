@@ -22,7 +22,9 @@ class StepProgress(L.Callback):
         self._bar: Progress | None = None
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Draw the bar."""
+        """Draw the bar, once for all devices."""
+        if not trainer.is_global_zero:
+            return
         self._bar = Progress(
             TextColumn("{task.description}{task.completed:.0f}/{task.total:.0f}"),
             BarColumn(bar_width=8),

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from functools import cached_property
+from typing import Self
 
 import lightning.pytorch as pl
 import numpy as np
+import torch
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold
@@ -30,10 +34,23 @@ def order(seed: int, step: int, batch_size: int, pool: np.ndarray) -> np.ndarray
     return pool[permutation[position * batch_size : (position + 1) * batch_size]]
 
 
+def share(rows: np.ndarray, rank: int, devices: int) -> np.ndarray:
+    """The rows of a batch that device `rank` takes: every `devices`-th, at least one: all take the step."""
+    mine = rows[rank::devices]
+    return mine if len(mine) else rows[rank % len(rows) :][:1]
+
+
 class StepLoader:
     """Iterating yields the batches from step `first_step()` to the end of that step's epoch.
 
     It holds no state of its own: whoever resumes a run says at which step it stands.
+
+    Args:
+        data, pool: measurements and the rows that are shown.
+        batch_size: rows of a batch, over all devices.
+        seed: of the order.
+        first_step: number of batches already shown.
+        rank, devices: which share of every batch is yielded.
     """
 
     def __init__(
@@ -43,11 +60,13 @@ class StepLoader:
         batch_size: int,
         seed: int,
         first_step: Callable[[], int] = lambda: 0,
+        rank: int = 0,
+        devices: int = 1,
     ) -> None:
         if batch_size < 1 or len(pool) == 0:
             raise ValueError(f"expected batch_size >= 1 and training rows, got {batch_size} and {len(pool)}")
         self.data, self.pool, self.batch_size, self.seed = data, pool, batch_size, seed
-        self.first_step = first_step
+        self.first_step, self.rank, self.devices = first_step, rank, devices
 
     def __len__(self) -> int:
         return steps_per_epoch(len(self.pool), self.batch_size)
@@ -55,7 +74,8 @@ class StepLoader:
     def __iter__(self) -> Iterator[Batch]:
         start = self.first_step()
         for step in range(start, (start // len(self) + 1) * len(self)):
-            yield self.data.batch(order(self.seed, step, self.batch_size, self.pool))
+            rows = order(self.seed, step, self.batch_size, self.pool)
+            yield self.data.batch(share(rows, self.rank, self.devices))
 
     def state_dict(self) -> dict[str, int]:
         """Nothing to store: the order is a pure function of (seed, step). Marks the loader as resumable."""
@@ -79,31 +99,98 @@ class RowsLoader:
             yield self.data.batch(self.rows[start : start + self.batch_size])
 
 
-class MeasurementsModule(pl.LightningDataModule):
-    """Any dataset and one fold for Lightning; data this small needs no worker processes."""
+class DataModule(pl.LightningDataModule, ABC):
+    """A dataset for Lightning, and after `use` the fold that its loaders show.
 
-    def __init__(self, measurements: Measurements, fold: Fold, batch_size: int, seed: int = 0) -> None:
+    A dataset of your own is a subclass with `load`, named as `_target_` in a file of conf/dataset.
+
+    Args:
+        name: names run directories.
+        batch_size: rows of a training step, shared by all devices.
+
+    Raises:
+        ValueError: a batch without rows.
+    """
+
+    def __init__(self, name: str, batch_size: int = 16) -> None:
         super().__init__()
-        self.measurements, self.fold, self.batch_size, self.seed = measurements, fold, batch_size, seed
+        if type(batch_size) is not int or batch_size < 1:
+            raise ValueError(f"dataset.batch_size={batch_size!r}: a whole number of at least 1 is needed")
+        self.name, self.batch_size = name, batch_size
+        self.fold: Fold | None = None
+        self.seed = 0
+
+    @abstractmethod
+    def load(self) -> Measurements:
+        """Read all measurements; called once.
+
+        Raises:
+            DataError: bad input, one line.
+        """
+
+    @cached_property
+    def measurements(self) -> Measurements:
+        """All measurements, read when first asked for."""
+        return self.load()
+
+    def use(self, fold: Fold, seed: int = 0) -> Self:
+        """Show the rows of `fold`, training rows in the order of `seed`; returns itself."""
+        self.fold, self.seed = fold, seed
+        return self
+
+    def setup(self, stage: str) -> None:
+        """Read the measurements."""
+        self.measurements  # noqa: B018 (reading is what is wanted)
 
     def train_dataloader(self) -> StepLoader:
         """Training batches, starting where the trainer stands (also in the middle of an epoch)."""
-        return StepLoader(self.measurements, self.fold.train, self.batch_size, self.seed, self._batches_shown)
+        trainer = self.trainer
+        rank, devices = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
+        pool = self._rows().train
+        return StepLoader(
+            self.measurements, pool, self.batch_size, self.seed, self._batches_shown, rank, devices
+        )
 
     def val_dataloader(self) -> RowsLoader:
-        """Validation rows in order."""
-        return RowsLoader(self.measurements, self.fold.val, self.batch_size)
+        """Validation rows in order, all of them on every device."""
+        return RowsLoader(self.measurements, self._rows().val, self.batch_size)
 
     def test_dataloader(self) -> RowsLoader:
-        """Test rows in order."""
-        return RowsLoader(self.measurements, self.fold.test, self.batch_size)
+        """Test rows in order, all of them on every device."""
+        return RowsLoader(self.measurements, self._rows().test, self.batch_size)
 
-    def transfer_batch_to_device(self, batch: Batch, device, dataloader_idx: int) -> Batch:
+    def predict_dataloader(self) -> RowsLoader:
+        """The test rows."""
+        return self.test_dataloader()
+
+    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
         """The batch on `device`; a Batch is a frozen dataclass, which Lightning does not move itself."""
         return batch.to(device)
+
+    def _rows(self) -> Fold:
+        if self.fold is None:
+            raise RuntimeError(f"{self.name}: say which rows to show with use(fold, seed)")
+        return self.fold
 
     def _batches_shown(self) -> int:
         if self.trainer is None:
             return 0
         # `completed` is what a checkpoint restores; `ready` would count the batch a kill interrupted.
         return self.trainer.fit_loop.epoch_loop.batch_progress.total.completed
+
+
+class Loaded(DataModule):
+    """Measurements that are already in memory.
+
+    Args:
+        measurements: all rows.
+        batch_size: rows of a training step.
+    """
+
+    def __init__(self, measurements: Measurements, batch_size: int = 16) -> None:
+        super().__init__(measurements.site.name, batch_size)
+        self.measurements = measurements
+
+    def load(self) -> Measurements:
+        """What it was given."""
+        return self.measurements

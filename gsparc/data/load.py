@@ -1,41 +1,75 @@
-"""From the config groups `dataset` and `split` to `Measurements` and `Split`."""
+"""From the config groups `dataset` and `split` to a `DataModule` and a `Split`."""
 
 from __future__ import annotations
 
 import difflib
-import logging
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Mapping
 from dataclasses import fields
-from pathlib import Path
+from importlib.resources import files
 from typing import Any
 
+import yaml
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
-from gsparc.data.rfid import WAVELENGTH, describe_missing, load_rfid, planar_array
+from gsparc.data.instantiate import find, refuse_foreign, suggest, targets
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, SplitSettings, make_split, read_split
 
-log = logging.getLogger(__name__)
+# A dataset is a file or a folder: who says the one may mean the other.
+PATHS = {"file": "root", "root": "file"}
+
+
+def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule:
+    """The data module that a config of the group `dataset` describes; nothing is read yet.
+
+    Args:
+        config: `_target_` and its arguments; without `_target_`, as in checkpoints of earlier versions,
+            what conf/dataset holds under `name`, with these settings.
+        trusted: False for text out of a file: then every `_target_` must be a class of gsparc.
+
+    Raises:
+        DataError: unknown name or setting, or one that is missing.
+        ValueError: a setting that cannot be, or a foreign class.
+    """
+    settings = _plain(config)
+    choices = _choices()
+    if "_target_" not in settings:
+        settings = _plain(OmegaConf.merge(_named(settings.get("name"), choices), settings))
+    if not trusted:
+        for path in targets(settings):
+            refuse_foreign(path)
+    target, name = settings["_target_"], settings.get("name")
+    own = [key for key, node in choices.items() if node["_target_"] == target]
+    if own and name is not None and name not in own:
+        _named(name, choices)
+        raise DataError(f"dataset.name={name}: this is dataset={own[0]}; say dataset={name}")
+    kind = find(str(target))
+    if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
+        raise DataError(f"dataset._target_={target} is no gsparc.data.datamodule.DataModule")
+    settings = _checked(settings, kind)
+    try:  # under its key, which errors then name
+        found = instantiate({"dataset": settings}, _convert_="all")["dataset"]
+    except InstantiationException as error:
+        if isinstance(error.__cause__, ValueError):
+            raise error.__cause__ from None
+        raise
+    if not isinstance(found, DataModule):
+        raise DataError(f"dataset._target_={target} makes no gsparc.data.datamodule.DataModule")
+    return found
 
 
 def load(config: Mapping[str, Any]) -> Measurements:
-    """Load what the config group `dataset` names.
-
-    Args:
-        config: keys as in conf/dataset/*.yaml; `name` chooses the loader.
+    """The measurements of `datamodule(config)`.
 
     Raises:
-        DataError: unknown name, missing file, or bad input.
+        DataError: as `datamodule`, missing file, or bad input.
     """
-    name = str(config.get("name"))
-    if name not in LOADERS:
-        close = difflib.get_close_matches(name, LOADERS, n=1, cutoff=0.4)
-        hint = f"; did you mean {close[0]!r}?" if close else ""
-        raise DataError(f"dataset: {name!r} is none of {', '.join(LOADERS)}{hint}")
-    wrong = "file" if name in FOLDERS else "root"
-    if config.get(wrong) is not None:
-        right = "root" if name in FOLDERS else "file"
-        raise DataError(f"dataset.{wrong} is not a setting of dataset={name}; say dataset.{right}=...")
-    return LOADERS[name](config)
+    return datamodule(config).measurements
 
 
 def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
@@ -53,113 +87,45 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     return make_split(data.moving, SplitSettings(**dict(config)), data.release_split)
 
 
-def _rfid(config: Mapping[str, Any]) -> Measurements:
-    root = config.get("root")
-    if root is None or not Path(root).exists():
-        stand_in = config.get("stand_in") or {}
-        log.warning("%s Using the SIMULATED stand-in rfid-sim instead.", describe_missing(root))
-        return _rfid_sim(stand_in)
-    array = config.get("array")
-    return load_rfid(
-        root,
-        gateway=config.get("gateway"),
-        wavelength_m=float(config.get("wavelength_m", WAVELENGTH)),
-        array=planar_array(**array) if array else None,
-        normalisation=str(config.get("normalisation", "max")),
-    )
+def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:
+    node = config if isinstance(config, DictConfig) else OmegaConf.create(dict(config))
+    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
 
 
-def _rfid_sim(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.simulate.rfid_sim import ensure_rfid_sim
-
-    folder = ensure_rfid_sim(
-        Path(config.get("root", "outputs/stand-ins")),
-        count=int(config.get("count", 640)),
-        seed=int(config.get("seed", 0)),
-    )
-    log.warning("rfid-sim: SIMULATED data in the layout of the RFID release, at %s", folder)
-    return load_rfid(folder)
-
-
-def _required_file(config: Mapping[str, Any]) -> Path:
-    file = config.get("file")
-    if not file:
-        raise DataError(f"dataset.file is not set; say dataset.file=FILE for dataset={config.get('name')}")
-    return Path(file)
+def _choices() -> dict[str, DictConfig]:
+    """What conf/dataset holds, by name; settings that come from other groups are left to their defaults."""
+    found: dict[str, DictConfig] = {}
+    for file in files("gsparc.conf").joinpath("dataset").iterdir():
+        if file.name.endswith(".yaml"):
+            settings = yaml.safe_load(file.read_text(encoding="utf-8"))
+            settings.pop("defaults", None)
+            found[file.name.removesuffix(".yaml")] = OmegaConf.create(settings)
+    return found
 
 
-def _newrf(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.data.newrf import load_newrf
-
-    return load_newrf(_required_file(config))
-
-
-def _own(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.data.describe import suspicious_values
-    from gsparc.data.own import load_own
-
-    file = _required_file(config)
-    data = load_own(file)
-    for doubt in suspicious_values(data):
-        log.warning("%s: units? %s", file, doubt)
-    return data
+def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
+    if str(name) not in choices:
+        close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
+        hint = f"; did you mean {close[0]!r}?" if close else ""
+        raise DataError(f"dataset: {str(name)!r} is none of {', '.join(sorted(choices))}{hint}")
+    return choices[str(name)]
 
 
-def _argos(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.data.argos import describe_missing as describe_missing_argos
-
-    root = config.get("root")
-    if root is None or not Path(root).exists():
-        log.warning("%s Using the SIMULATED stand-in argos-sim instead.", describe_missing_argos(root))
-        return _argos_sim(config)
-    return _argos_folder(Path(root), config)
-
-
-def _argos_sim(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.simulate.argos_sim import SCATTERERS, ensure_argos_sim
-
-    stand_in = config.get("stand_in") or {}
-    folder = ensure_argos_sim(
-        Path(stand_in.get("root", "outputs/stand-ins")),
-        count=int(stand_in.get("count", 4000)),
-        seed=int(stand_in.get("seed", 0)),
-        offsets=bool(stand_in.get("offsets", True)),
-        scatterers=int(stand_in.get("scatterers", SCATTERERS)),
-    )
-    log.warning("argos-sim: SIMULATED data in the layout of the Argos release, at %s", folder)
-    return _argos_folder(folder, config)
-
-
-def _argos_folder(folder: Path, config: Mapping[str, Any]) -> Measurements:
-    from gsparc.data.argos import load_argos
-    from gsparc.data.position_encoder.autoencoder import EncoderSettings
-    from gsparc.data.position_encoder.store import encoder_for
-
-    given = dict(config.get("encoder") or {})
-    file, room = given.pop("file", None), Path(given.pop("folder", "outputs/encoders"))
-    return load_argos(
-        folder,
-        encoder_for(room, EncoderSettings(**given), file),
-        antenna=config.get("antenna", 0),
-        positions=str(config.get("positions", "encoder")).lower(),  # `true` in YAML is no text
-        align=bool(config.get("align", True)),
-    )
-
-
-def _sionna(config: Mapping[str, Any]) -> Measurements:
-    from gsparc.data.sionna import load_sionna
-
-    return load_sionna(_required_file(config), config.get("target"), config.get("truth"))
-
-
-FOLDERS = ("rfid", "rfid_sim", "argos", "argos_sim")  # datasets that are a folder; the others are one file
-
-LOADERS: dict[str, Callable[[Mapping[str, Any]], Measurements]] = {
-    "rfid": _rfid,
-    "rfid_sim": _rfid_sim,
-    "argos": _argos,
-    "argos_sim": _argos_sim,
-    "newrf": _newrf,
-    "own": _own,
-    "sionna": _sionna,
-}
+def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
+    """The settings that `kind` takes, none unknown or missing; an unknown one that is null was not said."""
+    known = inspect.signature(kind).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in known.values()):
+        return settings
+    kept, name = {}, settings.get("name")
+    for key, value in settings.items():
+        if key in known or key.startswith("_"):
+            kept[key] = value
+        elif value is not None:
+            other = PATHS.get(key)
+            if other in known:
+                raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
+            raise DataError(f"dataset.{key}: no such setting of dataset={name}{suggest(key, known)}")
+    for key, parameter in known.items():
+        if parameter.default is parameter.empty and kept.get(key) in (None, "", "???"):
+            raise DataError(f"dataset.{key} is not set; say dataset.{key}={key.upper()} for dataset={name}")
+    return kept

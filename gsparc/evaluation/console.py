@@ -18,7 +18,7 @@ from hydra.errors import (
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.methods.registry import suggest
+from gsparc.data.instantiate import suggest
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
@@ -37,6 +37,10 @@ def one_line(error: BaseException) -> str:
     """What went wrong and what to do, on one line; a misspelt key or choice gets the nearest right name."""
     if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, choice = str(error.missing_cfg_file).partition("/")
+        if group == "hydra":  # hydra/sweeper/optuna
+            part, _, choice = choice.rpartition("/")
+            there = ", ".join(error.options)
+            return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
         return f"{group}={choice}: no such choice{suggest(choice, _choices(group) or list(error.options))}"
     if isinstance(error, OverrideParseException):
         return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
@@ -55,8 +59,9 @@ def one_line(error: BaseException) -> str:
         return f"{error.filename}: {error.strerror}"
     text = _first(error)
     # Errors of use are ValueErrors and their like; for a bug the type is shown too.
-    expected = isinstance(error, (ValueError, OSError, RuntimeError)) and text
-    return text if expected else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
+    expected = isinstance(error, (ValueError, OSError, RuntimeError))
+    expected |= type(error).__name__ == "MisconfigurationException"  # Lightning's, of the Trainer's options
+    return text if expected and text else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
 
 
 def _choices(group: str) -> list[str]:

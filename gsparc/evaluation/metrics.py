@@ -29,8 +29,8 @@ SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
 DECIDING: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
 """The figure by which methods, fronts and effects are compared."""
 
-RATIOS = ("nmse", "mse")  # of powers: compared in decibels, smaller is better
-DISTANCES = ("rmse_db", "mae_db", "mae")  # smaller is better
+RATIOS = ("nmse", "nmse_scalar", "mse")  # of powers: compared in decibels, smaller is better
+DISTANCES = ("rmse_db", "mae_db", "power_mae_db", "mae")  # smaller is better
 
 
 class SampleMetric(Metric):
@@ -223,6 +223,16 @@ def metrics_for(kind: Kind, scale: float = 1.0) -> SampleMetric:
     if kind == "spectrum":
         return SpectrumMetrics()
     return ChannelMetrics(scale) if kind == "csi" else PowerMetrics(scale)
+
+
+def figure_names(kind: Kind) -> tuple[str, ...]:
+    """The figures of merit that a dataset kind is told by."""
+    shape = {"spectrum": (1, 16, 16), "csi": (1, 1, 2), "rssi": (1, 1)}[kind]
+    one = torch.ones(shape, dtype=torch.complex64 if kind == "csi" else torch.float32)
+    metric = metrics_for(kind)
+    metric.update(one, one)
+    counts = ("samples", "silent_samples")
+    return tuple(name for name in metric.summary(metric.compute()) if name not in counts)
 
 
 def lower_is_better(figure: str) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.load import load, split_for
+from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split
 from gsparc.methods import checkpoint
@@ -53,7 +53,9 @@ def open_files(
     """
     loaded = [checkpoint.load(path) for path in paths]
     stored = [one for _, one in loaded]
-    data = aligned(load(_settings("dataset", stored[0], dataset)), stored[0].site)
+    chosen_class = "_target_" in (dataset or {})
+    module = datamodule(_settings("dataset", stored[0], dataset), trusted=chosen_class)
+    data = aligned(module.measurements, stored[0].site)
     whole = split_for(_settings("split", stored[0], split), data)
     chosen = _folds(whole, stored)
     _warn_if_seen(stored[0], data, whole)
@@ -61,13 +63,17 @@ def open_files(
 
 
 def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The checkpoint's settings of a config group under the ones given now (those that are not null)."""
+    """The checkpoint's settings of a config group under the ones given now (those that are not null).
+
+    Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
+    """
     before = stored.configuration.get(group)
+    before = before if isinstance(before, dict) else {}
     now = {key: value for key, value in (given or {}).items() if value is not None}
-    if not isinstance(before, dict) or ("name" in now and now["name"] != before.get("name")):
+    if "_target_" in now or ("name" in now and now["name"] != before.get("name")):
         before = {}
     settings = {**before, **now}
-    if "name" not in settings:
+    if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")
     return settings
 

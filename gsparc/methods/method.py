@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -15,6 +15,9 @@ from torch import Tensor
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.ops import Pose
+
+if TYPE_CHECKING:
+    from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,8 @@ class FitContext:
         budget_s: seconds of training; None: as the method is configured.
         resume: what an interrupted run left, to go on from.
         init_from: a checkpoint of the same model whose weights training starts from.
-        batch_size: rows of a step of gradient training.
+        batch_size: rows of a step of gradient training, where no `datamodule` says so.
+        datamodule: the run's `DataModule`, whose loaders gradient training on its measurements goes through.
         trainer: makes a Lightning Trainer from further options; None: with `DEFAULTS` of `training.fit`.
         callbacks: makes fresh Lightning callbacks.
         loggers: made once per run, closed by the caller.
@@ -71,6 +75,7 @@ class FitContext:
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16
+    datamodule: DataModule | None = None
     trainer: partial[Any] | None = None
     callbacks: Callable[[], Sequence[Any]] = tuple
     loggers: Sequence[Any] = ()

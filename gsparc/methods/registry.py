@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.instantiate import refuse_foreign, suggest, targets
 from gsparc.methods.method import Method
 
 METHODS = {
@@ -48,12 +48,6 @@ def initialiser(name: str) -> Any:
     return getattr(import_module(module), attribute)()
 
 
-def suggest(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """`; did you mean 'gp'?`, or what there is when nothing is close."""
-    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.5)
-    return f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(sorted(known))}"
-
-
 def method_class(name: str) -> type[Method]:
     """The class called `name`; `ValueError` with the nearest right name when there is none."""
     if name not in METHODS:
@@ -78,34 +72,8 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:
         raise ValueError("model: the config names no _target_ (choose one with model=NAME)")
     if not trusted:
         for path in targets(OmegaConf.to_container(node, resolve=False)):
-            _refuse_foreign(path)
+            refuse_foreign(path)
     method = instantiate(node)
     if not isinstance(method, Method):
         raise ValueError(f"model: {target} is not a gsparc.methods.method.Method")
     return method
-
-
-def targets(node: Any) -> Iterator[Any]:
-    """Every `_target_` in a config, at any depth."""
-    if isinstance(node, dict):
-        for key, value in node.items():
-            if key == "_target_":
-                yield value
-            else:
-                yield from targets(value)
-    elif isinstance(node, list):
-        for value in node:
-            yield from targets(value)
-
-
-def _refuse_foreign(path: Any) -> None:
-    """`gsparc.x.os.system` starts with gsparc too: what counts is where the class was defined."""
-    found = None
-    if isinstance(path, str) and path.startswith("gsparc."):
-        module, _, attribute = path.rpartition(".")
-        try:
-            found = getattr(import_module(module), attribute, None)
-        except ImportError:
-            found = None
-    if not (isinstance(found, type) and found.__module__.startswith("gsparc.")):
-        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")

@@ -199,3 +199,28 @@ def ensure_argos_sim(
         own = Offsets() if offsets else Offsets(0.0, 0.0, 0.0)
         write_argos_sim(folder, count, seed, own, scatterers)
     return folder
+
+
+@dataclass(frozen=True)
+class ArgosStandIn:
+    """What `dataset=argos` falls back on; a `gsparc.data.modules.stand_in.StandIn`.
+
+    Attributes:
+        count: users, at least 10.
+        seed: of streets, users and noise.
+        offsets: whether snapshots have phase, timing and frequency offsets of their own.
+        scatterers: lamp posts and cars, at least 1.
+        root: folder that holds stand-ins.
+    """
+
+    count: int = 4000
+    seed: int = 0
+    offsets: bool = True
+    scatterers: int = SCATTERERS
+    root: str | Path = "outputs/stand-ins"
+
+    def folder(self) -> Path:
+        """See `ensure_argos_sim`."""
+        return ensure_argos_sim(
+            Path(self.root), int(self.count), int(self.seed), bool(self.offsets), int(self.scatterers)
+        )

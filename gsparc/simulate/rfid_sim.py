@@ -7,6 +7,7 @@ image is `|A^H h|` over the hemisphere divided by its maximum, in 8 bits.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -110,3 +111,22 @@ def ensure_rfid_sim(parent: Path, count: int = 640, seed: int = 0) -> Path:
         folder.parent.mkdir(parents=True, exist_ok=True)
         write_rfid_sim(folder, count, seed)
     return folder
+
+
+@dataclass(frozen=True)
+class RFIDStandIn:
+    """What `dataset=rfid` falls back on; a `gsparc.data.modules.stand_in.StandIn`.
+
+    Attributes:
+        count: tag positions, at least 2.
+        seed: of the walk, the noise and the split.
+        root: folder that holds stand-ins.
+    """
+
+    count: int = 640
+    seed: int = 0
+    root: str | Path = "outputs/stand-ins"
+
+    def folder(self) -> Path:
+        """See `ensure_rfid_sim`."""
+        return ensure_rfid_sim(Path(self.root), int(self.count), int(self.seed))

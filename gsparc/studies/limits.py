@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from gsparc.methods.registry import METHODS, suggest
+from gsparc.data.instantiate import suggest
+from gsparc.methods.registry import METHODS
 
 
 @dataclass(frozen=True)

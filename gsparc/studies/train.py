@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,15 +17,18 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.files import platform_cache
-from gsparc.data.load import load, split_for
-from gsparc.data.schema import Measurements
+from gsparc.data.instantiate import suggest
+from gsparc.data.load import datamodule, split_for
+from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.metrics import DECIDING, figure_names, score_of
+from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
-from gsparc.methods.method import Method, Resumable
+from gsparc.methods.method import Method, Resumable, TrainsByGradient
 from gsparc.methods.registry import build
 from gsparc.studies import cli, limits
 from gsparc.studies.context import context_of
@@ -70,7 +74,11 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     if config.threads is not None:
         torch.set_num_threads(int(config.threads))
     _anchor(config)
-    data = load(_plain(config.dataset))
+    module = datamodule(config.dataset)
+    if config.get("init_from") is not None:
+        module.measurements = _seen_from(config.init_from, module.measurements)
+    data = module.measurements
+    objective_of(config, data.site.kind)  # refused now, not after the training
     split = split_for(_plain(config.split), data)
     _refuse_empty(split)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
@@ -80,6 +88,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         for number, fold in enumerate(split.folds):
             folder = run_dir if len(split.folds) == 1 else run_dir / f"fold{number}"
             method = build(config.model)
+            _refuse_start(config, method)
             for guess in method.guesses if number == 0 else ():
                 log.info("guess: %s", guess)
             resume = _resume(config, number, len(split.folds))
@@ -87,7 +96,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
                 raise ValueError(
                     f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path"
                 )
-            report = method.fit(data, fold, context_of(config, folder, loggers, resume))
+            report = method.fit(data, fold, context_of(config, folder, module, loggers, resume))
+            _note_unused_trainer(method)
             for note in report.notes:
                 log.info("%s", note)
             file = folder / "model.ckpt"
@@ -156,6 +166,34 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     return own if own.exists() else None
 
 
+def _seen_from(path: str, data: Measurements) -> Measurements:
+    """`data` in the local coordinates and units of the model that training starts from."""
+    try:
+        return aligned(data, checkpoint.read(path).site)
+    except ValueError as error:
+        raise ValueError(f"init_from={path}: {error}") from None
+
+
+def _refuse_start(config: DictConfig, method: Method) -> None:
+    """Weights to start from mean nothing to a method without any."""
+    if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
+        raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
+
+
+def _note_unused_trainer(method: Method) -> None:
+    """Say so when options of the Trainer were asked for and the method had no use for them."""
+    if isinstance(method, TrainsByGradient) and method.trainer_options():
+        return
+    said = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    unused = [o for o in said if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]
+    log.log(
+        logging.WARNING if unused else logging.DEBUG,
+        "%s does not train by gradient: trainer options (%s) are not used",
+        method.name,
+        ", ".join(unused) or "accelerator, devices, precision, max_steps, ...",
+    )
+
+
 @contextmanager
 def _loggers(config: DictConfig) -> Iterator[Sequence[Logger]]:
     """The run's loggers, closed whatever happens."""
@@ -172,17 +210,39 @@ def _loggers(config: DictConfig) -> Iterator[Sequence[Logger]]:
                 logger.experiment.finish(exit_code=0 if status == "success" else 1)
 
 
-def task(config: DictConfig) -> float | None:
-    """Train as configured and show the table; the returned figure is what a sweep optimises."""
+def objective_of(config: DictConfig, kind: Kind) -> str:
+    """The figure that a search improves, of rows `eval_on`; `objective: null` takes the deciding one.
+
+    Raises:
+        ValueError: there is no such figure.
+    """
+    figures = [DECIDING[kind], *figure_names(kind), "skill"]
+    known = {f"{config.eval_on}/{figure}": figure for figure in figures}
+    asked = config.get("objective")
+    if asked is not None and asked not in known:
+        raise ValueError(f"objective={asked}: no such figure{suggest(str(asked), known)}")
+    return known[asked] if asked is not None else DECIDING[kind]
+
+
+def task(config: DictConfig) -> float:
+    """Train as configured and show the table.
+
+    Returns:
+        The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned.
+    """
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     facts, objects = train(config, run_dir)
+    figure = objective_of(config, objects.data.site.kind)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
     console = open_console()
     console.print(results_table(facts, facts["model/name"], title, config.eval_on))
     for remark in remarks(facts, config.eval_on):
         console.print(remark, highlight=False)
     console.print(f"written to {run_dir}", highlight=False)
-    return facts.get(f"{config.eval_on}/psnr_db", facts.get(f"{config.eval_on}/nmse"))
+    value = facts[f"{config.eval_on}/{figure}"]
+    if value is None:
+        raise ValueError(f"objective={config.eval_on}/{figure}: these data and baselines do not tell it")
+    return score_of(figure, value)
 
 
 def main() -> None:

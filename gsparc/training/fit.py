@@ -14,15 +14,19 @@ from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as L
+import torch
 from lightning.pytorch.plugins.io import CheckpointIO
+from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
+from torch.multiprocessing.spawn import ProcessException
 
-from gsparc.data.datamodule import MeasurementsModule
+from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext
 from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.time_budget import Budget, Stretched
 
+SECONDS = "time/learning_s"
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 
 
@@ -51,12 +55,37 @@ def total_steps(context: FitContext) -> int:
     return steps
 
 
+class SeveralDevices(L.Callback):
+    """Brings the training time home, and refuses to train on when Gaussians were added or removed.
+
+    Gradients are then no longer averaged: DistributedDataParallel knows the parameters it began with.
+    """
+
+    def __init__(self) -> None:
+        self.parameters: set[int] = set()
+
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        """Remember what the devices share."""
+        self.parameters = {id(p) for p in module.parameters()}
+
+    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *unused: Any) -> None:
+        """Look whether it is still the same."""
+        if trainer.world_size > 1 and self.parameters != {id(p) for p in module.parameters()}:
+            raise ValueError("callbacks that add or remove Gaussians need one device: trainer.devices=1")
+
+    def on_train_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
+        """What the callbacks before have measured; of all attributes, only metrics leave the process."""
+        trainer.callback_metrics[SECONDS] = torch.tensor(module.train_seconds, dtype=torch.float64)
+
+
 class _Stopped(BaseException):
     """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a word."""
 
 
 class StopBetweenSteps(L.Callback):
     """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
+
+    On several devices it does not wait: the checkpoint before is what is left.
 
     A second interrupt does not wait, and leaves the checkpoint before.
 
@@ -67,6 +96,10 @@ class StopBetweenSteps(L.Callback):
     def __init__(self, file: Path) -> None:
         self.file = file
         self.requested = False
+
+    def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
+        """Every process that trains is as quiet as the first."""
+        _quieten_lightning()
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Write the checkpoint and end training when asked to."""
@@ -105,7 +138,10 @@ def run_stage(
     Raises:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
     """
-    folder, make = module.run_dir, context.trainer or DEFAULTS
+    folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
+    if batches is None or batches.measurements is not data:
+        batches = Loaded(data, context.batch_size)
+    batches.use(fold, context.seed)
     _quieten_lightning()
     stop = StopBetweenSteps(folder / "last.ckpt")
     callbacks, pace = list(context.callbacks()), module.pace
@@ -118,7 +154,7 @@ def run_stage(
     every = make.keywords.get("val_check_interval")
     every = every if type(every) is int else LOG_EVERY
     module.log_every = math.gcd(LOG_EVERY, every)  # a validation sees the figures of its own step
-    per_epoch = max(1, len(fold.train) // context.batch_size)
+    per_epoch = max(1, len(fold.train) // batches.batch_size)
     options: dict[str, Any] = {
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         "check_val_every_n_epoch": None,  # validations are counted in steps
@@ -129,31 +165,54 @@ def run_stage(
         options["max_steps"] = -1
     trainer = make(
         max_epochs=-1,
-        callbacks=[*callbacks, stop],
+        callbacks=[*callbacks, SeveralDevices(), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,
         enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
         **options,
     )
-    batches = MeasurementsModule(data, fold, context.batch_size, context.seed)
+    _refuse_whole_programs(trainer)
     try:
         with stop.listening():
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
-    except (_Stopped, SystemExit):  # Lightning's answer to a KeyboardInterrupt is SystemExit
+    except (_Stopped, SystemExit, ProcessException) as ended:
+        # Lightning's answer to a KeyboardInterrupt is SystemExit.
+        if isinstance(ended, ProcessException) and not stop.requested:
+            raise RuntimeError(_last_line(ended)) from ended
         advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
-    return module.train_seconds
+    finally:
+        batches.trainer = None  # which holds the optimizer's state
+    return float(trainer.callback_metrics[SECONDS])
+
+
+def _refuse_whole_programs(trainer: L.Trainer) -> None:
+    """Several devices train in processes that end with training: tests and files are the work of one."""
+    if trainer.world_size > 1 and not isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
+        raise ValueError(
+            "trainer.strategy: on several devices this would run the whole program once per device; "
+            "say trainer=ddp, or a strategy ddp_spawn* or ddp_fork*"
+        )
+
+
+def _last_line(error: ProcessException) -> str:
+    """What was said by the process that failed, without its traceback."""
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return lines[-1].partition("Error: ")[2] or lines[-1] if lines else type(error).__name__
 
 
 def _quieten_lightning() -> None:
-    """Lightning advertises and repeats what the progress line says; its warnings stay, but for six."""
+    """Lightning advertises and repeats what the progress line says; its warnings stay, but for a few."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # its report was asked for
     for pointless in (
         r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
         r".*does not have many workers.*",  # data this small is faster without
         r".*callbacks used to create the checkpoint need to be provided.*",  # a rhythm may change
         r".*The dirpath has changed.*",  # a resumed run may have a directory of its own
+        r".*recommended to use `self.log\(.*sync_dist=True.*",  # every device validates all rows
+        r".*Grad strides do not match bucket view strides.*",  # of DistributedDataParallel, for harmonics
         r".*smaller than the logging interval.*",  # small campaigns have few batches
         r".*Checkpoint directory .* exists and is not empty.*",  # it is the run directory
     ):

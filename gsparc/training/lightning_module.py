@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Protocol, get_args, runtime_checkable
 
 import lightning.pytorch as L
 import torch
@@ -15,6 +15,8 @@ from gsparc.field import edit
 from gsparc.field.confidence import weighted
 from gsparc.field.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
 from gsparc.field.model import GaussianModel, Rendered
+from gsparc.methods import checkpoint
+from gsparc.methods.method import TrainsByGradient
 from gsparc.ops import UnsoundGaussian
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.time_budget import Pace
@@ -41,6 +43,14 @@ class LossSettings:
 
 class NonFiniteLoss(RuntimeError):
     """Training met a NaN or an infinity; batch and parameters are on disk."""
+
+
+@runtime_checkable
+class HasModule(TrainsByGradient, Protocol):
+    """Trains a Gaussian field, and is one where `trainer_options()` says so."""
+
+    def module(self) -> GaussianModule:
+        """What Lightning trains, with schedules one step long."""
 
 
 class GaussianModule(L.LightningModule):
@@ -128,6 +138,31 @@ class GaussianModule(L.LightningModule):
             self.log("val/mse", error.mean(), batch_size=size, prog_bar=True)
         # Dashboards get the seconds beside every figure too.
         self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
+
+    def predict_step(self, batch: Batch, step: int) -> Tensor:
+        """Targets (B, ...) in stored units, spectra within [0, 1]."""
+        mean = self._render(batch).mean
+        return mean.clamp(0, 1) if self.model.site.kind == "spectrum" else mean
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls, checkpoint_path: str | Path, map_location: Any = None, **unused: Any
+    ) -> GaussianModule:
+        """The module of a `model.ckpt` or `last.ckpt` whose method is a splatted field.
+
+        Args:
+            checkpoint_path: the file.
+            map_location: device of the model; None: the CPU.
+            **unused: of Lightning's own; the file holds all settings.
+
+        Raises:
+            CheckpointError: unreadable, or another method's.
+        """
+        method, stored = checkpoint.load(checkpoint_path)
+        if not (isinstance(method, HasModule) and method.trainer_options()):
+            raise checkpoint.CheckpointError(f"{checkpoint_path}: {stored.method} holds no Gaussian field")
+        module = method.module()
+        return module if map_location is None else module.to(map_location)
 
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""

@@ -166,11 +166,15 @@ class LearnedField(Method):
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
             end = context.budget_s * (0.5 if first else 1.0)
             pace = Pace(steps, end - earlier_s - prepared)
-        module = GaussianModule(self.fitted(), self.loss, self.rates, steps, folder, pace)
+        module = self.module(steps, folder, pace)
         module.prepared_seconds = earlier_s + prepared
         marks = {"stage": stage, "earlier_s": earlier_s + prepared}
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         return prepared + run_stage(module, data, fold, context, files)
+
+    def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
+        """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
+        return GaussianModule(self.fitted(), self.loss, self.rates, steps, run_dir, pace)
 
     def _start_from(self, site: Site, path: Path) -> None:
         """Take the weights of another model of this site; what is learned anew are these rows.
@@ -190,7 +194,7 @@ class LearnedField(Method):
             raise ValueError(
                 f"init_from={path}: its origin is {stored.site.origin} m, here it is {site.origin} m"
             )
-        self.restore(site, {**state, "ends": self._ends, "shape": self._shape})
+        LearnedField.restore(self, site, {**state, "ends": self._ends, "shape": self._shape})
 
     def _receiver(self) -> Pose | None:
         ends = self._ends

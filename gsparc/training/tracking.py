@@ -1,11 +1,11 @@
-"""Dashboards: a Weights & Biases logger that stays offline unless its user has logged in."""
+"""Dashboards: Weights & Biases, which stays offline unless its user has logged in, and TensorBoard."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from lightning.pytorch.loggers import WandbLogger
+    from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 
 
 def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
@@ -22,3 +22,19 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
     # Lightning sets a variable that wandb, once asked for a login, does not read again.
     mode: dict[str, Any] = {"mode": "offline"} if stays else {}
     return WandbLogger(offline=stays, **mode, **settings)
+
+
+def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardLogger:
+    """A logger for `logger=tensorboard`; event files go to `save_dir/name`.
+
+    Raises:
+        ValueError: TensorBoard is not installed.
+    """
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    try:
+        return TensorBoardLogger(save_dir, name=name, version="")
+    except ModuleNotFoundError:
+        raise ValueError(
+            'logger=tensorboard: TensorBoard is not installed; say pip install "gsparc[tensorboard]"'
+        ) from None

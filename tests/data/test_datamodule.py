@@ -1,10 +1,15 @@
+from pathlib import Path
+
 import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
+from campaigns import compose
+from omegaconf import OmegaConf
 
-from gsparc.data.datamodule import MeasurementsModule, StepLoader, order, steps_per_epoch
-from gsparc.data.load import LOADERS, load
+import gsparc.conf
+from gsparc.data.datamodule import DataModule, Loaded, StepLoader, order, share, steps_per_epoch
+from gsparc.data.load import datamodule, load
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 
@@ -77,7 +82,7 @@ def _fit(data, tmp_path, model, steps, ckpt=None, every=None):
         enable_checkpointing=bool(every), enable_progress_bar=False, enable_model_summary=False,
         default_root_dir=tmp_path,
     )  # fmt: skip
-    trainer.fit(model, MeasurementsModule(data, FOLD, 4, seed=7), ckpt_path=ckpt, weights_only=False)
+    trainer.fit(model, Loaded(data, 4).use(FOLD, seed=7), ckpt_path=ckpt, weights_only=False)
     return trainer
 
 
@@ -108,11 +113,113 @@ def test_typos_of_dataset_kinds_get_the_nearest_name():
         load({"name": "own"})
 
 
-def test_every_loader_has_a_config_and_back():
-    from importlib.resources import files
+CONFIGS = {path.stem: path for path in Path(gsparc.conf.__path__[0]).joinpath("dataset").glob("*.yaml")}
 
-    from omegaconf import OmegaConf
 
-    folder = files("gsparc.conf").joinpath("dataset")
-    named = {OmegaConf.create(f.read_text()).name for f in folder.iterdir() if f.name.endswith(".yaml")}
-    assert set(LOADERS) <= named
+@pytest.mark.parametrize("name", sorted(CONFIGS))
+def test_every_config_names_a_data_module_of_its_own(name):
+    stored = {"name": name} | ({"file": "x.npz"} if name in ("own", "newrf", "sionna") else {})
+    module = datamodule(compose(f"dataset={name}", *(f"dataset.{k}={v}" for k, v in stored.items())).dataset)
+    assert isinstance(module, DataModule) and type(module).__module__.startswith("gsparc.")
+    assert (module.name, module.batch_size) == (name, 16)
+    earlier = datamodule(stored, trusted=False)  # as checkpoints of earlier versions store it
+    assert type(earlier) is type(module) and vars(earlier).keys() == vars(module).keys()
+    for key in (
+        "root",
+        "gateway",
+        "wavelength_m",
+        "normalisation",
+        "stand_in",
+        "antenna",
+        "positions",
+        "align",
+    ):
+        assert getattr(earlier, key, None) == getattr(module, key, None)
+
+
+def test_data_modules_are_of_different_classes():
+    made = [OmegaConf.create(path.read_text())["_target_"] for path in CONFIGS.values()]
+    assert len(set(made)) == len(CONFIGS) == 7
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"name": "own", "_target_": "os.system"}, "no gsparc.data.datamodule.DataModule|no such setting"),
+        ({"name": "own", "_target_": "gsparc.methods.mean.Mean"}, "is no gsparc.data.datamodule.DataModule"),
+        (
+            {"name": "own", "_target_": "gsparc.data.modules.own.Onw"},
+            "is no gsparc.data.datamodule.DataModule",
+        ),
+        (
+            {"name": "own", "_target_": "gsparc.data.modules.rfid.RFID"},
+            "this is dataset=rfid; say dataset=own",
+        ),
+        (
+            {"name": "rfid", "gatway": "x"},
+            r"dataset\.gatway: no such setting of dataset=rfid; did you mean 'gateway'",
+        ),
+        (
+            {"name": "own", "file": "x", "batch_size": 0},
+            r"dataset\.batch_size=0: a whole number of at least 1",
+        ),
+    ],
+)
+def test_what_is_no_dataset_is_refused_in_one_line(settings, says):
+    with pytest.raises(ValueError, match=says) as error:
+        datamodule(settings)
+    assert "\n" not in str(error.value)
+
+
+def test_text_out_of_a_file_names_classes_of_gsparc_only():
+    foreign = {"_target_": f"{__name__}.Mine", "name": "mine"}
+    with pytest.raises(ValueError, match="not a class of gsparc; refused"):
+        datamodule(foreign, trusted=False)
+    nested = {"name": "rfid", "stand_in": {"_target_": "os.system", "command": "true"}}
+    with pytest.raises(ValueError, match=r"'os\.system', which is not a class"):
+        datamodule(nested, trusted=False)
+
+
+class Mine(DataModule):
+    """A dataset of a user's own, outside gsparc."""
+
+    reads = 0
+
+    def __init__(self, arrays, name="mine", batch_size=4):
+        super().__init__(name, batch_size)
+        self.arrays = arrays
+
+    def load(self):
+        Mine.reads += 1
+        return from_arrays(self.arrays)
+
+
+def test_a_subclass_needs_load_alone(csi_arrays, tmp_path):
+    module = Mine(csi_arrays)
+    with pytest.raises(RuntimeError, match=r"use\(fold, seed\)"):
+        module.train_dataloader()
+    recorder = _Recorder()
+    trainer = pl.Trainer(
+        max_steps=2, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False,
+        enable_model_summary=False, default_root_dir=tmp_path,
+    )  # fmt: skip
+    trainer.fit(recorder, module.use(FOLD, seed=3))
+    assert recorder.seen == [order(3, s, 4, FOLD.train).tolist() for s in range(2)] and Mine.reads == 1
+    assert [b.index.tolist() for b in module.test_dataloader()] == [FOLD.test.tolist()]
+
+
+@pytest.mark.parametrize(("rows", "devices"), [(8, 2), (5, 2), (1, 3), (2, 3)])
+def test_devices_share_every_batch_and_none_is_left_out(rows, devices):
+    shares = [share(np.arange(rows), rank, devices) for rank in range(devices)]
+    assert all(len(part) for part in shares)
+    assert set(np.concatenate(shares)) == set(range(rows))
+    if rows >= devices:
+        assert sum(map(len, shares)) == rows
+
+
+def test_several_devices_take_the_steps_of_one(data):
+    one = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0)]
+    two = [[b.index.tolist() for b in StepLoader(data, FOLD.train, 4, 0, rank=r, devices=2)] for r in (0, 1)]
+    assert len(two[0]) == len(two[1]) == len(one)
+    for whole, *parts in zip(one, *two, strict=True):
+        assert parts[0] == whole[0::2] and set(parts[0] + parts[1]) == set(whole)

@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gsparc.methods.registry import targets
+from gsparc.data.instantiate import targets
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 

@@ -1,0 +1,35 @@
+"""What `gsparc simulate` wrote: `dataset=sionna`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsparc.data.datamodule import DataModule
+from gsparc.data.schema import Measurements
+from gsparc.data.sionna import load_sionna
+
+
+class Sionna(DataModule):
+    """One transmitter, many receivers, read as spectra or as channels.
+
+    Args:
+        file: *.h5.
+        target: `spectrum` or `csi`; None takes what the file was mainly made for.
+        truth: another simulation of the same receivers, which test rows are compared with.
+        name, batch_size: see `DataModule`.
+    """
+
+    def __init__(
+        self,
+        file: str | Path,
+        target: str | None = None,
+        truth: str | Path | None = None,
+        name: str = "sionna",
+        batch_size: int = 16,
+    ) -> None:
+        super().__init__(name, batch_size)
+        self.file, self.target, self.truth = Path(file), target, truth
+
+    def load(self) -> Measurements:
+        """Spectra (S, H, W) or channels (S, A, K)."""
+        return load_sionna(self.file, self.target, self.truth)
