@@ -99,7 +99,7 @@ def _choices() -> dict[str, DictConfig]:
         if file.name.endswith(".yaml"):
             settings = yaml.safe_load(file.read_text(encoding="utf-8"))
             settings.pop("defaults", None)
-            found[file.name.removesuffix(".yaml")] = OmegaConf.create(settings)
+            found[file.name.removesuffix(".yaml")] = DictConfig(settings)
     return found
 
 

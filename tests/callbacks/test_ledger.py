@@ -21,6 +21,7 @@ def trainer(callbacks=(), **figures) -> SimpleNamespace:
         callbacks=list(callbacks),
         callback_metrics=figures,
         sanity_checking=False,
+        is_global_zero=True,
         global_step=7,
         state=SimpleNamespace(fn="fit"),
     )

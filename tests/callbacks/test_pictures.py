@@ -17,7 +17,10 @@ def stage(data, fold, run_dir, step):
     model = type("Model", (), {"site": data.site, "__call__": lambda self, tx, rx: predict(tx, rx)})()
     module = SimpleNamespace(model=model, run_dir=run_dir, train_seconds=1.0, device="cpu")
     loaded = SimpleNamespace(measurements=data, fold=fold)
-    return SimpleNamespace(global_step=step, max_steps=25, datamodule=loaded, callbacks=[]), module
+    trainer = SimpleNamespace(
+        global_step=step, max_steps=25, datamodule=loaded, callbacks=[], is_global_zero=True
+    )
+    return trainer, module
 
 
 @pytest.mark.parametrize(("step", "drawn"), [(10, True), (11, False), (25, True)])

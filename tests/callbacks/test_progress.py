@@ -23,7 +23,7 @@ FIGURES = {"train/task_loss": 0.0123, "val/ssim_gauss": 0.9315, "val/psnr_db": 2
 
 
 def run(step: int = 400) -> tuple[SimpleNamespace, SimpleNamespace]:
-    trainer = SimpleNamespace(max_steps=400, global_step=step, callback_metrics=FIGURES)
+    trainer = SimpleNamespace(max_steps=400, global_step=step, callback_metrics=FIGURES, is_global_zero=True)
     return trainer, SimpleNamespace(
         model=SimpleNamespace(gaussians=[0] * 500), run_dir=Path("run"), pace=None
     )
