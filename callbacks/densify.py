@@ -10,6 +10,7 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 
@@ -44,6 +45,11 @@ class Densify(L.Callback):
         max_gaussians: int = 100_000,
         min_gaussians: int = 16,
     ) -> None:
+        check_arguments(
+            locals(), start=whole(0), stop=whole(0), interval=whole(1), grad_threshold=number(0),
+            size_share=number(0), children=whole(2), max_radius=or_null(POSITIVE), max_gaussians=whole(1),
+            min_gaussians=whole(0),
+        )  # fmt: skip
         self.start, self.stop, self.interval = start, stop, interval
         self.grad_threshold = grad_threshold
         self.size_share = size_share

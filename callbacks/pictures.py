@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from gsparc.callbacks.ledger import CostLedger
+from gsparc.data.limits import check_arguments, whole
 from gsparc.evaluation.pictures import draw_spectra
 
 
@@ -21,6 +22,7 @@ class Pictures(L.Callback):
     """
 
     def __init__(self, every: int = 1000, count: int = 4) -> None:
+        check_arguments(locals(), every=whole(1), count=whole(1))
         self.every = every
         self.count = count
 

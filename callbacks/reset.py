@@ -8,6 +8,8 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
+from gsparc.data.limits import SHARE, check_arguments, whole
+
 
 class OpacityReset(L.Callback):
     """sigma_i <- min(sigma_i, ceiling) every `interval` steps until `stop`; Adam's moments follow.
@@ -19,6 +21,7 @@ class OpacityReset(L.Callback):
     """
 
     def __init__(self, interval: int = 3000, stop: int = 15_000, ceiling: float = 0.01) -> None:
+        check_arguments(locals(), interval=whole(1), stop=whole(0), ceiling=SHARE)
         self.interval = interval
         self.stop = stop
         self.ceiling = math.log(ceiling / (1 - ceiling))

@@ -1,15 +1,14 @@
-"""`gsparc COMMAND key=value ...`, also `python -m gsparc COMMAND key=value ...`."""
+"""`gsparc COMMAND key=value ...`."""
 
 from __future__ import annotations
 
 import sys
-from importlib import import_module
 
 from gsparc.studies.commands import COMMANDS, listed, nearest
 
 
 def main() -> None:
-    """Run the command named first; without one, list them."""
+    """Run the command named first; without one, list them. Exit status 0 only when the job was done."""
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help"):
         sys.stdout.write(listed())
@@ -17,8 +16,9 @@ def main() -> None:
     if name not in COMMANDS:
         sys.stderr.write(f"error: no command is called {name!r}{nearest(name)}\n")
         sys.exit(1)
-    sys.argv = [f"gsparc {name}", *sys.argv[2:]]
-    import_module(COMMANDS[name].module).main()
+    command = COMMANDS[name]
+    sys.argv = [f"gsparc {name}", *command.arguments(sys.argv[2:])]
+    command.run()
 
 
 if __name__ == "__main__":

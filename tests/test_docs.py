@@ -72,7 +72,6 @@ def said(page: Path) -> list[str]:
 
 
 COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
-STUDIES = {"kind=effects": "prices", "kind=positions": "sensitivity"}  # configurations of `gsparc study`
 
 
 def commands() -> dict[tuple[str, ...], str]:
@@ -85,9 +84,8 @@ def commands() -> dict[tuple[str, ...], str]:
         name = match["name"] or "train"
         assert name in COMMANDS, line
         words = shlex.split(match["rest"], comments=True)
-        name = next((STUDIES[word] for word in words if word in STUDIES), name)
         given = [word for word in words if "=" in word or word.startswith("~")]
-        given = [word for word in given if word not in STUDIES and not word.endswith(("=NAME", "=..."))]
+        given = [word for word in given if not word.endswith(("=NAME", "=..."))]
         # Of the values of a sweep the first.
         found[name, *(word if "[" in word else word.partition(",")[0] for word in given)] = line
     return {key: line for key, line in found.items() if (ROOT / "conf" / f"{key[0]}.yaml").exists()}

@@ -31,7 +31,7 @@ ARROWS = {
     "peers": "data field methods ops physics",
     "auto": "data field methods ops training",
     "evaluation": "data methods",
-    "callbacks": "evaluation field",
+    "callbacks": "data evaluation field",
     "studies": "data evaluation field methods multipath ops simulate training",
     "conf": "",
 }

@@ -19,6 +19,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
 from gsparc.data.instantiate import suggest
+from gsparc.data.limits import SettingError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
@@ -50,6 +51,9 @@ def one_line(error: BaseException) -> str:
         key = str(error.full_key or str(error).rpartition(" ")[2])
         return f"{key} is not set; give {key}=..."
     if isinstance(error, InstantiationException) and error.__cause__ is not None:
+        where = re.search(r"full_key: (\S+)", str(error))
+        if isinstance(error.__cause__, SettingError) and where:
+            return f"{where[1]}.{error.__cause__}"
         return _argument(str(error)) or one_line(error.__cause__)
     if isinstance(error, HydraException):
         return " ".join(str(error).split())

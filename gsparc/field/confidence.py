@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.limits import Checked, number, setting, whole
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 
 @dataclass(frozen=True)
-class ConfidenceSettings:
+class ConfidenceSettings(Checked):
     """The confidence network and its weight in the loss.
 
     Attributes:
@@ -23,9 +24,9 @@ class ConfidenceSettings:
     """
 
     enabled: bool = True
-    hidden: int = 32
-    alpha: float = 0.3
-    clamp: float = 10.0
+    hidden: int = setting(32, whole(1))
+    alpha: float = setting(0.3, number(0))
+    clamp: float = setting(10.0, number(0, 80, open_low=True))
     encoding: EncodingSettings = field(default_factory=lambda: EncodingSettings(kind="raw"))
 
 

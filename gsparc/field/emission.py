@@ -9,14 +9,16 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.limits import Checked, choice, number, setting, whole
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops.networks import networks
 
+ACTIVATIONS = ("auto", "sigmoid", "softplus", "linear")
 EMISSION_FLOOR = 0.01  # inverting an activation stops short of its infinities
 
 
 @dataclass(frozen=True)
-class EmissionSettings:
+class EmissionSettings(Checked):
     """Shape of the emission networks (paper: 3-16-2, raw coordinates).
 
     Attributes:
@@ -31,11 +33,11 @@ class EmissionSettings:
     """
 
     encoding: EncodingSettings = field(default_factory=EncodingSettings)
-    hidden: int = 32
-    activation: Literal["auto", "sigmoid", "softplus", "linear"] = "sigmoid"
-    log_distance: bool = True
-    init_scale: float = 0.1
-    init_bias: float | Literal["auto"] = 0.0
+    hidden: int = setting(0, whole(0))
+    activation: Literal["auto", "sigmoid", "softplus", "linear"] = setting("auto", choice(*ACTIVATIONS))
+    log_distance: bool = False
+    init_scale: float = setting(0.1, number(0))
+    init_bias: float | Literal["auto"] = "auto"
 
 
 class Emission(nn.Module):

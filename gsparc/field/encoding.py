@@ -9,11 +9,13 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.limits import Checked, setting, whole
+
 JITTER = 1e-5  # relative to the unit variance of the kernel
 
 
 @dataclass(frozen=True)
-class EncodingSettings:
+class EncodingSettings(Checked):
     """Choice of encoding.
 
     Attributes:
@@ -24,9 +26,9 @@ class EncodingSettings:
         anchors: largest number of training positions of `kernel`.
     """
 
-    kind: Literal["auto", "raw", "fourier", "kernel"] = "fourier"
-    octaves: int = 5
-    anchors: int = 1024
+    kind: Literal["auto", "raw", "fourier", "kernel"] = "auto"
+    octaves: int = setting(5, whole(0, 30))
+    anchors: int = setting(1024, whole(1))
 
 
 @dataclass(frozen=True)

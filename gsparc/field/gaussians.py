@@ -9,12 +9,14 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.limits import POSITIVE, SHARE, Checked, number, or_null, setting, whole
+
 POINT = 0.05  # [m], standard deviation of a Gaussian that stands for a point
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
 
 
 @dataclass(frozen=True)
-class FieldSettings:
+class FieldSettings(Checked):
     """Size and initial state of the field.
 
     Attributes:
@@ -29,13 +31,13 @@ class FieldSettings:
         scale: initial standard deviation [m]; null takes the spacing between neighbours.
     """
 
-    count: int = 500
-    init: Literal["auto", "uniform", "sphere", "backprojection"] = "sphere"
-    margin: float = 2.0
-    near: float = 1.0
-    far: float = 6.0
-    opacity: float = 0.3
-    scale: float | None = None
+    count: int = setting(500, whole(0))
+    init: Literal["auto", "uniform", "sphere", "backprojection"] = "auto"
+    margin: float = setting(2.0, number(0))
+    near: float = setting(1.0, number(0))
+    far: float = setting(6.0, POSITIVE)
+    opacity: float = setting(0.3, SHARE)
+    scale: float | None = setting(None, or_null(POSITIVE))
 
 
 class GaussianField(nn.Module):

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.limits import POSITIVE, Checked, or_null, setting
 from gsparc.data.schema import Site
 from gsparc.field.confidence import Confidence, ConfidenceSettings
 from gsparc.field.emission import Emission, EmissionSettings
@@ -33,7 +34,7 @@ FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 
 
 @dataclass(frozen=True)
-class AttenuationSettings:
+class AttenuationSettings(Checked):
     """Distance law between transmitter and Gaussians.
 
     Attributes:
@@ -45,10 +46,10 @@ class AttenuationSettings:
         learn_gain: whether the gain is trained.
     """
 
-    inverse_distance: bool = True
-    d_min: float = 0.05
-    d_ref: float | None = None
-    gain: float = 2.0
+    inverse_distance: bool = False
+    d_min: float = setting(0.05, POSITIVE)
+    d_ref: float | None = setting(None, or_null(POSITIVE))
+    gain: float = setting(2.0, POSITIVE)
     learn_gain: bool = True
 
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.limits import Checked, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import Pose
 from gsparc.ops.channels import channels
@@ -23,7 +24,7 @@ UNEVEN = 1e-6  # tones this far off an even comb, in spacings, are evaluated one
 
 
 @dataclass(frozen=True)
-class ResponseSettings:
+class ResponseSettings(Checked):
     """Coherent terms of the splatted field; off means not computed.
 
     Attributes:
@@ -35,7 +36,7 @@ class ResponseSettings:
     """
 
     array: bool = False
-    pattern: float = 0.0
+    pattern: float = setting(0.0, number(0))
     carrier: bool = False
 
 

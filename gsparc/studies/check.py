@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -44,7 +43,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console()
     good = [check(path, console) for path in parser.parse_args(arguments).path]
     return 0 if all(good) else 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

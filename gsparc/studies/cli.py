@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -62,9 +63,18 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
 def _explained(task: Callable[[DictConfig], object], config: str) -> str:
     """What a command does and its settings with their comments, which Hydra leaves out."""
     what = inspect.cleandoc(inspect.getmodule(task).__doc__ or "").partition("\n\n")[0]  # type: ignore[union-attr]
-    file = Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0]) / f"{config}.yaml"
-    settings = file.read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()
-    return f"{what}\n\n{settings}\n\n"
+    texts = [(_folder() / f"{config}.yaml").read_text(encoding="utf-8").partition("\nhydra:")[0].rstrip()]
+    kind = re.search(r"^  - kind: (\w+)", texts[0], re.MULTILINE)  # settings of the command itself
+    if kind is not None:
+        said = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
+        file = _folder() / "kind" / f"{(said or [kind[1]])[-1]}.yaml"
+        texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
+    return "\n\n".join([what, *texts]) + "\n\n"
+
+
+def _folder() -> Path:
+    """Where the configurations are."""
+    return Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0])
 
 
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import import_module
 
 
 @dataclass(frozen=True)
@@ -11,41 +14,65 @@ class Command:
     """One command.
 
     Attributes:
-        module: has `main()`, which reads `sys.argv`.
+        name: also of its configuration, `conf/<name>.yaml`.
+        module: has `task(config)`.
         answers: one line for the list.
+        bare: setting that takes words without an equals sign, as a list of paths.
+        configured: False for a command without a configuration: its module has `main(arguments)`.
     """
 
+    name: str
     module: str
     answers: str
+    bare: str | None = None
+    configured: bool = True
+
+    def arguments(self, given: Sequence[str]) -> list[str]:
+        """A command line in Hydra's words: bare paths become `<bare>=[...]`."""
+        paths = [word for word in given if self.bare and "=" not in word and not word.startswith("-")]
+        quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
+        return [
+            *(word for word in given if word not in paths),
+            *([f"{self.bare}=[{quoted}]"] if paths else []),
+        ]
+
+    def run(self) -> None:
+        """Run it with the command line in `sys.argv`; ends the process when it fails."""
+        module = import_module(self.module)
+        if not self.configured:
+            sys.exit(module.main(sys.argv[1:]))
+        from gsparc.studies import cli
+
+        cli.run(module.task, self.name)
 
 
+ROOM = "gsparc.studies."
 COMMANDS = {
-    "train": Command("gsparc.studies.train", "train a method on a dataset and test it beside baselines"),
-    "evaluate": Command("gsparc.studies.evaluate", "test a checkpoint again: ckpt=FILE"),
-    "check": Command("gsparc.studies.check", "what is in a file of measurements, or what is wrong with it"),
-    "simulate": Command(
-        "gsparc.studies.simulate", "ray-trace a dataset with the effects it calls for: out=FILE"
-    ),
-    "study": Command(
-        "gsparc.studies.study.command", "variants of one model: kind=effects, positions or measurements"
-    ),
-    "tradeoff": Command(
-        "gsparc.studies.tradeoff.command", "accuracy against milliseconds of one model: ckpt=FILE"
-    ),
-    "compare": Command(
-        "gsparc.studies.compare.command", "every method under the same data, metrics and clock"
-    ),
-    "calibrate": Command(
-        "gsparc.studies.calibrate.command",
-        "which confidence to trust, and a threshold with a promise: ckpt=FILE",
-    ),
-    "link": Command(
-        "gsparc.studies.link.command", "rates and block errors with predicted channels: ckpt=FILE"
-    ),
-    "report": Command("gsparc.studies.report", "one page about many runs: RUN..."),
-    "bench": Command(
-        "gsparc.studies.bench.command", "timings of the kernels as ratios to the machine's limit"
-    ),
+    command.name: command
+    for command in (
+        Command("train", f"{ROOM}train", "train a method on a dataset and test it beside baselines"),
+        Command("evaluate", f"{ROOM}evaluate", "test a checkpoint again: ckpt=FILE"),
+        Command(
+            "check",
+            f"{ROOM}check",
+            "what is in files of measurements, or what is wrong: FILE...",
+            configured=False,
+        ),
+        Command("simulate", f"{ROOM}simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
+        Command(
+            "study", f"{ROOM}study.command", "variants of one model: kind=effects, positions or measurements"
+        ),
+        Command("tradeoff", f"{ROOM}tradeoff.command", "accuracy against latency of one model: ckpt=FILE"),
+        Command("compare", f"{ROOM}compare.command", "every method under the same data, metrics and clock"),
+        Command(
+            "calibrate",
+            f"{ROOM}calibrate.command",
+            "compare confidences; a threshold with a bounded risk: ckpt=FILE",
+        ),
+        Command("link", f"{ROOM}link.command", "rates and block errors with predicted channels: ckpt=FILE"),
+        Command("report", f"{ROOM}report", "one page about many runs: RUN...", "runs"),
+        Command("bench", f"{ROOM}bench.command", "timings of kernels as ratios to the machine's limit"),
+    )
 }
 
 

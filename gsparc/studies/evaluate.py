@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
@@ -18,7 +17,7 @@ from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
-from gsparc.studies import cli, limits
+from gsparc.studies.settings import RunSettings, plain
 
 
 def evaluate_files(
@@ -52,15 +51,13 @@ def evaluate_files(
 
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
-    limits.check(OmegaConf.to_container(config, resolve=True))  # type: ignore[arg-type]
-    if config.threads is not None:
-        torch.set_num_threads(int(config.threads))
+    RunSettings.of(config)
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     found, data, split = evaluate_files(
         paths,
-        OmegaConf.to_container(config.dataset, resolve=True),  # type: ignore[arg-type]
-        OmegaConf.to_container(config.split, resolve=True),  # type: ignore[arg-type]
+        plain(config.dataset),
+        plain(config.split),
         eval_on=config.eval_on,
         baselines=config.baselines,
         cache=platform_cache() if config.cache is None else Path(config.cache),
@@ -75,12 +72,3 @@ def task(config: DictConfig) -> dict[str, Any]:
     console.print(results_table(facts, facts["model/name"], title, config.eval_on))
     console.print(f"written to {run_dir}", highlight=False)
     return facts
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "evaluate")
-
-
-if __name__ == "__main__":
-    main()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,6 @@ from gsparc.evaluation.report.readme import refresh
 from gsparc.evaluation.report.runs import columns, find_runs
 from gsparc.evaluation.report.timing import retime
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.studies import cli
 
 log = logging.getLogger(__name__)
 
@@ -61,23 +59,3 @@ def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
         summary = json.loads((file.parent / "summary.json").read_text(encoding="utf-8"))
         found.append((str(summary["dataset/name"]), columns(file)))
     return found
-
-
-def arguments(given: Sequence[str]) -> list[str]:
-    """Run directories become `runs=[...]`; what holds an equals sign or starts with a dash is Hydra's."""
-    paths = [a for a in given if "=" not in a and not a.startswith("-")]
-    rest = [a for a in given if a not in paths]
-    if paths:
-        quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
-        rest.append(f"runs=[{quoted}]")
-    return rest
-
-
-def main() -> None:
-    """Entry point."""
-    sys.argv[1:] = arguments(sys.argv[1:])
-    cli.run(task, "report")
-
-
-if __name__ == "__main__":
-    main()

@@ -8,10 +8,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import to_absolute_path
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import open_console
@@ -25,7 +24,7 @@ from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
-from gsparc.studies import cli
+from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
 
@@ -36,18 +35,18 @@ def campaign(config: DictConfig) -> Campaign:
     Raises:
         ValueError: a setting that does not exist or cannot be.
     """
-    plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    settings = plain(config)
     return Campaign(
-        scene_from_config(plain["scene"]),
-        _effects(plain["effects"]),
-        Sampling(**plain["sampling"]),
-        SpectrumSettings(**plain["spectrum"]),
-        CsiSettings(**plain["csi"]),
-        shard=int(plain["shard"]),
-        check=int(plain["check"]),
-        check_seed=int(plain["check_seed"]),
-        weakest_db=float(plain["weakest_db"]),
-        measurement=str(plain["measurement"]),
+        scene_from_config(settings["scene"]),
+        _effects(settings["effects"]),
+        Sampling(**settings["sampling"]),
+        SpectrumSettings(**settings["spectrum"]),
+        CsiSettings(**settings["csi"]),
+        shard=int(settings["shard"]),
+        check=int(settings["check"]),
+        check_seed=int(settings["check_seed"]),
+        weakest_db=float(settings["weakest_db"]),
+        measurement=str(settings["measurement"]),
     )
 
 
@@ -59,8 +58,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 def task(config: DictConfig) -> Outcome:
     """Simulate, then table, summary and pictures."""
-    if config.threads is not None:
-        torch.set_num_threads(int(config.threads))
+    RunSettings.of(config)
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
@@ -104,12 +102,3 @@ def _closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
             f"spectra {error.spectrum_psnr_db:.1f} dB, SSIM {error.spectrum_ssim:.4f}"
         )
     return lines
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "simulate")
-
-
-if __name__ == "__main__":
-    main()

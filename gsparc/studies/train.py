@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning.pytorch.loggers import Logger
@@ -30,8 +29,9 @@ from gsparc.evaluation.summary import provenance, remarks, results_table, write_
 from gsparc.methods import checkpoint
 from gsparc.methods.method import Method, Resumable, TrainsByGradient
 from gsparc.methods.registry import build
-from gsparc.studies import cli, limits
+from gsparc.studies import cli
 from gsparc.studies.context import context_of
+from gsparc.studies.settings import RunSettings
 
 log = logging.getLogger(__name__)
 
@@ -69,10 +69,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     Raises:
         ValueError: bad data, settings or checkpoint; one line each.
     """
-    limits.check(_plain(config))
+    RunSettings.of(config)
     _refuse_absent(config.ckpt_path)
-    if config.threads is not None:
-        torch.set_num_threads(int(config.threads))
     _anchor(config)
     module = datamodule(config.dataset)
     if config.get("init_from") is not None:
@@ -248,7 +246,3 @@ def task(config: DictConfig) -> float:
 def main() -> None:
     """Entry point."""
     cli.run(task, "train")
-
-
-if __name__ == "__main__":
-    main()

@@ -10,6 +10,7 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.schema import Batch
 from gsparc.field import edit
 from gsparc.field.confidence import weighted
@@ -23,7 +24,7 @@ from gsparc.training.time_budget import Pace
 
 
 @dataclass(frozen=True)
-class LossSettings:
+class LossSettings(Checked):
     """Task loss.
 
     Attributes:
@@ -33,12 +34,8 @@ class LossSettings:
             not look at it.
     """
 
-    ssim_weight: float = 0.2
-    snapshot: Snapshot = "none"
-
-    def __post_init__(self) -> None:
-        if self.snapshot not in get_args(Snapshot):
-            raise ValueError(f"model.loss.snapshot={self.snapshot!r}: choose {', '.join(get_args(Snapshot))}")
+    ssim_weight: float = setting(0.2, number(0, 1))
+    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
 class NonFiniteLoss(RuntimeError):

@@ -9,11 +9,14 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
+from gsparc.data.limits import Checked, number, setting, whole
 from gsparc.training.time_budget import Pace
+
+RATE = number(0)
 
 
 @dataclass(frozen=True)
-class OptimizerSettings:
+class OptimizerSettings(Checked):
     """Adam's rates (paper, table of hyperparameters) and their decay.
 
     Attributes:
@@ -24,17 +27,17 @@ class OptimizerSettings:
         eps: Adam's epsilon.
     """
 
-    positions: float = 1.6e-4
-    positions_final: float = 1.6e-7
-    scales: float = 0.005
-    rotations: float = 0.001
-    opacities: float = 0.0055
-    emission: float = 0.005
-    confidence: float = 0.005
-    gain: float = 0.005
-    decay: float = 1.0
-    warmup: int = 0
-    eps: float = 1e-15
+    positions: float = setting(1e-3, RATE)
+    positions_final: float = setting(1e-5, RATE)
+    scales: float = setting(0.005, RATE)
+    rotations: float = setting(0.001, RATE)
+    opacities: float = setting(0.0055, RATE)
+    emission: float = setting(0.005, RATE)
+    confidence: float = setting(0.005, RATE)
+    gain: float = setting(0.005, RATE)
+    decay: float = setting(0.05, RATE)
+    warmup: int = setting(0, whole(0))
+    eps: float = setting(1e-15, RATE)
 
 
 KINDS = {

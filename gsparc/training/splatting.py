@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.limits import check_arguments, switch
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field import edit
@@ -69,10 +70,11 @@ class LearnedField(Method):
         optimizer: OptimizerSettings = OptimizerSettings(),
         response: ResponseSettings | None = None,
         name: str = "gsparc",
-        warm_start: bool | Literal["auto"] = False,
-        refit: bool = False,
+        warm_start: bool | Literal["auto"] = "auto",
+        refit: bool = True,
         guesses: Sequence[str] = (),
     ) -> None:
+        check_arguments(locals(), warm_start=switch("auto"), refit=switch())
         self.settings = ModelSettings(
             field, emission, attenuation, raster, response or ResponseSettings(), confidence
         )

@@ -14,7 +14,9 @@ ENCODING = EncodingSettings("fourier", octaves=2)
 
 def emission(hidden: int = 4, count: int = 5, channels: int = 2, **more) -> Emission:
     torch.manual_seed(0)
-    settings = EmissionSettings(encoding=ENCODING, hidden=hidden, **{"log_distance": False, **more})
+    settings = EmissionSettings(
+        encoding=ENCODING, hidden=hidden, **{"activation": "sigmoid", "init_bias": 0.0, **more}
+    )
     return Emission(settings, count, channels, PositionEncoding(ENCODING, BOX))
 
 

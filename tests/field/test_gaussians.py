@@ -19,7 +19,7 @@ def test_uniform_fills_the_enlarged_box():
 
 
 def test_sphere_surrounds_the_receiver_above_its_horizon():
-    field = initial_field(FieldSettings(count=500, near=1, far=6), BOX, RECEIVER, TURN)
+    field = initial_field(FieldSettings(count=500, init="sphere", near=1, far=6), BOX, RECEIVER, TURN)
     local = (field.means - RECEIVER) @ TURN
     distance = local.norm(dim=1)
     assert distance.min() >= 1 and distance.max() <= 6 and (local[:, 2] > 0).all()

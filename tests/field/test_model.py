@@ -12,7 +12,8 @@ from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose, StalePlan
 
 RAW = EncodingSettings("raw")
-LINEAR = EmissionSettings(RAW, hidden=3, activation="linear", log_distance=False)
+LINEAR = EmissionSettings(RAW, hidden=3, activation="linear", init_bias=0.0)
+INVERSE = AttenuationSettings(inverse_distance=True)
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 
 
@@ -20,7 +21,12 @@ def model(data, count: int = 20, **more) -> GaussianModel:
     torch.manual_seed(0)
     moving = data.site.static_end == "tx"
     settings = ModelSettings(
-        **{"field": FieldSettings(count=count, init="uniform", opacity=0.5), "emission": LINEAR, **more}
+        **{
+            "field": FieldSettings(count=count, init="uniform", opacity=0.5),
+            "emission": LINEAR,
+            "attenuation": INVERSE,
+            **more,
+        }
     )
     transmitter = torch.from_numpy(data.tx[0]).float() if moving else None
     return GaussianModel(settings, data.site, None if moving else RECEIVER, transmitter)
@@ -47,13 +53,13 @@ def test_antennas_and_subcarriers_are_factored(campaign):
 
 def test_signed_channels_refuse_an_activation_of_powers(campaign):
     with pytest.raises(ValueError, match="channels are signed, choose linear"):
-        model(campaign("csi"), emission=EmissionSettings(RAW, activation="sigmoid"))
+        model(campaign("csi"), emission=EmissionSettings(RAW, activation="sigmoid", init_bias=0.0))
 
 
 def test_attenuation_is_gain_over_distance_and_can_be_off(campaign):
     data = campaign("spectrum")
     batch = data.batch(np.arange(4))
-    on = model(data, attenuation=AttenuationSettings(gain=3.0, d_ref=2.0, d_min=0.1))
+    on = model(data, attenuation=AttenuationSettings(inverse_distance=True, gain=3.0, d_ref=2.0, d_min=0.1))
     off = model(data, attenuation=AttenuationSettings(inverse_distance=False))
     apart = (batch.tx[:, None] - on.gaussians.means).square().sum(-1).add(0.01).sqrt() / 2.0
     assert torch.allclose(on.distances(batch.tx), apart, atol=1e-6)
@@ -79,7 +85,7 @@ def test_the_emission_reads_the_end_that_moves(campaign):
 def test_a_frozen_view_equals_the_forward_pass_until_the_next_edit(campaign):
     data = campaign("spectrum")
     batch = data.batch(np.arange(6))
-    field = model(data, field=FieldSettings(count=60, near=1, far=4))
+    field = model(data, field=FieldSettings(count=60, init="sphere", near=1, far=4))
     frozen = field.freeze(batch.rx)
     image = frozen.render(field.features(batch.tx, batch.rx).detach(), int(field.gaussians.version))
     assert torch.allclose(image.squeeze(1), field(batch.tx, batch.rx).mean, atol=1e-5)

@@ -228,7 +228,9 @@ def _splatted(hidden: int = 0):
     settings = ModelSettings(
         field=FieldSettings(count=30, init="sphere"),
         attenuation=AttenuationSettings(inverse_distance=bool(hidden)),
-        emission=EmissionSettings(EncodingSettings("fourier"), hidden, "linear", False, init_scale=1.0),
+        emission=EmissionSettings(
+            EncodingSettings("fourier"), hidden, "linear", init_scale=1.0, init_bias=0.0
+        ),
         response=ResponseSettings(array=True),
     )
     return GaussianModel(settings, array_site(GRID, planar_array(2, 2)), _pose())

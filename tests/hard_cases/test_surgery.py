@@ -49,8 +49,10 @@ RECEIVER = Pose.identity(torch.tensor([0.0, 0.0, -2.0]))
 
 def fresh(count: int) -> tuple[GaussianModel, SimpleNamespace]:
     torch.manual_seed(0)
-    emission = EmissionSettings(EncodingSettings("raw"), hidden=2, log_distance=False)
-    model = GaussianModel(ModelSettings(field=FieldSettings(count=count), emission=emission), SITE, RECEIVER)
+    emission = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0)
+    model = GaussianModel(
+        ModelSettings(field=FieldSettings(count=count, init="sphere"), emission=emission), SITE, RECEIVER
+    )
     optimizer = optimizer_for(model, OptimizerSettings())
     return model, SimpleNamespace(optimizers=[optimizer], global_step=0)
 

@@ -8,7 +8,7 @@ from gsparc.field.confidence import ConfidenceSettings
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
-from gsparc.field.model import GaussianModel, ModelSettings
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
 from gsparc.training.lightning_module import GaussianModule, LossSettings
 from gsparc.training.optimizer import OptimizerSettings
@@ -18,10 +18,11 @@ RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 
 def module(data, run_dir, confidence: bool = True) -> GaussianModule:
     torch.manual_seed(0)
-    emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", log_distance=False)
+    emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", init_bias=0.0)
     settings = ModelSettings(
         field=FieldSettings(count=20, init="uniform"),
         emission=emission,
+        attenuation=AttenuationSettings(inverse_distance=True),
         confidence=ConfidenceSettings(enabled=confidence),
     )
     shape = data.target.shape[1:] if data.site.kind == "csi" else None

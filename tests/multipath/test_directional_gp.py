@@ -19,7 +19,7 @@ from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.visibility_gp import VisibilityGP
 from gsparc.multipath.visibility_update import RayErrorRates, flips
-from gsparc.studies.study.sensitivity import turned
+from gsparc.studies.study.disturb import turned
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
 

@@ -20,8 +20,8 @@ import gsparc.conf
 from gsparc.evaluation.console import one_line
 from gsparc.methods.method import Method
 from gsparc.methods.registry import build
-from gsparc.studies import cli
-from gsparc.studies.train import task
+from gsparc.training.fit import DEFAULTS
+from gsparc.training.splatting import LearnedField
 
 CONF = Path(gsparc.conf.__path__[0])
 ROOT = Path(__file__).parents[2]
@@ -89,6 +89,17 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
     }  # fmt: skip
 
 
+def test_defaults_in_code_are_those_of_the_configuration():
+    """A field made in Python was another one than `model=gsparc` with its effects off."""
+    config = compose()
+    composed, own = build(config.model), LearnedField()
+    for name in ("settings", "loss", "rates", "warm_start", "refit", "guesses", "name"):
+        assert getattr(composed, name) == getattr(own, name), name
+    trainer = OmegaConf.to_container(config.trainer)
+    del trainer["_target_"], trainer["gradient_clip_val"]
+    assert DEFAULTS.keywords == trainer and config.trainer.gradient_clip_val is None
+
+
 def test_the_paper_leaves_nothing_to_auto():
     config = compose("paper=gsparc")
     settings = build(config.model).settings
@@ -114,17 +125,6 @@ def test_every_model_has_a_run_directory_of_its_own(model, monkeypatch):
 
 def test_the_papers_runs_lie_apart_from_ours(monkeypatch):
     assert "/gsparc-paper/" in run_directory(monkeypatch, "paper=gsparc")
-
-
-@pytest.mark.parametrize("command", ["train", "calibrate", "link", "tradeoff"])
-def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monkeypatch, capsys):
-    """`--help` listed names and values without a word about them."""
-    monkeypatch.setattr(sys, "argv", [command, "--help"])
-    with pytest.raises(SystemExit) as ended:
-        cli.run(task, command)
-    said = capsys.readouterr().out
-    assert not ended.value.code and said.startswith("Compose, fit, test, write")
-    assert (CONF / f"{command}.yaml").read_text().splitlines()[0] in said and "  # " in said
 
 
 def test_a_folder_that_cannot_be_written_is_named_without_a_number():

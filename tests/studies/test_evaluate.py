@@ -19,7 +19,8 @@ from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.nearest import Nearest
 from gsparc.studies.cli import run
-from gsparc.studies.evaluate import evaluate_files, main
+from gsparc.studies.commands import COMMANDS
+from gsparc.studies.evaluate import evaluate_files
 
 
 @pytest.fixture
@@ -92,7 +93,7 @@ def test_an_error_is_one_clear_line(arguments, line, tmp_path, monkeypatch, caps
     monkeypatch.setattr(sys, "argv", ["evaluate", f"hydra.run.dir={tmp_path}", *arguments])
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     with pytest.raises(SystemExit) as stopped:
-        main()
+        COMMANDS["evaluate"].run()
     assert stopped.value.code == 1 and capsys.readouterr().err.strip() == line
 
 
@@ -100,7 +101,7 @@ def test_the_traceback_comes_when_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate", f"hydra.run.dir={tmp_path}", "ckpt=none.ckpt"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(checkpoint.CheckpointError, match="no such checkpoint"):
-        main()
+        COMMANDS["evaluate"].run()
 
 
 def test_a_sweep_names_the_job_that_failed(tmp_path):

@@ -47,7 +47,7 @@ def test_what_is_said_stays_and_needs_no_words(campaign):
     given = dataclasses.replace(
         open_settings(),
         field=FieldSettings(init="uniform"),
-        emission=EmissionSettings(EncodingSettings("raw")),
+        emission=EmissionSettings(EncodingSettings("raw"), activation="sigmoid", init_bias=0.0),
     )
     choices, notes = resolve(given, False, campaign("spectrum").site)
     assert choices == Choices("uniform", "raw", "sigmoid", 0.0, False) and notes == ()

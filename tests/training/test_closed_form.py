@@ -13,7 +13,7 @@ from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
 from gsparc.training.closed_form import learn_prior, warm_start
 
-KERNEL = EmissionSettings(EncodingSettings("kernel"), hidden=0, activation="linear", log_distance=False)
+KERNEL = EmissionSettings(EncodingSettings("kernel"), activation="linear", init_bias=0.0)
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 ROWS = np.arange(40)
 
@@ -22,7 +22,7 @@ def started(data, emission=KERNEL, count: int = 150, on: bool = False) -> Gaussi
     torch.manual_seed(0)
     prior = learn_prior(data, ROWS, 1024, 0)
     settings = ModelSettings(
-        field=FieldSettings(count=count),
+        field=FieldSettings(count=count, init="sphere"),
         emission=emission,
         attenuation=AttenuationSettings(inverse_distance=on),
     )

@@ -24,7 +24,7 @@ def test_positions_that_do_not_learn():
 
 
 def test_warmup_rises_to_the_full_rate():
-    slow = OptimizerSettings(warmup=4)
+    slow = OptimizerSettings(warmup=4, decay=1.0)
     assert [rate_factor("emission", slow, k, 100) for k in range(5)] == [0.25, 0.5, 0.75, 1, 1]
 
 

@@ -15,13 +15,12 @@ from gsparc.evaluation.console import open_console
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.timing import ClockSettings, machine_facts, peak_memory
 from gsparc.ops.native import instruction_set
-from gsparc.studies import cli
 from gsparc.studies.bench import kernels, layers, steps
 from gsparc.studies.bench.case import Case
 from gsparc.studies.bench.claims import claims
 from gsparc.studies.bench.measure import Machine, Row, facts, measure
 from gsparc.studies.bench.report import claims_table, markdown, rows_table
-from gsparc.studies.bench.scene import DEFAULT, scene
+from gsparc.studies.bench.scene import NETWORK, scene
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +46,7 @@ def cases(config: DictConfig) -> Iterator[Case]:
             yield layers.channel(field, *layers.MANY, 1)
         for batch in config.batches:
             yield layers.emission(count, batch)
-            yield layers.emission(count, batch, DEFAULT)
+            yield layers.emission(count, batch, NETWORK)
             yield layers.emission_backward(count, batch)
     for batch in config.batches:
         yield layers.loss(batch)
@@ -93,12 +92,3 @@ def task(config: DictConfig) -> dict[str, Any]:
     console.print(rows_table(rows, f"{found['machine/cpu']}, {found['machine/instruction_set']}"))
     console.print(claims_table(promises, "Promises"))
     return found
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "bench")
-
-
-if __name__ == "__main__":
-    main()

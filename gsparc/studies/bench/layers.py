@@ -12,11 +12,11 @@ from gsparc.ops import mean_weights
 from gsparc.ops.channels import channels, summed
 from gsparc.ops.networks import networks, products
 from gsparc.studies.bench.case import Case, Work, size
-from gsparc.studies.bench.scene import DEFAULT, GRID, PAPER, Scene, places, receivers, scene
+from gsparc.studies.bench.scene import GRID, NETWORK, PAPER, Scene, places, receivers, scene
 
 TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
 MANY = (64, 26)  # antennas and subcarriers of the Argos release: 1,664 channels
-NAMES = {PAPER: "emission 3-16-2", DEFAULT: "emission, default network"}
+NAMES = {PAPER: "emission 3-16-2", NETWORK: "emission 63-32-2"}
 
 
 def emission(count: int, batch: int, settings: EmissionSettings = PAPER) -> Case:

@@ -12,7 +12,7 @@ from gsparc.data.schema import Site
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings, GaussianField
-from gsparc.field.model import GaussianModel, ModelSettings, RasterSettings
+from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, make_plan
 from gsparc.ops.settings import IMAGE_CUTOFF, Projection
 
@@ -20,8 +20,8 @@ ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
 GRID = SphereGrid.hemisphere()
 CHANNEL_GRID = SphereGrid.full_sphere(90, 180)
 CHANNEL_CUTOFF = Cutoff(1e-3, relative=True)
-PAPER = EmissionSettings(encoding=EncodingSettings(kind="raw"), hidden=16)
-DEFAULT = EmissionSettings()
+PAPER = EmissionSettings(EncodingSettings("raw"), 16, "sigmoid", log_distance=True, init_bias=0.0)
+NETWORK = EmissionSettings(EncodingSettings("fourier"), 32, "sigmoid", log_distance=True, init_bias=0.0)
 COMPLEX = 2  # real channels
 
 
@@ -70,6 +70,7 @@ def scene(
         settings = ModelSettings(
             FieldSettings(count=count, init="uniform", margin=0.0),
             emission,
+            AttenuationSettings(inverse_distance=True),
             raster=RasterSettings(projection, backend=backend),
         )
         model = ComplexSpectra(settings, _site())

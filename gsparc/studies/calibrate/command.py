@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.table import Table
 
 from gsparc.data.argos import published_figures, published_normalisation
@@ -33,10 +32,10 @@ from gsparc.methods.confidence_scores import (
 from gsparc.methods.method import Method
 from gsparc.methods.risk_threshold import Promise
 from gsparc.methods.timing import machine_facts
-from gsparc.studies import cli
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.studies.calibrate.pictures import draw
 from gsparc.studies.calibrate.trial import How, Trial, accept, divisible, trials
+from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
 
@@ -129,11 +128,10 @@ def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[st
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Gather, resample, write; returns the facts of `summary.json`."""
-    if config.threads is not None:
-        torch.set_num_threads(int(config.threads))
+    RunSettings.of(config)
     run_dir = Path(HydraConfig.get().runtime.output_dir)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    settings = plain(config)
     evidence, known = collect(paths, settings["dataset"], settings["split"])
     if config.confidence != "auto" and config.confidence not in evidence.scores:
         raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
@@ -222,12 +220,3 @@ def _broken(trial: Trial) -> str:
         return "-"
     low, high = trial.interval
     return f"{trial.broken:.1%}, {low:.0%} to {high:.0%}"
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "calibrate")
-
-
-if __name__ == "__main__":
-    main()

@@ -11,15 +11,13 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.console import one_line, open_console
 from gsparc.evaluation.summary import provenance, write_summary
-from gsparc.studies import cli
 from gsparc.studies.compare import figure, table
 from gsparc.studies.compare.cells import Budget, Cell, contenders, plan
 from gsparc.studies.compare.fitting import (
@@ -34,6 +32,7 @@ from gsparc.studies.compare.fitting import (
     remember,
 )
 from gsparc.studies.compare.latency import Latency, latencies
+from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
 
@@ -42,10 +41,9 @@ FREE_S = 5.0  # guessed for a method without a budget, until one was seen
 
 def task(config: DictConfig) -> list[table.Row]:
     """Fill the cells that are asked for and not there yet, time all methods, and report."""
-    if config.threads is not None:
-        torch.set_num_threads(int(config.threads))
+    RunSettings.of(config)
     run_dir = Path(HydraConfig.get().runtime.output_dir)
-    settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    settings = plain(config)
     methods = contenders(settings["methods"])
     kept = kept_in(settings["cells"], platform_cache())
     rooms = _rooms(settings, kept)
@@ -217,12 +215,3 @@ def report(
     console.print(Markdown(page))
     console.print(f"written to {run_dir}", highlight=False)
     return rows
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "compare")
-
-
-if __name__ == "__main__":
-    main()

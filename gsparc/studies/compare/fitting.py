@@ -5,10 +5,9 @@ from __future__ import annotations
 import json
 import logging
 import os
-import time
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,14 +18,17 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
+from gsparc.evaluation.baseline_cache import mean_seconds
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.scores import score
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitReport, Method
 from gsparc.methods.registry import build
 from gsparc.methods.timing import machine_facts
 from gsparc.studies.compare.cells import Cell, Contender, key
 from gsparc.studies.context import context_of
+from gsparc.studies.settings import plain
+from gsparc.studies.study.run import fit_and_score, in_folders
 
 log = logging.getLogger(__name__)
 
@@ -92,9 +94,9 @@ def remember(kept: Path, dataset: str, splits: Sequence[str]) -> list[Remembered
 def open_rooms(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Room]:
     """Load what `conf/dataset` names, with the given paths, once for all splits of `conf/split`."""
     configs = [compose(dataset, settings, split, []) for split in splits]
-    data = load(_plain(configs[0].dataset))
+    data = load(plain(configs[0].dataset))
     return [
-        Room(dataset, split, data, split_for(_plain(config.split), data))
+        Room(dataset, split, data, split_for(plain(config.split), data))
         for split, config in zip(splits, configs, strict=True)
     ]
 
@@ -177,9 +179,9 @@ def prepare(
 ) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
-    model = _plain(config.model)
-    trainer = {name: _plain(config[name]) for name in ("trainer", "callbacks", "budget_s")}
-    name = key(model, trainer, *room.hashes)
+    whole = plain(config)
+    trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
+    name = key(whole["model"], trainer, *room.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, config, folder, not contender.timed_only)
 
@@ -192,30 +194,26 @@ def fill(prepared: Prepared, room: Room) -> Filled:
         RuntimeError: training diverged.
     """
     config, folder = prepared.config, prepared.folder
-    methods, seconds, processor, notes = [], [], [], []
-    for number, fold in enumerate(room.folds.folds[: None if prepared.scored else 1]):
-        method = build(config.model)
-        context = context_of(config, folder / f"fold{number}")
-        before = time.process_time()
-        report = method.fit(room.data, fold, context)
-        processor.append(time.process_time() - before)
-        seconds.append(report.seconds)
-        notes += [note for note in report.notes if number == 0]
+    yaml = OmegaConf.to_yaml(config, resolve=True)
+
+    def keep(number: int, method: Method, report: FitReport) -> None:
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": room.folds.sha256}
-        yaml = OmegaConf.to_yaml(config, resolve=True)
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
-        methods.append(method)
-    started = time.perf_counter()
-    figures = score(methods, room.data, room.folds).figures() if prepared.scored else {}
-    facts: dict[str, Any] = {f"test/{name}": value for name, value in figures.items()}
+
+    folds = room.folds if prepared.scored else replace(room.folds, folds=room.folds.folds[:1])
+    found = fit_and_score(
+        lambda: build(config.model), room.data, folds, in_folders(context_of(config, folder)),
+        eval_on="test" if prepared.scored else None, keep=keep,
+    )  # fmt: skip
+    facts: dict[str, Any] = {f"test/{name}": value for name, value in found.figures.items()}
     facts |= {
-        "time/train_s": sum(seconds) / len(seconds),
-        "time/train_cpu_s": sum(processor) / len(processor),
-        "time/score_s": time.perf_counter() - started,
+        "time/train_s": mean_seconds(found.train_s),
+        "time/train_cpu_s": mean_seconds(found.train_cpu_s),
+        "time/score_s": found.score_s,
         "model/name": prepared.cell.method,
-        "model/num_gaussians": methods[0].size(),
-        "model/effects": methods[0].effects,
-        "model/notes": "; ".join(notes),
+        "model/num_gaussians": found.methods[0].size(),
+        "model/effects": found.methods[0].effects,
+        "model/notes": "; ".join(found.notes),
         "seed": prepared.cell.seed,
         "budget_s": prepared.cell.budget_s,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
@@ -228,7 +226,3 @@ def fill(prepared: Prepared, room: Room) -> Filled:
 def kept_in(folder: str | None, cache: Path) -> Path:
     """Where cells live: the folder asked for, else the platform's cache."""
     return Path(os.path.expanduser(folder)) if folder else cache / "comparison"
-
-
-def _plain(node: DictConfig) -> dict[str, Any]:
-    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]

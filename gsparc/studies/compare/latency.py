@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
@@ -12,8 +11,8 @@ from gsparc.methods import checkpoint
 from gsparc.methods.method import Method
 from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
 from gsparc.studies.compare.fitting import Filled, Room
+from gsparc.studies.study.run import queries
 
-QUERIES = 64  # different positions asked for
 SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
 ENDLESS_MS = 10_000.0  # from here on it is timed once
 FAST = ClockSettings(rounds=60, budget_s=30.0)
@@ -41,9 +40,8 @@ def latencies(filled: Sequence[Filled], room: Room) -> dict[str, Latency]:
     methods: dict[str, Method] = {}
     for one in filled:
         if one.cell.method not in methods:
-            methods[one.cell.method] = _loaded(one.checkpoint)
-    rows = room.folds.folds[0].test[:QUERIES]
-    calls = cycling(methods, [room.data.batch(rows[i : i + 1]) for i in range(len(rows))])
+            methods[one.cell.method] = checkpoint.load(one.checkpoint)[0]
+    calls = cycling(methods, queries(room.data, room.folds.folds[0].test))
     once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
     endless = {name for name in calls if once[name][0] > ENDLESS_MS}
     cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
@@ -55,10 +53,6 @@ def latencies(filled: Sequence[Filled], room: Room) -> dict[str, Latency]:
             timed = interleaved({**{n: calls[n] for n in calls if n in group}, COPY: reference_copy()}, clock)
             found |= _summaries(timed)
     return {name: found[name] for name in methods}
-
-
-def _loaded(path: Path) -> Method:
-    return checkpoint.load(path)[0]
 
 
 def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc.evaluation.console import open_console
@@ -21,7 +21,6 @@ from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.resource_grid import SUBCARRIERS_PER_BLOCK, centred
 from gsparc.methods.risk_threshold import Promise
 from gsparc.methods.timing import machine_facts
-from gsparc.studies import cli
 from gsparc.studies.calibrate.trial import accept
 from gsparc.studies.link.adaptation import Band
 from gsparc.studies.link.channels import Channels, channels
@@ -39,6 +38,7 @@ from gsparc.studies.link.study import (
     transmit,
 )
 from gsparc.studies.link.tables import tables
+from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
 
@@ -60,10 +60,10 @@ def band(found: Channels) -> Band:
 def task(config: DictConfig) -> dict[str, Any]:
     """All three experiments on one checkpoint; returns the facts of `summary.json`."""
     need_sionna()
-    torch.set_num_threads(int(config.threads))
+    RunSettings.of(config)
     torch.manual_seed(int(config.seed))
     run_dir = Path(HydraConfig.get().runtime.output_dir)
-    settings: dict[str, Any] = OmegaConf.to_container(config, resolve=True)  # type: ignore[assignment]
+    settings = plain(config)
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     if data.site.kind != "csi" or data.site.subcarriers_hz is None:
@@ -168,12 +168,3 @@ def task(config: DictConfig) -> dict[str, Any]:
         console.print(table)
     console.print(f"written to {run_dir}", highlight=False)
     return facts
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "link")
-
-
-if __name__ == "__main__":
-    main()

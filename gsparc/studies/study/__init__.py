@@ -1,1 +1,1 @@
-"""study"""
+"""Variants of one model and baselines under the same data, splits and clock."""

@@ -1,19 +1,108 @@
-"""`gsparc study kind=effects|positions ...`: variants of one model on the same data."""
+"""`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
+
+Leaves `study.csv`, `study.png` and `summary.json`, whose `study/<variant>[/<what>/<amount>]/*` hold the
+accuracy under its own name, seconds of training, milliseconds of a query and their ratios to `base`.
+"""
 
 from __future__ import annotations
 
-import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
 
-from gsparc.studies.study import prices, sensitivity
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
 
-KINDS = {"effects": prices.main, "positions": sensitivity.main}
+from gsparc.data.load import load, split_for
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.summary import circumstances, provenance, write_samples, write_summary
+from gsparc.methods.method import Method
+from gsparc.methods.registry import build, method_class
+from gsparc.methods.timing import ClockSettings, machine_facts
+from gsparc.studies.context import context_of
+from gsparc.studies.settings import RunSettings, plain
+from gsparc.studies.study.figure import draw
+from gsparc.studies.study.study import Row, Study, Variant
 
 
-def main() -> None:
-    """Entry point."""
-    kind = next((word.removeprefix("kind=") for word in sys.argv if word.startswith("kind=")), "effects")
-    sys.argv = [word for word in sys.argv if not word.startswith("kind=")]
-    if kind not in KINDS:
-        sys.stderr.write(f"error: kind={kind}: choose {' or '.join(KINDS)}\n")
-        sys.exit(1)
-    KINDS[kind]()
+def variants_of(config: DictConfig) -> list[Variant]:
+    """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
+
+    def maker(overrides: Any) -> Callable[[], Method]:
+        return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+
+    found = [Variant(str(name), maker(overrides)) for name, overrides in config.variants.items()]
+    return found + [Variant(name, method_class(name)) for name in config.baselines]
+
+
+def study_of(config: DictConfig) -> Study:
+    """The study that a composed configuration describes."""
+    return Study(
+        variants_of(config),
+        instantiate(config.kind).conditions(),
+        config.base,
+        int(config.rounds),
+        int(config.seed),
+        ClockSettings(rounds=int(config.queries), budget_s=float(config.query_s)),
+    )
+
+
+def task(config: DictConfig) -> list[Row]:
+    """Run the study, show its table, write its files."""
+    settings = RunSettings.of(config)
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    study = study_of(config)
+    data = load(plain(config.dataset))
+    split = split_for(plain(config.split), data)
+    rows = study.run(data, split, context_of(config, run_dir))
+    facts: dict[str, Any] = {
+        **dataset_facts(data), **split_facts(split), **machine_facts(), **provenance(),
+        "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,
+    }  # fmt: skip
+    for row in rows:
+        facts |= row.facts()
+    title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
+    write_samples(run_dir / "study.csv", _columns(rows))
+    draw(rows, title, run_dir / "study.png")
+    write_summary(run_dir / "summary.json", facts)
+    console = open_console()
+    console.print(table(rows, title))
+    for remark in circumstances(facts):
+        console.print(remark, highlight=False)
+    ratios = "" if study.base is None else f"ratios to {study.base!r}; "
+    console.print(f"{ratios}written to {run_dir}", highlight=False)
+    return rows
+
+
+def _columns(rows: Sequence[Row]) -> Mapping[str, list[Any]]:
+    """Columns of `study.csv`; what there is none of is an empty cell."""
+    cells = [{k: "" if v is None else v for k, v in asdict(row).items()} for row in rows]
+    return {column.name: [row[column.name] for row in cells] for column in fields(Row)}
+
+
+def table(rows: Sequence[Row], title: str) -> Table:
+    """A line per row; columns that say nothing in this study are left out."""
+    first = rows[0]
+    changed = any(row.what != "none" for row in rows)
+    compared = any(row.train_ratio is not None for row in rows)
+    found = Table(title=title)
+    words = ["variant", "effects", *(["changed"] if changed else [])]
+    for column in words:
+        found.add_column(column)
+    ratio = ["ratio"] if compared else []
+    for column in ("rows", first.figure, "train s", *ratio, "cpu s", "query ms", "p95", *ratio):
+        found.add_column(column, justify="right")
+    for row in rows:
+        change = row.what if row.what == "none" else f"{row.what} {row.amount:g}"
+        value = f"{row.value:.4g}" + ("" if row.spread is None else f" ± {row.spread:.2g}")
+        train, query = ([row.train_ratio], [row.query_ratio]) if compared else ([], [])
+        numbers = (row.train_s, *train, row.train_cpu_s, row.query_ms, row.query_p95_ms, *query)
+        found.add_row(
+            row.variant, row.effects, *([change] if changed else []), f"{row.rows:g}", value,
+            *("-" if number is None else f"{number:.3g}" for number in numbers),
+        )  # fmt: skip
+    return found

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.table import Table
 
 from gsparc.data.files import platform_cache
@@ -31,7 +31,7 @@ from gsparc.methods.pareto import Point, cost_of_halving, front
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import combinations, contributions, reduced
 from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
-from gsparc.studies import cli
+from gsparc.studies.settings import plain
 from gsparc.studies.tradeoff.picture import Rival, beaten_by, draw
 from gsparc.studies.tradeoff.sweep import candidate, sweep
 
@@ -41,12 +41,12 @@ log = logging.getLogger(__name__)
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
     run_dir = Path(HydraConfig.get().runtime.output_dir)
-    run = open_files([config.ckpt], _plain(config.dataset), _plain(config.split))
+    run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
     rows = rows_of(fold, config.eval_on)
     learned = np.sort(np.concatenate([fold.train, fold.val]))
     measured = contributions(method, data, learned)
-    settings = list(combinations(method, _plain(config.grid), _plain(config.singles)))
+    settings = list(combinations(method, plain(config.grid), plain(config.singles)))
     threads = _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
@@ -198,16 +198,3 @@ def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run
             highlight=False,
         )
     console.print(f"written to {run_dir}", highlight=False)
-
-
-def _plain(node: DictConfig) -> dict[str, Any]:
-    return OmegaConf.to_container(node, resolve=True)  # type: ignore[return-value]
-
-
-def main() -> None:
-    """Entry point."""
-    cli.run(task, "tradeoff")
-
-
-if __name__ == "__main__":
-    main()

@@ -14,7 +14,10 @@ from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import html, studies, warnings
 from gsparc.evaluation.report.readme import BEGIN, END, refresh
 from gsparc.evaluation.report.runs import find_runs
-from gsparc.studies.report import arguments, task
+from gsparc.studies.commands import COMMANDS
+from gsparc.studies.report import task
+
+arguments = COMMANDS["report"].arguments
 
 FETCHED = re.compile(
     r"""(?:src|href)\s*=\s*["'](?!data:|#)|@import|url\((?!#|["']?data:)|<link|<script[^>]+src"""

@@ -30,8 +30,10 @@ from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
-from gsparc.studies.evaluate import main as evaluate
+from gsparc.studies.commands import COMMANDS
 from gsparc.studies.train import main as train
+
+evaluate = COMMANDS["evaluate"].run
 
 MARK = "owned"
 

@@ -1,7 +1,6 @@
 """Configurations with a slip of the finger at any depth: the nearest right name, before anything is computed.
 
-Remedy: gsparc/studies/limits.py (what each setting may be), gsparc/studies/cli.py (one line, the nearest
-name).
+Remedy: gsparc/data/limits.py (what a setting may be), gsparc/studies/cli.py (one line, the nearest name).
 """
 
 from __future__ import annotations
@@ -10,8 +9,10 @@ import pytest
 from campaigns import spectra
 from doors import assert_refused, knock
 
-from gsparc.studies.evaluate import main as evaluate
+from gsparc.studies.commands import COMMANDS
 from gsparc.studies.train import main as train
+
+evaluate = COMMANDS["evaluate"].run
 
 SLIPS = {
     "modle=gsparc": "did you mean 'model'",
@@ -23,11 +24,11 @@ SLIPS = {
     "experiment=paperrfid": "did you mean 'paper/rfid'",
     "experiment=demoo": "did you mean 'demo'",
     "paper=gsprc": "did you mean 'gsparc'",
-    "trainer=defalt": "did you mean 'default'",
+    "trainer=debg": "did you mean 'debug'",
     "callbacks=densfy": "did you mean 'densify'",
     "logger=wandbb": "did you mean 'wandb'",
     "trainer.max_step=3": "did you mean 'trainer.max_steps'",
-    "trainer.batchsize=3": "did you mean 'dataset.batch_size'",
+    "dataset.batchsize=3": "did you mean 'dataset.batch_size'",
     "model.field.cout=4": "did you mean 'model.field.count'",
     "model.feild.count=4": "did you mean 'model.field'",
     "model.emission.encoding.octavs=3": "did you mean 'model.emission.encoding.octaves'",

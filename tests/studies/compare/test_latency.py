@@ -18,7 +18,7 @@ WAITS = {"quick": 0.0, "slow": 0.2, "endless": 0.7}  # [s]
 
 
 class Waiting:
-    """Reads whole batches, as methods that hear an uplink do: they refuse to be asked for positions alone."""
+    """Reads whole batches, as methods that need an uplink do: positions alone are not enough."""
 
     def __init__(self, name: str, watch: WoundClock) -> None:
         self.name, self.watch, self.asked = name, watch, []
@@ -34,7 +34,9 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     watch = WoundClock()
     monkeypatch.setattr(timing.time, "perf_counter", watch)
     monkeypatch.setattr(
-        latency, "_loaded", lambda path: made.setdefault(path.parent.name, Waiting(path.parent.name, watch))
+        latency.checkpoint,
+        "load",
+        lambda path: (made.setdefault(path.parent.name, Waiting(path.parent.name, watch)), None),
     )
     monkeypatch.setattr(latency, "SLOW_MS", 150.0)
     monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)

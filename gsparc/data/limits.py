@@ -1,0 +1,102 @@
+"""What a setting may be, said where the setting is defined and checked when it is given.
+
+A dataclass of settings inherits `Checked` and gives limits beside defaults, such as
+`count: int = setting(500, whole(0))`; a constructor calls `check_arguments`. The error names the setting; the
+command line puts the group it stands in before that (`gsparc.evaluation.console.one_line`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+
+class SettingError(ValueError):
+    """A setting that cannot be; the text begins with its name, an equals sign and the value."""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What a setting may be.
+
+    Attributes:
+        words: the same for people.
+        holds: whether a value is one.
+        known: choices, for suggesting the nearest.
+    """
+
+    words: str
+    holds: Callable[[Any], bool]
+    known: tuple[str, ...] = ()
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise `SettingError` unless `value` is allowed for the setting called `name`."""
+        if self.holds(value):
+            return
+        near = difflib.get_close_matches(value, self.known, 1, 0.5) if isinstance(value, str) else []
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise SettingError(f"{name}={value!r}: {self.words} is needed{hint}")
+
+
+def whole(least: int, most: int | None = None) -> Limit:
+    """A whole number from `least`."""
+    words = f"a whole number of at least {least}" + ("" if most is None else f" and at most {most}")
+    return Limit(words, lambda v: type(v) is int and v >= least and (most is None or v <= most))
+
+
+def number(low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False) -> Limit:
+    """A finite number between `low` and `high`."""
+    words = f"a number {'above' if open_low else 'of at least'} {low:g}"
+    words += "" if high == math.inf else f" and {'below' if open_high else 'at most'} {high:g}"
+    return Limit(
+        words,
+        lambda v: _real(v) and (v > low if open_low else v >= low) and (v < high if open_high else v <= high),
+    )
+
+
+def choice(*values: str) -> Limit:
+    """One of a few words."""
+    return Limit(f"one of {', '.join(values)}", lambda v: v in values, values)
+
+
+def switch(*more: str) -> Limit:
+    """True, false, or one of a few words."""
+    words = ("true", "false", *more)
+    return Limit(f"one of {', '.join(words)}", lambda v: isinstance(v, bool) or v in more, words)
+
+
+def or_null(limit: Limit) -> Limit:
+    """The same, or nothing."""
+    return Limit(f"{limit.words}, or null", lambda v: v is None or limit.holds(v), limit.known)
+
+
+POSITIVE = number(0, open_low=True)
+SHARE = number(0, 1, open_low=True, open_high=True)
+
+
+def _real(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def setting(default: Any, limit: Limit) -> Any:
+    """A field of a `Checked` dataclass."""
+    return dataclasses.field(default=default, metadata={"limit": limit})
+
+
+class Checked:
+    """A dataclass that refuses, with `SettingError`, what its fields' limits do not allow."""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            if "limit" in field.metadata:
+                field.metadata["limit"].check(field.name, getattr(self, field.name))
+
+
+def check_arguments(given: dict[str, Any], **limits: Limit) -> None:
+    """Check arguments of a constructor by name; call it with `locals()`."""
+    for name, limit in limits.items():
+        limit.check(name, given[name])

@@ -1,0 +1,78 @@
+"""Settings that every command has."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.instantiate import suggest
+from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
+from gsparc.methods.registry import METHODS, build
+
+
+@dataclass(frozen=True)
+class RunSettings(Checked):
+    """Settings of a run as a whole; a command has those of them that its configuration names.
+
+    Attributes:
+        seed: of whatever is random.
+        threads: CPU threads; None takes what torch finds.
+        eval_on: rows that are scored.
+        baselines: names of methods.
+    """
+
+    seed: int = setting(0, whole(0, 2**32 - 1))
+    threads: int | None = setting(None, or_null(whole(1)))
+    eval_on: str = setting("test", choice("train", "val", "test"))
+    baselines: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, config: DictConfig) -> RunSettings:
+        """Check what can be checked before anything is read, and set the number of threads.
+
+        Raises:
+            ValueError: a setting that cannot be, named as it is in the configuration.
+        """
+        given = OmegaConf.to_container(config, resolve=True)
+        assert isinstance(given, dict)
+        known: dict[str, Any] = {f.name: given[f.name] for f in fields(cls) if f.name in given}
+        found = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
+        clip = (given.get("trainer") or {}).get("gradient_clip_val")
+        or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
+        if "model" in config:
+            build(config.model)  # its parts check themselves, and so do callbacks
+        for node in (config.get("callbacks") or {}).values():
+            instantiate(node)
+        for key, value in _leaves(given):
+            if isinstance(value, float):
+                Limit("a finite number", math.isfinite).check(key, value)
+        if found.threads is not None:
+            torch.set_num_threads(found.threads)
+        return found
+
+
+def _methods(names: Any) -> tuple[str, ...]:
+    if isinstance(names, list) and all(name in METHODS for name in names):
+        return tuple(names)
+    wrong = next((b for b in names if b not in METHODS), names) if isinstance(names, list) else names
+    hint = suggest(str(wrong), METHODS)
+    raise SettingError(f"baselines={names}: a list of methods is needed, {wrong!r} is none{hint}")
+
+
+def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    if not isinstance(node, Mapping):
+        yield prefix, node
+        return
+    for key, value in node.items():
+        yield from _leaves(value, f"{prefix}.{key}" if prefix else str(key))
+
+
+def plain(node: DictConfig) -> dict[str, Any]:
+    """A group of settings as plain containers; a setting that is still missing is an error."""
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]

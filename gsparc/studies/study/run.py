@@ -1,0 +1,102 @@
+"""Fit a method on every fold of a split, score it, time it: one row of a study, a comparison or a run."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsparc.data.schema import Batch, Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.scores import score
+from gsparc.methods.method import FitContext, FitReport, Method
+from gsparc.methods.timing import ClockSettings, cycling, interleaved
+
+QUERIES = 64  # different positions asked for
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A method after it was fitted on every fold.
+
+    Attributes:
+        methods: one per fold.
+        train_s: seconds of each fit [s], without validation.
+        train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not inflate them.
+        figures: accuracies pooled over folds, as in `Scores.figures`; empty when it was not scored.
+        score_s: seconds that scoring took [s].
+        notes: what the first fold's fit said.
+    """
+
+    methods: tuple[Method, ...]
+    train_s: tuple[float, ...]
+    train_cpu_s: tuple[float, ...]
+    figures: dict[str, float | None]
+    score_s: float
+    notes: tuple[str, ...]
+
+    def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
+        """The same fits scored on other data, such as displaced queries."""
+        started = time.perf_counter()
+        figures = score(self.methods, data, split, eval_on).figures()
+        return replace(self, figures=figures, score_s=time.perf_counter() - started)
+
+
+def in_folders(context: FitContext) -> Callable[[int], FitContext]:
+    """The context of each fold, which differs in its folder."""
+    return lambda number: replace(context, run_dir=context.run_dir / f"fold{number}")
+
+
+def fit_and_score(
+    make: Callable[[], Method],
+    data: Measurements,
+    split: Split,
+    context: Callable[[int], FitContext],
+    *,
+    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
+    eval_on: str | None = "test",
+    keep: Callable[[int, Method, FitReport], None] | None = None,
+) -> Outcome:
+    """Fit an unfitted method per fold, then score them together.
+
+    Args:
+        make: an unfitted method.
+        data, split: learned from `train` and `val` of each fold.
+        context: of each fold's fit, by its number.
+        learned: what is learned from instead, such as displaced or fewer measurements.
+        eval_on: `train`, `val` or `test` rows that are scored; None scores nothing.
+        keep: called after each fit with the fold's number, the method and its report.
+
+    Raises:
+        ValueError: the method does not serve these data.
+        RuntimeError: training diverged.
+    """
+    methods, seconds, processor, notes = [], [], [], []
+    for number, fold in enumerate(split.folds):
+        there, rows = (data, fold) if learned is None else learned(data, fold)
+        method, settings = make(), context(number)
+        before = time.process_time()
+        report = method.fit(there, rows, settings)
+        processor.append(time.process_time() - before)
+        seconds.append(report.seconds)
+        notes += [note for note in report.notes if number == 0]
+        methods.append(method)
+        if keep is not None:
+            keep(number, method, report)
+    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes))
+    return found if eval_on is None else found.scored_on(data, split, eval_on)
+
+
+def queries(data: Measurements, rows: np.ndarray) -> list[Batch]:
+    """Single queries at the first rows (n,)."""
+    return [data.batch(rows[i : i + 1]) for i in range(min(len(rows), QUERIES))]
+
+
+def query_ms(
+    methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings
+) -> dict[str, tuple[float, float]]:
+    """Median and 95th percentile of warm single queries, all methods in turns [ms]."""
+    times = interleaved(cycling(methods, queries(data, rows)), clock)
+    return {name: (float(np.median(ms)), float(np.quantile(ms, 0.95))) for name, ms in times.items()}
