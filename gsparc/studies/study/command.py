@@ -19,7 +19,7 @@ from rich.table import Table
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.summary import circumstances, provenance, write_samples, write_summary
+from gsparc.evaluation.summary import provenance, run_conditions, write_samples, write_summary
 from gsparc.methods.method import Method
 from gsparc.methods.registry import build, method_class
 from gsparc.methods.timing import ClockSettings, machine_facts
@@ -71,7 +71,7 @@ def task(config: DictConfig) -> list[Row]:
     write_summary(run_dir / "summary.json", facts)
     console = open_console()
     console.print(table(rows, title))
-    for remark in circumstances(facts):
+    for remark in run_conditions(facts):
         console.print(remark, highlight=False)
     ratios = "" if study.base is None else f"ratios to {study.base!r}; "
     console.print(f"{ratios}written to {run_dir}", highlight=False)
