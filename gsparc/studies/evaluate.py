@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gsparc.data.files import platform_cache
@@ -17,6 +16,7 @@ from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
+from gsparc.studies.output import run_directory
 from gsparc.studies.settings import RunSettings, plain
 
 
@@ -52,7 +52,7 @@ def evaluate_files(
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
     RunSettings.of(config)
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     found, data, split = evaluate_files(
         paths,

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gsparc.evaluation.console import open_console
@@ -18,6 +17,7 @@ from gsparc.evaluation.report.readme import refresh
 from gsparc.evaluation.report.runs import columns, find_runs
 from gsparc.evaluation.report.timing import retime
 from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.studies.output import run_directory
 
 log = logging.getLogger(__name__)
 
@@ -28,7 +28,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     runs = find_runs(paths)
     if config.retime:
         runs = retime(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
-    out = Path(HydraConfig.get().runtime.output_dir)
+    out = run_directory()
     shown = studies(runs, _fronts(paths))
     origin = provenance()
     made = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by gsparc at commit {str(origin['git'])[:8]}"

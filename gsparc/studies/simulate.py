@@ -8,7 +8,6 @@ import time
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
@@ -24,6 +23,7 @@ from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
+from gsparc.studies.output import run_directory
 from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
@@ -59,7 +59,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 def task(config: DictConfig) -> Outcome:
     """Simulate, then table, summary and pictures."""
     RunSettings.of(config)
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
     outcome = simulate(campaign(config), out)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import gc
 import logging
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from gsparc.evaluation.console import open_console
@@ -21,6 +19,7 @@ from gsparc.studies.bench.claims import claims
 from gsparc.studies.bench.measure import Machine, Row, facts, measure
 from gsparc.studies.bench.report import claims_table, markdown, rows_table
 from gsparc.studies.bench.scene import NETWORK, scene
+from gsparc.studies.output import run_directory
 
 log = logging.getLogger(__name__)
 
@@ -86,7 +85,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         stem = f"claim/{claim.name}/{where}".replace(",", "").replace(" ", "_")
         found |= {f"{stem}/ratio": claim.ratio, f"{stem}/promised": claim.bound, f"{stem}/met": claim.met}
     found["machine/load_before"] = before
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     write_summary(run_dir / "summary.json", found)
     (run_dir / "bench.md").write_text(markdown(found, rows, promises), encoding="utf-8")
     console.print(rows_table(rows, f"{found['machine/cpu']}, {found['machine/instruction_set']}"))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.table import Table
 
@@ -35,6 +33,7 @@ from gsparc.methods.timing import machine_facts
 from gsparc.studies.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.studies.calibrate.pictures import draw
 from gsparc.studies.calibrate.trial import How, Trial, accept, divisible, trials
+from gsparc.studies.output import run_directory, shown, table
 from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
@@ -66,11 +65,11 @@ def store(path: str, dataset: dict[str, Any], split: dict[str, Any], how: Settle
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     evidence = gather(method, data, fold, rows_of(fold, "test"))
     used, found, _, _ = accept(evidence, how.promise, how.kind, how.spatial, how.seed)
-    told = Trusted(
+    stored = Trusted(
         used, threshold_of(used, found), how.promise, known_positions(data, fold), position_kernel(data, fold)
     )
-    keep(path, told)
-    return told
+    keep(path, stored)
+    return stored
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[st
 def task(config: DictConfig) -> dict[str, Any]:
     """Gather, resample, write; returns the facts of `summary.json`."""
     RunSettings.of(config)
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     settings = plain(config)
     evidence, known = collect(paths, settings["dataset"], settings["split"])
@@ -139,80 +138,52 @@ def task(config: DictConfig) -> dict[str, Any]:
     if not divisible(evidence, "spatial"):
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
     ways: tuple[How, ...] = ("random", "spatial") if divisible(evidence, "spatial") else ("random",)
-    found = [
-        trials(
-            evidence,
-            promise,
-            how,
-            int(config.draws),
-            config.confidence,
-            float(config.apart_m),
-            int(config.seed),
-        )
-        for how in ways
-    ]
-    facts = {
-        **known,
-        **figures(evidence, found, promise),
-        **machine_facts(),
-        **provenance(),
-        "seed": config.seed,
-    }
+    draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
+    found = [trials(evidence, promise, how, *draws) for how in ways]
+    facts = known | figures(evidence, found, promise) | machine_facts() | provenance()
+    facts["seed"] = config.seed
     write_summary(run_dir / "summary.json", facts)
     draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
     console = open_console()
-    for table in tables(facts, evidence, found):
-        console.print(table)
+    for one in tables(facts, evidence, found):
+        console.print(one)
     if config.store:
         how = Settled(promise, config.confidence, bool(config.spatial), int(config.seed))
         for path in paths:
-            told = store(path, settings["dataset"], settings["split"], how)
-            speaks = bool(np.isfinite(told.threshold))
-            facts["stored/kind"], facts["stored/threshold"] = told.kind, told.threshold if speaks else None
-            since = (
-                f"accepted from {told.threshold:.4g}" if speaks else "nothing can be promised: none accepted"
-            )
-            console.print(f"{path}: confidence={told.kind}, {since}", highlight=False)
+            stored = store(path, settings["dataset"], settings["split"], how)
+            threshold = stored.threshold if np.isfinite(stored.threshold) else None
+            facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
+            bound = "no threshold keeps the bound" if threshold is None else f"accepted from {threshold:.4g}"
+            console.print(f"{path}: confidence={stored.kind}, {bound}", highlight=False)
         write_summary(run_dir / "summary.json", facts)
     console.print(f"written to {run_dir}", highlight=False)
     return facts
 
 
 def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> list[Table]:
-    """Confidences side by side; promises beside what came of them."""
-    first = Table(title=f"{facts['dataset/name']}: {len(evidence)} positions of {facts['model/name']}")
-    for column in ("confidence", "area under risk-coverage", "below distance", "risk at 70 %", "rank"):
-        first.add_column(column, justify="left" if column == "confidence" else "right")
-    for kind in evidence.scores:
-        own = {k.rpartition("/")[2]: v for k, v in facts.items() if k.startswith(f"confidence/{kind}/")}
-        rank = "-" if own["rank_correlation"] is None else f"{own['rank_correlation']:.2f}"
-        below = "-" if own["area_below_distance"] is None else f"{own['area_below_distance']:.0%}"
-        first.add_row(kind, f"{own['area']:.4g}", below, f"{own['risk_at_70']:.4g}", rank)
-    second = Table(title=f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB")
-    for column in (
-        "split",
-        "confidence",
-        "accepted",
-        "bad among them",
-        "broken",
-        "of all draws",
-        "promised",
-        "accepted nobody",
-    ):
-        second.add_column(column, justify="left" if column in ("split", "confidence") else "right")
-    for trial in found:
-        bad = "-" if trial.mean_realised is None else f"{trial.mean_realised:.1%}"
-        second.add_row(
-            trial.how,
-            trial.kind,
-            f"{trial.coverage.mean():.0%}",
-            bad,
-            _broken(trial),
-            f"{trial.broken_of_all:.1%}",
-            f"{trial.delta:.0%}",
-            f"{trial.silent:.0%}",
-        )
-    return [first, second]
+    """Confidences side by side; bounds beside what came of them."""
+    wanted = {
+        "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
+        "risk at 70 %": ("risk_at_70", ".4g"), "rank": ("rank_correlation", ".2f"),
+    }  # fmt: skip
+    curves = [
+        [kind, *(shown(facts[f"confidence/{kind}/{key}"], form) for key, form in wanted.values())]
+        for kind in evidence.scores
+    ]
+    draws = [
+        [
+            trial.how, trial.kind, f"{trial.coverage.mean():.0%}", shown(trial.mean_realised, ".1%"),
+            _broken(trial), f"{trial.broken_of_all:.1%}", f"{trial.delta:.0%}", f"{trial.silent:.0%}",
+        ]
+        for trial in found
+    ]  # fmt: skip
+    numbers = ["accepted", "bad among them", "broken", "of all draws", "promised", "accepted nobody"]
+    heading = f"{facts['dataset/name']}: {len(evidence)} positions of {facts['model/name']}"
+    promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
+    return [
+        table(heading, ["confidence"], list(wanted), curves),
+        table(promise, ["split", "confidence"], numbers, draws),
+    ]
 
 
 def _broken(trial: Trial) -> str:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from gsparc.methods.confidence_scores import Evidence
 from gsparc.studies.calibrate.curves import bounded, risk_coverage
 from gsparc.studies.calibrate.trial import Trial
+from gsparc.studies.output import panels, save
 
 NAMES = {
     "learned": "learned",
@@ -22,9 +21,8 @@ NAMES = {
 
 def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> None:
     """Save both halves of the story as one PNG."""
-    figure = Figure(figsize=(11, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
+    figure, grid = panels(11, 4.2, 1, 2)
+    left, right = grid[0]
     loss = bounded(evidence.error)
     for kind, score in evidence.scores.items():
         curve = risk_coverage(score, loss)
@@ -53,4 +51,4 @@ def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> Non
     right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
     right.legend(fontsize=8)
     right.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save(figure, path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -142,13 +141,20 @@ def accept(
     Raises:
         ValueError: `kind` is no confidence of this evidence.
     """
-    rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
+    return _draw(evidence, promise, kind, "spatial" if spatial else "random", np.random.default_rng(seed))
+
+
+def _draw(
+    evidence: Evidence, promise: Promise, kind: str, how: How, rng: np.random.Generator, apart_m: float = 0.0
+) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
+    """One division: confidence, threshold, and positions to test on and set aside."""
+    choose_on, calibrate, test = divided(evidence, how, rng)
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], promise.bad(evidence.error)
-    patch = cells(evidence.position)[calibrate] if spatial else None
+    calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
+    patch = cells(evidence.position)[calibrate] if how == "spatial" else None
     found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
     return used, found, test, choose_on
 
@@ -174,20 +180,13 @@ def trials(
         seed: of the draws.
     """
     realised, coverage, kinds = [], [], []
-    for rng in _generators(seed, draws):
-        choose_on, calibrate, test = divided(evidence, how, rng)
-        used = best_kind(evidence, choose_on) if kind == "auto" else kind
-        score, bad = evidence.scores[used], promise.bad(evidence.error)
-        calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
-        patch = cells(evidence.position)[calibrate] if how == "spatial" else None
-        found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
-        taken = test[score[test] >= found.value]
+    bad = promise.bad(evidence.error)
+    for draw in range(draws):
+        rng = np.random.default_rng([seed, draw])
+        used, found, test, _ = _draw(evidence, promise, kind, how, rng, apart_m)
+        taken = test[evidence.scores[used][test] >= found.value]
         kinds.append(used)
         realised.append(bad[taken].mean() if len(taken) else np.nan)
         coverage.append(len(taken) / max(len(test), 1))
     most = max(set(kinds), key=kinds.count)
     return Trial(most, how, np.array(realised), np.array(coverage), promise.alpha, promise.delta)
-
-
-def _generators(seed: int, draws: int) -> Iterator[np.random.Generator]:
-    return (np.random.default_rng([seed, draw]) for draw in range(draws))

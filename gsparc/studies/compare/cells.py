@@ -111,15 +111,15 @@ class Budget:
 
 
 def plan(
-    rooms: Sequence[tuple[str, str, str]],
+    problems: Sequence[tuple[str, str, str]],
     methods: Mapping[str, Contender],
     budgets: Sequence[Budget],
     only: Sequence[str] = (),
 ) -> list[Cell]:
-    """All cells, the most useful first: every room's table before further seeds and longer budgets.
+    """All cells, the most useful first: every problem's table before further seeds and longer budgets.
 
     Args:
-        rooms: (dataset, split, kind of data), the most wanted first.
+        problems: (dataset, split, kind of data), the most wanted first.
         methods: who takes part.
         budgets: the most wanted first.
         only: patterns of `str(cell)`; empty for all.
@@ -127,18 +127,20 @@ def plan(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    able = {(d, s): [m for m in methods.values() if m.serves(kind)] for d, s, kind in rooms}
-    cells = [Cell(*room, m.name, None, None) for room, those in able.items() for m in those if not m.budget]
+    able = {(d, s): [m for m in methods.values() if m.serves(kind)] for d, s, kind in problems}
+    cells = [
+        Cell(*problem, m.name, None, None) for problem, those in able.items() for m in those if not m.budget
+    ]
     longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
     for turn in range(turns):  # first seeds of all budgets before second ones
         for budget in (b for b in budgets if turn < len(b.seeds)):
-            for room, those in able.items():
+            for problem, those in able.items():
                 cells += [
-                    Cell(*room, m.name, budget.seconds, budget.seeds[turn])
+                    Cell(*problem, m.name, budget.seconds, budget.seeds[turn])
                     for m in those
                     if m.budget
-                    and budget.given(room[1])
+                    and budget.given(problem[1])
                     and not (m.only_longest and (turn > 0 or budget.seconds < longest))
                 ]
     for pattern in only:

@@ -11,7 +11,6 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
@@ -23,15 +22,15 @@ from gsparc.studies.compare.cells import Budget, Cell, contenders, plan
 from gsparc.studies.compare.fitting import (
     Filled,
     Prepared,
-    Remembered,
-    Room,
+    Problem,
     fill,
     kept_in,
-    open_rooms,
+    load_problems,
     prepare,
-    remember,
+    stored_problems,
 )
 from gsparc.studies.compare.latency import Latency, latencies
+from gsparc.studies.output import run_directory
 from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
@@ -42,17 +41,17 @@ FREE_S = 5.0  # guessed for a method without a budget, until one was seen
 def task(config: DictConfig) -> list[table.Row]:
     """Fill the cells that are asked for and not there yet, time all methods, and report."""
     RunSettings.of(config)
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     settings = plain(config)
     methods = contenders(settings["methods"])
     kept = kept_in(settings["cells"], platform_cache())
-    rooms = _rooms(settings, kept)
+    problems = _problems(settings, kept)
     budgets = [
         Budget(float(b["seconds"]), tuple(int(s) for s in b["seeds"]), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
-    wanted = plan([(r.dataset, r.split, r.kind) for r in rooms], methods, budgets, settings["only"])
-    by_name = {(r.dataset, r.split): r for r in rooms}
+    wanted = plan([(r.dataset, r.split, r.kind) for r in problems], methods, budgets, settings["only"])
+    by_name = {(r.dataset, r.split): r for r in problems}
     prepared = [
         prepare(c, methods[c.method], settings["datasets"][c.dataset], by_name[c.dataset, c.split], kept)
         for c in wanted
@@ -65,34 +64,34 @@ def task(config: DictConfig) -> list[table.Row]:
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 
-def _rooms(settings: Mapping[str, Any], kept: Path) -> list[Room | Remembered]:
-    """Every dataset under every split, splits outermost: the best-known rooms come first.
+def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
+    """Every dataset under every split, splits outermost: the best-known come first.
 
     Without its path a dataset is there as far as results were kept, for the table alone.
     """
     wanted = [str(pattern) for pattern in settings["only"]]
-    rooms: list[Room | Remembered] = []
+    problems: list[Problem] = []
     for name, paths in settings["datasets"].items():
         splits = [s for s in settings["splits"] if not wanted or any(_may_match(p, name, s) for p in wanted)]
         if any((paths or {}).values()):
-            rooms += open_rooms(name, paths, splits) if splits else []
+            problems += load_problems(name, paths, splits) if splits else []
             continue
-        remembered = remember(kept, name, splits)
-        rooms += remembered
+        stored = stored_problems(kept, name, splits)
+        problems += stored
         log.warning(
             "%s %s: say datasets.%s.root=DIR or .file=FILE",
-            name, "is here as far as results were kept" if remembered else "is left out", name,
+            name, "is here as far as results were kept" if stored else "is left out", name,
         )  # fmt: skip
-    rooms.sort(key=lambda room: settings["splits"].index(room.split))
-    if not rooms and not any(any((paths or {}).values()) for paths in settings["datasets"].values()):
+    problems.sort(key=lambda problem: settings["splits"].index(problem.split))
+    if not problems and not any(any((paths or {}).values()) for paths in settings["datasets"].values()):
         raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
-    if not rooms:
+    if not problems:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
-    return rooms
+    return problems
 
 
 def _may_match(pattern: str, dataset: str, split: str) -> bool:
-    """Whether a pattern of cells can speak of this room, so that others need not be loaded."""
+    """Whether a pattern of cells can match this problem, so that others need not be loaded."""
     for part, name in zip(pattern.split("/"), (dataset, split), strict=False):
         if "*" in part:  # it may stand for what follows, too
             return fnmatchcase(name, part.partition("*")[0] + "*")
@@ -103,7 +102,7 @@ def _may_match(pattern: str, dataset: str, split: str) -> bool:
 
 def fill_all(
     prepared: Sequence[Prepared],
-    rooms: Mapping[tuple[str, str], Room | Remembered],
+    problems: Mapping[tuple[str, str], Problem],
     train: bool = True,
     limit_s: float | None = None,
 ) -> list[Filled]:
@@ -112,23 +111,23 @@ def fill_all(
     A cell that cannot be filled is said and left out; the others go on.
     """
     filled: list[Filled] = []
-    open_cells = [p for p in prepared if p.found() is None and isinstance(_room(p.cell, rooms), Room)]
+    open_cells = [p for p in prepared if p.found() is None and _problem(p.cell, problems).data is not None]
     log.info("%d cells, %d of them are there", len(prepared), sum(p.found() is not None for p in prepared))
     started = time.monotonic()
-    left = sum(_expected_s(p.cell, rooms) for p in open_cells) if train else 0.0
+    left = sum(_expected_s(p.cell, problems) for p in open_cells) if train else 0.0
     for number, one in enumerate(prepared, 1):
         found = one.found()
-        room = _room(one.cell, rooms)
-        if found is None and train and isinstance(room, Room):
-            expected = _expected_s(one.cell, rooms)
+        problem = _problem(one.cell, problems)
+        if found is None and train and problem.data is not None:
+            expected = _expected_s(one.cell, problems)
             if limit_s is not None and time.monotonic() - started + expected > limit_s:
                 log.warning("max_hours: %s is not started", one.cell)
-                filled += _earlier(one, rooms)
+                filled += _earlier(one, problems)
                 continue
             log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
             left -= expected
             try:
-                found = fill(one, room)
+                found = fill(one, problem)
             except (ValueError, RuntimeError) as error:
                 log.warning("%s cannot be filled: %s", one.cell, one_line(error))
                 continue
@@ -138,30 +137,30 @@ def fill_all(
                 else "-"
             )
             log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
-        filled += [found] if found is not None else _earlier(one, rooms)
+        filled += [found] if found is not None else _earlier(one, problems)
     return filled
 
 
-def _room(cell: Cell, rooms: Mapping[tuple[str, str], Room | Remembered]) -> Room | Remembered:
-    return rooms[cell.dataset, cell.split]
+def _problem(cell: Cell, problems: Mapping[tuple[str, str], Problem]) -> Problem:
+    return problems[cell.dataset, cell.split]
 
 
-def _earlier(one: Prepared, rooms: Mapping[tuple[str, str], Room | Remembered]) -> list[Filled]:
+def _earlier(one: Prepared, problems: Mapping[tuple[str, str], Problem]) -> list[Filled]:
     """What was measured with earlier program text, where nothing newer is there."""
-    found = one.found_earlier(_room(one.cell, rooms))
+    found = one.found_earlier(_problem(one.cell, problems))
     return [] if found is None else [found]
 
 
-def _expected_s(cell: Cell, rooms: Mapping[tuple[str, str], Room | Remembered]) -> float:
+def _expected_s(cell: Cell, problems: Mapping[tuple[str, str], Problem]) -> float:
     """Seconds a cell will take: its budget on every fold, and something for scoring [s]."""
-    room = _room(cell, rooms)
-    folds = len(room.folds.folds) if isinstance(room, Room) else 0
+    problem = _problem(cell, problems)
+    folds = 0 if problem.folds is None else len(problem.folds.folds)
     return folds * ((cell.budget_s or FREE_S) + 2.0)
 
 
 def _timed(
     filled: Sequence[Filled],
-    rooms: Mapping[tuple[str, str], Room | Remembered],
+    problems: Mapping[tuple[str, str], Problem],
     kept: Path,
     measure: bool,
 ) -> dict[str, dict[str, Latency]]:
@@ -179,9 +178,9 @@ def _timed(
                 "%s: timings are kept ones; models of %s are not here (cells=EMPTY_FOLDER trains all)",
                 dataset, ", ".join(sorted(absent)),
             )  # fmt: skip
-        elif measure and present and isinstance(room := rooms[dataset, split], Room):
+        elif measure and present and problems[dataset, split].data is not None:
             log.info("%s: timing single queries of every method in turns", dataset)
-            found[dataset] = latencies(present, room)
+            found[dataset] = latencies(present, problems[dataset, split])
             file.parent.mkdir(parents=True, exist_ok=True)
             rows = {name: asdict(one) for name, one in found[dataset].items()}
             file.write_text(json.dumps(rows, indent=2))
@@ -204,12 +203,12 @@ def report(
     figure.draw(rows, run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}
     for block in blocks:
-        room = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
-        facts[f"{room}/first"] = block.rows[0].method
+        stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
+        facts[f"{stem}/first"] = block.rows[0].method
         for row in block.rows:
-            facts[f"{room}/{row.method}/score_db"] = row.score_db
-            facts[f"{room}/{row.method}/train_s"] = row.train_s
-            facts[f"{room}/{row.method}/query_ms_p50"] = row.query_ms
+            facts[f"{stem}/{row.method}/score_db"] = row.score_db
+            facts[f"{stem}/{row.method}/train_s"] = row.train_s
+            facts[f"{stem}/{row.method}/query_ms_p50"] = row.query_ms
     write_summary(run_dir / "summary.json", facts)
     console = open_console()
     console.print(Markdown(page))

@@ -10,11 +10,10 @@ from pathlib import Path
 
 import matplotlib
 from matplotlib.artist import Artist
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.studies.compare.table import SCORE, Row
+from gsparc.studies.output import panels, save
 
 LEAST_S = 1e-3  # faster fits are drawn here
 MARKS = "osD^vP*X<>ph"
@@ -22,17 +21,15 @@ MARKS = "osD^vP*X<>ph"
 
 def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
     """A line of panels per dataset and split; a method keeps its colour, a line joins its budgets."""
-    rooms = list(dict.fromkeys((r.dataset, r.split) for r in rows))
+    problems = list(dict.fromkeys((r.dataset, r.split) for r in rows))
     names = list(dict.fromkeys(r.method for r in rows))
     palette = matplotlib.colormaps["tab20"]
-    looks = {name: (palette((2 * i + i // 10) % 20), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
-    figure = Figure(figsize=(11, 3.4 * len(rooms) + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(len(rooms), 2, squeeze=False, sharey="row")
-    for line, (dataset, split) in zip(grid, rooms, strict=True):
+    styles = {name: (palette((2 * i + i // 10) % 20), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
+    figure, grid = panels(11, 3.4 * len(problems) + 0.6, len(problems), 2, sharey="row")
+    for line, (dataset, split) in zip(grid, problems, strict=True):
         here = [r for r in rows if (r.dataset, r.split) == (dataset, split)]
         for name in names:
-            colour, mark = looks[name]
+            colour, mark = styles[name]
             own = sorted((r for r in here if r.method == name), key=lambda r: r.budget_s or 0)
             style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 7, "capsize": 2}
             for axis, horizontal in ((line[0], "train_cpu_s"), (line[1], "query_ms")):
@@ -61,4 +58,4 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
     for axis in grid.flat:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
     figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=9)
-    figure.savefig(path, dpi=110)
+    save(figure, path)

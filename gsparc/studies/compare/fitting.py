@@ -37,49 +37,42 @@ EARLIER = "measured at commit"  # among the facts of a result of earlier program
 
 
 @dataclass(frozen=True)
-class Room:
-    """One dataset under one split.
-
-    Attributes:
-        dataset, split: names.
-        data: measurements.
-        folds: which rows learn and which test.
-    """
-
-    dataset: str
-    split: str
-    data: Measurements
-    folds: Split
-
-    @property
-    def kind(self) -> str:
-        """Of the measurements."""
-        return self.data.site.kind
-
-    @property
-    def hashes(self) -> tuple[str, str]:
-        """Of measurements and folds."""
-        return self.data.site.sha256, self.folds.sha256
-
-
-@dataclass(frozen=True)
-class Remembered:
-    """A room whose measurements are not here: what its kept results say of it.
+class Problem:
+    """One dataset under one split; its measurements may be absent, then kept results say what they were.
 
     Attributes:
         dataset, split: names.
         kind: of the measurements.
         hashes: of measurements and folds.
+        data: measurements; None where they are not here.
+        folds: which rows learn and which test.
     """
 
     dataset: str
     split: str
     kind: str
     hashes: tuple[str, str]
+    data: Measurements | None = None
+    folds: Split | None = None
+
+    @classmethod
+    def of(cls, dataset: str, split: str, data: Measurements, folds: Split) -> Problem:
+        """With its measurements."""
+        return cls(dataset, split, data.site.kind, (data.site.sha256, folds.sha256), data, folds)
+
+    def present(self) -> tuple[Measurements, Split]:
+        """Measurements and folds.
+
+        Raises:
+            ValueError: they are not here.
+        """
+        if self.data is None or self.folds is None:
+            raise ValueError(f"{self.dataset}/{self.split}: the measurements are not here")
+        return self.data, self.folds
 
 
-def remember(kept: Path, dataset: str, splits: Sequence[str]) -> list[Remembered]:
-    """The rooms of a dataset that most kept results speak of, one per split."""
+def stored_problems(kept: Path, dataset: str, splits: Sequence[str]) -> list[Problem]:
+    """The problems of a dataset that most kept results are of, one per split."""
     found = []
     for split in splits:
         files = sorted(kept.glob(f"{dataset}-{split}-*/{RESULT}"))
@@ -87,16 +80,16 @@ def remember(kept: Path, dataset: str, splits: Sequence[str]) -> list[Remembered
         known = Counter((f["dataset/kind"], f["dataset/sha256"], f["split/sha256"]) for f in facts)
         if known:
             kind, *hashes = known.most_common(1)[0][0]
-            found.append(Remembered(dataset, split, kind, (hashes[0], hashes[1])))
+            found.append(Problem(dataset, split, kind, (hashes[0], hashes[1])))
     return found
 
 
-def open_rooms(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Room]:
+def load_problems(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Problem]:
     """Load what `conf/dataset` names, with the given paths, once for all splits of `conf/split`."""
     configs = [compose(dataset, settings, split, []) for split in splits]
     data = load(plain(configs[0].dataset))
     return [
-        Room(dataset, split, data, split_for(plain(config.split), data))
+        Problem.of(dataset, split, data, split_for(plain(config.split), data))
         for split, config in zip(splits, configs, strict=True)
     ]
 
@@ -155,14 +148,14 @@ class Prepared:
             return None
         return Filled(self.cell, self.folder, facts)
 
-    def found_earlier(self, room: Room | Remembered) -> Filled | None:
+    def found_earlier(self, problem: Problem) -> Filled | None:
         """The latest result of other program text or settings for this cell, the same data and split.
 
         Published results outlive the code they were measured with; a table must say so, not lose them.
         """
         stem = self.folder.name.rpartition("-")[0]
         same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
-        same |= dict(zip(("dataset/sha256", "split/sha256"), room.hashes, strict=True))
+        same |= dict(zip(("dataset/sha256", "split/sha256"), problem.hashes, strict=True))
         found = []
         for file in self.folder.parent.glob(f"{stem}-*/{RESULT}"):
             facts = json.loads(file.read_text(encoding="utf-8"))
@@ -175,34 +168,34 @@ class Prepared:
 
 
 def prepare(
-    cell: Cell, contender: Contender, settings: dict[str, Any], room: Room | Remembered, kept: Path
+    cell: Cell, contender: Contender, settings: dict[str, Any], problem: Problem, kept: Path
 ) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
     config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
     whole = plain(config)
     trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
-    name = key(whole["model"], trainer, *room.hashes)
+    name = key(whole["model"], trainer, *problem.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, config, folder, not contender.timed_only)
 
 
-def fill(prepared: Prepared, room: Room) -> Filled:
+def fill(prepared: Prepared, problem: Problem) -> Filled:
     """Train on every fold, score on the test rows, write checkpoints and then the result.
 
     Raises:
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
-    config, folder = prepared.config, prepared.folder
+    config, folder, (data, split) = prepared.config, prepared.folder, problem.present()
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        extra = {"train_s": report.seconds, "fold": number, "split_sha256": room.folds.sha256}
+        extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
 
-    folds = room.folds if prepared.scored else replace(room.folds, folds=room.folds.folds[:1])
+    folds = split if prepared.scored else replace(split, folds=split.folds[:1])
     found = fit_and_score(
-        lambda: build(config.model), room.data, folds, in_folders(context_of(config, folder)),
+        lambda: build(config.model), data, folds, in_folders(context_of(config, folder)),
         eval_on="test" if prepared.scored else None, keep=keep,
     )  # fmt: skip
     facts: dict[str, Any] = {f"test/{name}": value for name, value in found.figures.items()}
@@ -218,7 +211,7 @@ def fill(prepared: Prepared, room: Room) -> Filled:
         "budget_s": prepared.cell.budget_s,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    facts |= dataset_facts(room.data) | split_facts(room.folds) | machine_facts() | provenance()
+    facts |= dataset_facts(data) | split_facts(split) | machine_facts() | provenance()
     write_summary(folder / RESULT, facts)  # last: a cell without it does not count
     return Filled(prepared.cell, folder, facts)
 

@@ -1,4 +1,4 @@
-"""Single-query latency of all methods of a room, in turns, on one processor, after all training."""
+"""Single-query latency of all methods of a problem, in turns, on one processor, after all training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from gsparc.methods import checkpoint
 from gsparc.methods.method import Method
 from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
-from gsparc.studies.compare.fitting import Filled, Room
+from gsparc.studies.compare.fitting import Filled, Problem
 from gsparc.studies.study.run import queries
 
 SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
@@ -35,13 +35,14 @@ class Latency:
     rounds: int
 
 
-def latencies(filled: Sequence[Filled], room: Room) -> dict[str, Latency]:
+def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
     """One row per method, from the first of its checkpoints."""
+    data, split = problem.present()
     methods: dict[str, Method] = {}
     for one in filled:
         if one.cell.method not in methods:
             methods[one.cell.method] = checkpoint.load(one.checkpoint)[0]
-    calls = cycling(methods, queries(room.data, room.folds.folds[0].test))
+    calls = cycling(methods, queries(data, split.folds[0].test))
     once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
     endless = {name for name in calls if once[name][0] > ENDLESS_MS}
     cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}

@@ -1,10 +1,9 @@
-"""Cells of one room and budget side by side: who is first, who is fast, who is not worth its training."""
+"""Cells of one problem and budget side by side: accuracy, latency, training."""
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,10 @@ import numpy as np
 
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metrics import DECIDING, score_of
-from gsparc.evaluation.summary import BUSY
+from gsparc.evaluation.summary import BUSY, write_samples
 from gsparc.studies.compare.fitting import Filled
 from gsparc.studies.compare.latency import Latency
+from gsparc.studies.output import columns, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
@@ -82,9 +82,11 @@ def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -
         cell = one.cell
         return cell.dataset, cell.split, cell.budget_s or 0.0, cell.method
 
-    rooms = list(dict.fromkeys((one.cell.dataset, one.cell.split) for one in filled))
-    arranged = sorted(filled, key=lambda one: (rooms.index((one.cell.dataset, one.cell.split)), *group(one)))
-    first = dict(reversed(rooms))
+    problems = list(dict.fromkeys((one.cell.dataset, one.cell.split) for one in filled))
+    arranged = sorted(
+        filled, key=lambda one: (problems.index((one.cell.dataset, one.cell.split)), *group(one))
+    )
+    first = dict(reversed(problems))
     return [
         _row(list(same), timed.get(dataset, {}).get(method) if split == first[dataset] else None)
         for (dataset, split, _, method), same in groupby(arranged, group)
@@ -116,7 +118,7 @@ def _row(same: list[Filled], latency: Latency | None) -> Row:
 
 @dataclass(frozen=True)
 class Block:
-    """The table of one room and budget, best first."""
+    """The table of one problem and budget, best first."""
 
     dataset: str
     split: str
@@ -150,37 +152,37 @@ def within_spread(row: Row, first: Row) -> bool:
 
 
 def remarks(block: Block, ours: str) -> list[str]:
-    """What the table says about simple baselines and about our own default, favourable or not."""
+    """What the table shows about simple baselines and about our own default, favourable or not."""
     first = block.rows[0]
-    said = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
+    found = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
     if first.method in SIMPLE:
-        said.append(f"a simple baseline wins: take {first.method} for this data and split")
+        found.append(f"a simple baseline wins: take {first.method} for this data and split")
     own = next((r for r in block.rows if r.method == ours), None)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
-        said.append(gap + (", within the seeds' spread" if within_spread(own, first) else ""))
+        found.append(gap + (", within the seeds' spread" if within_spread(own, first) else ""))
     for row in block.rows:
         if own is not None and row.method in SIMPLE and row.score_db > own.score_db and row is not first:
-            said.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
+            found.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
     close = [r for r in block.rows if r.score_db >= first.score_db - CLOSE_DB and r.query_ms is not None]
     if close:
         quick = min(close, key=lambda r: r.query_ms or np.inf)
-        said.append(
+        found.append(
             f"fastest within {CLOSE_DB} dB of the first: {quick.method}, {quick.query_ms:.3g} ms a query"
         )
     old = {r.method: r.earlier for r in block.rows if r.earlier}
     if old:
-        said.append(
+        found.append(
             "measured before the program or its settings were last changed (at commit): "
             + ", ".join(f"{method} ({commits})" for method, commits in old.items())
         )
     loads = [r.load for r in block.rows if r.load is not None and r.budget_s is not None]
     if loads and max(loads) > BUSY:
-        said.append(
+        found.append(
             f"the machine was busy (load up to {max(loads):.1f} per core): train s is inflated, "
             "cpu s is what was spent"
         )
-    return said
+    return found
 
 
 def markdown(
@@ -207,21 +209,14 @@ def _page(block: Block, ours: str) -> str:
     for row in block.rows:
         near = "" if row.spread_db is None else f" ± {row.spread_db:.2f}"
         raw = [] if plain else [f"{row.value:.4g}"]
-        cells = [row.method, f"{row.score_db:.2f}{near}", *raw, _shown(row.second_value, ".4g"),
-                 str(row.seeds), f"{row.train_s:.3g}", f"{row.train_cpu_s:.3g}", _shown(row.query_ms, ".3g"),
-                 _shown(row.query_p95_ms, ".3g"), _shown(row.to_copy, ".2g")]  # fmt: skip
+        cells = [row.method, f"{row.score_db:.2f}{near}", *raw, shown(row.second_value, ".4g"),
+                 str(row.seeds), f"{row.train_s:.3g}", f"{row.train_cpu_s:.3g}", shown(row.query_ms, ".3g"),
+                 shown(row.query_p95_ms, ".3g"), shown(row.to_copy, ".2g")]  # fmt: skip
         bold = row.method == ours
         lines.append("| " + " | ".join(f"**{c}**" if bold else c for c in cells) + " |")
     return "\n".join([f"### {block.title}", "", *lines, "", *(f"- {r}" for r in remarks(block, ours))])
 
 
-def _shown(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
 def write_csv(found: Sequence[Row], path: Path) -> None:
     """One line per row, every column."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, [name for name in Row.__dataclass_fields__])
-        writer.writeheader()
-        writer.writerows({k: "" if v is None else v for k, v in asdict(row).items()} for row in found)
+    write_samples(path, columns(found, Row))

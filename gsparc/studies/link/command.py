@@ -5,12 +5,10 @@ from __future__ import annotations
 import logging
 import time
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
@@ -38,6 +36,7 @@ from gsparc.studies.link.study import (
     transmit,
 )
 from gsparc.studies.link.tables import tables
+from gsparc.studies.output import run_directory
 from gsparc.studies.settings import RunSettings, plain
 
 log = logging.getLogger(__name__)
@@ -62,7 +61,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     need_sionna()
     RunSettings.of(config)
     torch.manual_seed(int(config.seed))
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     settings = plain(config)
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
     method, data, fold = run.methods[0], run.data, run.split.folds[0]

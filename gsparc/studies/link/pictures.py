@@ -1,4 +1,4 @@
-"""Block error rates, throughput and the price of accepting more, as a person looks at them."""
+"""Block error rates, throughput and the price of accepting more, drawn."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from gsparc.methods.risk_threshold import binomial_interval
 from gsparc.studies.link.adaptation import Rates
 from gsparc.studies.link.study import Curve
+from gsparc.studies.output import panels, save
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),
@@ -42,9 +41,7 @@ LEAST_RATE = 3e-4
 
 def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path) -> None:
     """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
-    figure = Figure(figsize=(5.6 * len(drawn), 8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, len(drawn), squeeze=False)
+    figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn))
     for column, (modulation, curves) in enumerate(drawn.items()):
         for name, (label, colour, line) in STYLES.items():
             if name not in curves:
@@ -68,14 +65,13 @@ def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path
             axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=what)
             axes[row, column].grid(alpha=0.3, which="both")
     axes[0, 0].legend(fontsize=7)
-    figure.savefig(path, dpi=110)
+    save(figure, path)
 
 
 def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
     """Throughput over noise, and the confidence of right and wrong choices."""
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
+    figure, grid = panels(11, 4, 1, 2)
+    left, right = grid[0]
     snr = [one.snr_db for one in found]
     left.plot(snr, [one.oracle_bps.mean() / 1e6 for one in found], "k-o", label="from the true channel")
     left.plot(snr, [one.best_bps.mean() / 1e6 for one in found], "k:", label="the most there is")
@@ -91,17 +87,15 @@ def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) ->
     right.boxplot([g for _, g in present], tick_labels=[label for label, _ in present])
     right.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
     right.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save(figure, path)
 
 
 def draw_acceptance(
     found: Mapping[str, Mapping[str, np.ndarray]], threshold_share: float, path: Path
 ) -> None:
     """Block error rate of the surest share of positions, a panel a modulation."""
-    figure = Figure(figsize=(5.5 * len(found), 4), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, len(found), squeeze=False)[0]
-    for axis, (modulation, trade) in zip(axes, found.items(), strict=True):
+    figure, grid = panels(5.5 * len(found), 4, 1, len(found))
+    for axis, (modulation, trade) in zip(grid[0], found.items(), strict=True):
         for name, rates in trade.items():
             if name in SHORT:
                 axis.plot(trade["share"], rates, SHORT[name], label=NAMES.get(name, name))
@@ -110,4 +104,4 @@ def draw_acceptance(
         axis.set_title(f"{modulation.upper()} at {float(trade['ebno_db']):g} dB")
         axis.legend(fontsize=8)
         axis.grid(alpha=0.3)
-    figure.savefig(path, dpi=110)
+    save(figure, path)

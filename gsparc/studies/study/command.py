@@ -6,12 +6,9 @@ accuracy under its own name, seconds of training, milliseconds of a query and th
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields
-from pathlib import Path
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
@@ -24,6 +21,7 @@ from gsparc.methods.method import Method
 from gsparc.methods.registry import build, method_class
 from gsparc.methods.timing import ClockSettings, machine_facts
 from gsparc.studies.context import context_of
+from gsparc.studies.output import columns, run_directory, shown, table
 from gsparc.studies.settings import RunSettings, plain
 from gsparc.studies.study.figure import draw
 from gsparc.studies.study.study import Row, Study, Variant
@@ -54,7 +52,7 @@ def study_of(config: DictConfig) -> Study:
 def task(config: DictConfig) -> list[Row]:
     """Run the study, show its table, write its files."""
     settings = RunSettings.of(config)
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     study = study_of(config)
     data = load(plain(config.dataset))
     split = split_for(plain(config.split), data)
@@ -66,11 +64,11 @@ def task(config: DictConfig) -> list[Row]:
     for row in rows:
         facts |= row.facts()
     title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
-    write_samples(run_dir / "study.csv", _columns(rows))
+    write_samples(run_dir / "study.csv", columns(rows, Row))
     draw(rows, title, run_dir / "study.png")
     write_summary(run_dir / "summary.json", facts)
     console = open_console()
-    console.print(table(rows, title))
+    console.print(table_of(rows, title))
     for remark in run_conditions(facts):
         console.print(remark, highlight=False)
     ratios = "" if study.base is None else f"ratios to {study.base!r}; "
@@ -78,31 +76,19 @@ def task(config: DictConfig) -> list[Row]:
     return rows
 
 
-def _columns(rows: Sequence[Row]) -> Mapping[str, list[Any]]:
-    """Columns of `study.csv`; what there is none of is an empty cell."""
-    cells = [{k: "" if v is None else v for k, v in asdict(row).items()} for row in rows]
-    return {column.name: [row[column.name] for row in cells] for column in fields(Row)}
-
-
-def table(rows: Sequence[Row], title: str) -> Table:
-    """A line per row; columns that say nothing in this study are left out."""
-    first = rows[0]
+def table_of(rows: Sequence[Row], title: str) -> Table:
+    """A line per row; conditions and ratios where the study has any."""
     changed = any(row.what != "none" for row in rows)
     compared = any(row.train_ratio is not None for row in rows)
-    found = Table(title=title)
-    words = ["variant", "effects", *(["changed"] if changed else [])]
-    for column in words:
-        found.add_column(column)
     ratio = ["ratio"] if compared else []
-    for column in ("rows", first.figure, "train s", *ratio, "cpu s", "query ms", "p95", *ratio):
-        found.add_column(column, justify="right")
+    lines = []
     for row in rows:
         change = row.what if row.what == "none" else f"{row.what} {row.amount:g}"
         value = f"{row.value:.4g}" + ("" if row.spread is None else f" ± {row.spread:.2g}")
         train, query = ([row.train_ratio], [row.query_ratio]) if compared else ([], [])
         numbers = (row.train_s, *train, row.train_cpu_s, row.query_ms, row.query_p95_ms, *query)
-        found.add_row(
-            row.variant, row.effects, *([change] if changed else []), f"{row.rows:g}", value,
-            *("-" if number is None else f"{number:.3g}" for number in numbers),
-        )  # fmt: skip
-    return found
+        words = [row.variant, row.effects, *([change] if changed else [])]
+        lines.append([*words, f"{row.rows:g}", value, *(shown(number, ".3g") for number in numbers)])
+    words = ["variant", "effects", *(["changed"] if changed else [])]
+    costs = ["train s", *ratio, "cpu s", "query ms", "p95", *ratio]
+    return table(title, words, ["rows", rows[0].figure, *costs], lines)

@@ -6,11 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-
-from gsparc.data.files import whole_file
 from gsparc.evaluation.metrics import lower_is_better
+from gsparc.studies.output import panels, save
 from gsparc.studies.study.study import Row
 
 
@@ -48,12 +45,10 @@ COSTS = (
 def draw(rows: Sequence[Row], title: str, path: Path) -> None:
     """Save the figure as PNG; a dotted line is the variant's accuracy on undisturbed data."""
     drawn = {row.what for row in rows}
-    panels = [panel for panel in PANELS if panel.what in drawn] or list(COSTS)
-    figure = Figure(figsize=(5 * len(panels), 4), layout="constrained")
-    FigureCanvasAgg(figure)
+    wanted = [panel for panel in PANELS if panel.what in drawn] or list(COSTS)
+    figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))
     figure.suptitle(title, fontsize=11)
-    every = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, panel in zip(every, panels, strict=True):
+    for axes, panel in zip(grid[0], wanted, strict=True):
         for name in dict.fromkeys(row.variant for row in rows):
             own = [row for row in rows if row.variant == name and row.what == panel.what]
             if not own:
@@ -72,6 +67,5 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
         elif lower_is_better(rows[0].figure):
             axes.invert_yaxis()
         axes.grid(alpha=0.3)
-    every[0].legend(fontsize=8)
-    with whole_file(path) as partial:
-        figure.savefig(partial, dpi=110, format="png")
+    grid[0, 0].legend(fontsize=8)
+    save(figure, path)

@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-from rich.table import Table
 
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
@@ -31,8 +29,9 @@ from gsparc.methods.pareto import Point, cost_of_halving, front
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import combinations, contributions, reduced
 from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
+from gsparc.studies.output import run_directory, table
 from gsparc.studies.settings import plain
-from gsparc.studies.tradeoff.picture import Rival, beaten_by, draw
+from gsparc.studies.tradeoff.picture import Other, beaten_by, draw
 from gsparc.studies.tradeoff.sweep import candidate, sweep
 
 log = logging.getLogger(__name__)
@@ -40,7 +39,7 @@ log = logging.getLogger(__name__)
 
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
     fold, data, method = run.split.folds[0], run.data, run.methods[0]
     rows = rows_of(fold, config.eval_on)
@@ -50,20 +49,20 @@ def task(config: DictConfig) -> dict[str, Any]:
     threads = _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
-    rivals = _rivals(config, run)
+    others = _others(config, run)
     places = data.moving[rows] + data.site.origin
-    clocks = {name: Predictor(rival, data.site).cycling(places) for name, (rival, _) in rivals.items()}
+    clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
     clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
-    others = {COPY: reference_copy(), **clocks}
-    points, other_ms = sweep(candidates, data, fold, eval_on=config.eval_on, clock=clock, others=others)
+    timed = {COPY: reference_copy(), **clocks}
+    points, other_ms = sweep(candidates, data, fold, eval_on=config.eval_on, clock=clock, others=timed)
     figure = DECIDING[data.site.kind]
     shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
     chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
     if config.store:
         stored_front.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
     beside = {
-        name: Rival(value, float(np.median(other_ms[name])), float(np.quantile(other_ms[name], 0.95)))
-        for name, (_, value) in rivals.items()
+        name: Other(value, float(np.median(other_ms[name])), float(np.quantile(other_ms[name], 0.95)))
+        for name, (_, value) in others.items()
         if value is not None
     }
     copy_ms = float(np.median(other_ms[COPY]))
@@ -83,9 +82,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_summary(run_dir / "summary.json", facts)
     _show(best, figure, facts, title, run_dir)
     for p in best:
-        rival = beaten_by(p, beside, figure)
-        if rival is not None:
-            log.warning("%s: %s is as fast and better", p.label, rival)
+        other = beaten_by(p, beside, figure)
+        if other is not None:
+            log.warning("%s: %s is as fast and better", p.label, other)
     return facts
 
 
@@ -99,7 +98,7 @@ def _threads(given: Sequence[int] | None) -> list[int]:
     return found
 
 
-def _rivals(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | None]]:
+def _others(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | None]]:
     """Baselines and the methods in other checkpoints, with the deciding figure of each."""
     figure, fold, data = DECIDING[run.data.site.kind], run.split.folds[0], run.data
     cache = platform_cache() if config.cache is None else Path(config.cache)
@@ -128,7 +127,7 @@ def _columns(
     """Columns of `tradeoff.csv`, fastest point first."""
     order = sorted(range(len(points)), key=lambda i: points[i].p50)
     rows = [points[i] for i in order]
-    spared = list(dict.fromkeys(knob for p in points for knob in p.settings))
+    knobs = list(dict.fromkeys(knob for p in points for knob in p.settings))
     return {
         "label": [p.label for p in rows],
         "render_ms_p50": [p.p50 for p in rows],
@@ -142,7 +141,7 @@ def _columns(
         "kept_with_model": [int(i in chosen) for i in order],
         "threads": [p.threads for p in rows],
         "num_gaussians": [p.size for p in rows],
-        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in spared},
+        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in knobs},
     }
 
 
@@ -151,10 +150,10 @@ def _cell(value: Any) -> Any:
 
 
 def _facts(
-    points: list[Point], best: list[Point], figure: str, rivals: dict[str, Rival], copy_ms: float
+    points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
 ) -> dict[str, Any]:
     full = min((p for p in points if not p.settings), key=lambda p: p.p50)
-    useful = [p for p in best if beaten_by(p, rivals, figure) is None]  # a slope of points nobody should take
+    useful = [p for p in best if beaten_by(p, others, figure) is None]  # a slope of points that others beat
     halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),
@@ -162,7 +161,7 @@ def _facts(
         "tradeoff/span": best[-1].p50 / best[0].p50,
         "tradeoff/per_halving": halving,
         "tradeoff/figure": figure,
-        "tradeoff/front_beaten_by_others": sum(beaten_by(p, rivals, figure) is not None for p in best),
+        "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
         "time/copy_ms": copy_ms,
         "time/render_ms_p50": full.p50,
         "time/render_ms_p95": full.p95,
@@ -172,22 +171,19 @@ def _facts(
         stem = f"front/{number}"
         facts |= {f"{stem}/render_ms_p50": p.p50, f"{stem}/render_ms_p95": p.p95, f"{stem}/label": p.label}
         facts |= {f"{stem}/{name}": value for name, value in p.figures.items()}
-    for name, rival in rivals.items():
-        facts |= {f"baseline/{name}/{figure}": rival.value, f"baseline/{name}/render_ms_p50": rival.p50}
+    for name, other in others.items():
+        facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
     return facts
 
 
 def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run_dir: Path) -> None:
-    table = Table(title=title)
-    table.add_column("not beaten")
-    for name in ("ms p50", "ms p95", figure, "difference to full"):
-        table.add_column(name, justify="right")
+    rows = []
     for p in best:
         gap, error = p.difference
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
-        table.add_row(p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart)
+        rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
     console = open_console()
-    console.print(table)
+    console.print(table(title, ["not beaten"], ["ms p50", "ms p95", figure, "difference to full"], rows))
     slope = facts["tradeoff/per_halving"]
     if slope is not None:
         beaten = facts["tradeoff/front_beaten_by_others"]

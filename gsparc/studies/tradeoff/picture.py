@@ -1,4 +1,4 @@
-"""Accuracy against latency as a person reads it: the front, numbered, and its legend beside it."""
+"""Accuracy against latency drawn: the front, numbered, and its legend beside it."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.evaluation.metrics import lower_is_better, score_of
 from gsparc.methods.pareto import Point
+from gsparc.studies.output import panels, save
 
 NAMES = {
     "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"
@@ -19,7 +18,7 @@ NAMES = {
 
 
 @dataclass(frozen=True)
-class Rival:
+class Other:
     """Another method on the same axes: its accuracy and median latency [ms]."""
 
     value: float
@@ -27,10 +26,10 @@ class Rival:
     p95: float
 
 
-def beaten_by(point: Point, rivals: Mapping[str, Rival], figure_name: str) -> str | None:
-    """The most accurate rival that is neither slower nor worse than a point; None when there is none."""
+def beaten_by(point: Point, others: Mapping[str, Other], figure_name: str) -> str | None:
+    """The most accurate other that is neither slower nor worse than a point; None when there is none."""
     own = score_of(figure_name, point.value(figure_name))
-    better = {n: score_of(figure_name, r.value) for n, r in rivals.items() if r.p50 <= point.p50}
+    better = {n: score_of(figure_name, r.value) for n, r in others.items() if r.p50 <= point.p50}
     best = max(better, key=lambda name: better[name], default=None)
     return best if best is not None and better[best] >= own else None
 
@@ -38,7 +37,7 @@ def beaten_by(point: Point, rivals: Mapping[str, Rival], figure_name: str) -> st
 def draw(
     points: Sequence[Point],
     on_front: Sequence[int],
-    rivals: Mapping[str, Rival],
+    others: Mapping[str, Other],
     figure_name: str,
     title: str,
     path: Path,
@@ -48,14 +47,13 @@ def draw(
     Args:
         points: all of them.
         on_front: indices of the front, fastest first.
-        rivals: baselines and peers by name.
+        others: baselines and peers by name.
         figure_name: key of the accuracy.
         title: what was measured.
         path: PNG file.
     """
-    figure = Figure(figsize=(11, 5.2), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes, legend = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    figure, grid = panels(11, 5.2, 1, 2, width_ratios=(1.5, 1))
+    axes, legend = grid[0]
     value = [p.value(figure_name) for p in points]
     inside = [i for i in range(len(points)) if i not in on_front]
     axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
@@ -69,20 +67,20 @@ def draw(
         axes.annotate(
             str(number), (points[i].p50, value[i]), xytext=(-3, 6), textcoords="offset points", color="C0"
         )
-    for name, rival in rivals.items():
-        axes.scatter([rival.p50], [rival.value], marker="s", c="C1", s=28)
-        axes.annotate(name, (rival.p50, rival.value), xytext=(6, -4), textcoords="offset points", color="C1")
+    for name, other in others.items():
+        axes.scatter([other.p50], [other.value], marker="s", c="C1", s=28)
+        axes.annotate(name, (other.p50, other.value), xytext=(6, -4), textcoords="offset points", color="C1")
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
-    worst, best = min(y), max(y)  # far-off rivals would flatten the front
+    worst, best = min(y), max(y)  # far-off others would flatten the front
     if lower_is_better(figure_name):
         axes.set_yscale("log")
         axes.invert_yaxis()
     else:
         axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
-        below = [name for name, rival in rivals.items() if rival.value < axes.get_ylim()[0]]
+        below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
         if below:
             axes.text(
                 0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, color="C1", fontsize=8
@@ -92,7 +90,7 @@ def draw(
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
-    winner = {i: beaten_by(points[i], rivals, figure_name) for i in on_front}
+    winner = {i: beaten_by(points[i], others, figure_name) for i in on_front}
     lines = [
         f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
         + (f" ({winner[i]} is better)" if winner[i] else "")
@@ -101,5 +99,4 @@ def draw(
     legend.axis("off")
     text = "\n".join(["       median  accuracy  settings", *lines])
     legend.text(0, 1, text, va="top", family="monospace", fontsize=7.5)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save(figure, path)

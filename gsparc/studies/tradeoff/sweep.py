@@ -24,7 +24,7 @@ from gsparc.methods.timing import Call, ClockSettings, interleaved
 
 log = logging.getLogger(__name__)
 
-CLOSEST_DB = 100.0  # float32 tells no more
+CLOSEST_DB = 100.0  # the precision of float32
 PAIRED = {"nmse": "snr_db"}  # an NMSE is of a whole set; its samples are compared by their own ratios
 
 
@@ -34,7 +34,7 @@ class Candidate:
 
     Attributes:
         label: in words.
-        settings: what is spared.
+        settings: what it is reduced by.
         method: answers so.
         threads: CPU threads to be timed with.
     """
@@ -72,11 +72,11 @@ def sweep(
     rows, whole = rows_of(fold, eval_on), None
     places = data.moving[rows] + data.site.origin
     for number, candidate in enumerate(candidates):
-        heard = Heard(candidate.method)
-        there = score([heard], data, split, eval_on)
-        said = torch.cat(heard.means)
-        whole = said if whole is None else whole
-        scored.append((there, closeness(said, whole)))
+        recorded = Recorded(candidate.method)
+        there = score([recorded], data, split, eval_on)
+        answers = torch.cat(recorded.means)
+        whole = answers if whole is None else whole
+        scored.append((there, closeness(answers, whole)))
         if number % 10 == 9:
             log.info("%d of %d combinations scored", number + 1, len(candidates))
     calls: dict[tuple[int, int] | str, Call] = {name: call for name, call in others.items()}
@@ -102,7 +102,7 @@ def sweep(
     return points, {name: times[name] for name in others}
 
 
-class Heard(View):
+class Recorded(View):
     """A method whose answers are kept while it is scored.
 
     Attributes:

@@ -13,7 +13,7 @@ from hydra import initialize_config_module
 
 from gsparc.studies.compare.cells import Cell, Contender
 from gsparc.studies.compare.command import _may_match, _timed
-from gsparc.studies.compare.fitting import Filled, Prepared, Remembered, prepare, remember
+from gsparc.studies.compare.fitting import Filled, Prepared, Problem, prepare, stored_problems
 
 ROOT = Path(__file__).parents[3]
 
@@ -41,7 +41,7 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     """Published cells would vanish from the table with every edit of a method."""
     cell = Cell("toy", "random", "gp", None, None)
     prepared = Prepared(cell, None, tmp_path / "toy-random-gp-today")
-    room = Remembered("toy", "random", "spectrum", ("d", "s"))
+    problem = Problem("toy", "random", "spectrum", ("d", "s"))
     facts = {
         "seed": None, "budget_s": None, "git": "0123456789",
         "dataset/kind": "spectrum", "dataset/sha256": "d", "split/sha256": "s",
@@ -52,14 +52,14 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
         (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
 
     write("toy-random-gp-other", **{"dataset/sha256": "e"})
-    assert prepared.found() is None and prepared.found_earlier(room) is None
+    assert prepared.found() is None and prepared.found_earlier(problem) is None
     write("toy-random-gp-old", made="2026-01-01")
     write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
-    found = prepared.found_earlier(room)
+    found = prepared.found_earlier(problem)
     assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
     write("toy-random-gp-today")
     assert prepared.found().earlier is None
-    assert remember(tmp_path, "toy", ["random", "sparse"]) == [room] and not remember(
+    assert stored_problems(tmp_path, "toy", ["random", "sparse"]) == [problem] and not stored_problems(
         tmp_path, "t", ["random"]
     )
 
@@ -67,11 +67,11 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
 @pytest.mark.parametrize("model", ["gsparc", "moving_array"])
 def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
     """A model was trained as if there were no budget: one of 5 s was found again as one of 60 s."""
-    room = Remembered("own", "random", "spectrum", ("d", "s"))
+    problem = Problem("own", "random", "spectrum", ("d", "s"))
     contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         short, long = (
-            prepare(Cell("own", "random", model, budget_s, 0), contender, {"file": "x"}, room, tmp_path)
+            prepare(Cell("own", "random", model, budget_s, 0), contender, {"file": "x"}, problem, tmp_path)
             for budget_s in (5.0, 60.0)
         )
     assert short.config.budget_s == 5 and short.folder != long.folder

@@ -12,7 +12,7 @@ from gsparc.methods import timing
 from gsparc.methods.method import Prediction
 from gsparc.studies.compare import latency
 from gsparc.studies.compare.cells import Cell
-from gsparc.studies.compare.fitting import Filled, Room
+from gsparc.studies.compare.fitting import Filled, Problem
 
 WAITS = {"quick": 0.0, "slow": 0.2, "endless": 0.7}  # [s]
 
@@ -41,9 +41,9 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     monkeypatch.setattr(latency, "SLOW_MS", 150.0)
     monkeypatch.setattr(latency, "ENDLESS_MS", 600.0)
     monkeypatch.setattr(latency, "FAST", replace(latency.FAST, rounds=12))
-    room = Room("toy", "random", campaign("spectrum", 20), folds(20))
+    problem = Problem.of("toy", "random", campaign("spectrum", 20), folds(20))
     cells = [Filled(Cell("toy", "random", name, None, None), tmp_path / name, {}) for name in WAITS]
-    found = latency.latencies(cells, room)
+    found = latency.latencies(cells, problem)
     assert list(found) == list(WAITS)
     assert {name: one.rounds for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}
     assert found["slow"].p50_ms == pytest.approx(200, abs=1) and found["quick"].p50_ms < 1

@@ -19,7 +19,7 @@ from gsparc.methods import checkpoint, operating_point, stored_front
 from gsparc.methods.pareto import Point
 from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.studies.tradeoff.command import task
-from gsparc.studies.tradeoff.sweep import Heard, closeness
+from gsparc.studies.tradeoff.sweep import Recorded, closeness
 
 
 @pytest.fixture(scope="module")
@@ -86,10 +86,10 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
     assert close == sorted(close) and close[-1] == 100.0  # the last is as near as the full model itself
     data = field.data
     blind = dataclasses.replace(data, target=np.zeros_like(data.target))
-    heard = [Heard(field.methods[0]) for _ in range(2)]
-    for one, seen in zip(heard, (blind, data), strict=True):
+    recorded = [Recorded(field.methods[0]) for _ in range(2)]
+    for one, seen in zip(recorded, (blind, data), strict=True):
         score([one], seen, field.split)
-    answers, again = (torch.cat(one.means) for one in heard)
+    answers, again = (torch.cat(one.means) for one in recorded)
     assert torch.equal(answers, again) and closeness(answers, answers) == 100.0
     assert closeness(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
 

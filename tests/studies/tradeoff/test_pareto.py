@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsparc.methods.pareto import Point, cost_of_halving, front, worded
-from gsparc.studies.tradeoff.picture import Rival, beaten_by
+from gsparc.studies.tradeoff.picture import Other, beaten_by
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
 
@@ -44,6 +44,6 @@ def test_settings_are_said_in_words():
 
 def test_a_point_that_another_method_beats_is_said():
     point = Point("p", {}, 1, {"psnr_db": 20.0}, 0.0, np.full(3, 1.0))
-    rivals = {"nearest": Rival(26.0, 0.5, 0.6), "gp": Rival(29.0, 2.0, 3.0), "mean": Rival(15.0, 0.1, 0.1)}
-    assert beaten_by(point, rivals, "psnr_db") == "nearest"
-    assert beaten_by(point, {"gp": rivals["gp"], "mean": rivals["mean"]}, "psnr_db") is None
+    others = {"nearest": Other(26.0, 0.5, 0.6), "gp": Other(29.0, 2.0, 3.0), "mean": Other(15.0, 0.1, 0.1)}
+    assert beaten_by(point, others, "psnr_db") == "nearest"
+    assert beaten_by(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None
