@@ -34,7 +34,7 @@ sionna: $(VENV)/.sionna ## what `gsparc simulate` needs: Sionna and an LLVM that
 
 $(VENV)/.sionna: $(VENV)/.installed
 	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna
-	$(RUN) -m gsparc.simulate.llvm
+	$(RUN) -m gsparc llvm
 	@touch $@
 
 demo: setup ## train on a small simulated site, print the table, draw the spectra (about two minutes)

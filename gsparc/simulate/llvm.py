@@ -3,16 +3,18 @@
 Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first solve,
 which no `try` catches. So a library is accepted only after a tiny solve in a process of its own.
 
-`python -m gsparc.simulate.llvm` (or `make sionna`) fetches Debian's package where no library is good.
+`gsparc llvm` (or `make sionna`) fetches Debian's package where no library is good.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
@@ -29,7 +31,7 @@ INSTALLED = (
     "/usr/lib/llvm-18/lib/libLLVM.so.18.1",
 )
 REMEDY = (
-    f"get one with `python -m gsparc.simulate.llvm` (Debian's {PACKAGE}, no root needed) or name a library "
+    f"get one with `gsparc llvm` (Debian's {PACKAGE}, no root needed) or name a library "
     f"of LLVM 19 in {VARIABLE}"
 )
 TINY_SOLVE = """
@@ -143,8 +145,9 @@ def _require_sionna() -> None:
         raise SimulatorMissing("Sionna is not installed; run `make sionna` or pip install 'gsparc[sionna]'")
 
 
-def main() -> int:
-    """Entry point: a good library is found or fetched; exit status 0 when a tiny solve works."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """`gsparc llvm`: a good library is found or fetched; exit status 0 when a tiny solve works."""
+    argparse.ArgumentParser(prog="gsparc llvm", description=__doc__).parse_args(arguments)
     console = Console(soft_wrap=True, highlight=False)
     try:
         _require_sionna()
@@ -156,7 +159,3 @@ def main() -> int:
         console.print(f"error: {error}", markup=False, style="red")
         return 1
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

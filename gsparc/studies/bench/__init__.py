@@ -1,1 +1,1 @@
-"""The measuring stick: timings of kernels and queries as ratios to what the machine can do at best."""
+"""Timings of kernels and queries as ratios to what the machine can do at best."""

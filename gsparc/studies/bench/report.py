@@ -1,4 +1,4 @@
-"""The table people read."""
+"""Timings and promised ratios as tables and as a page."""
 
 from __future__ import annotations
 
@@ -9,40 +9,24 @@ from rich.table import Table
 
 from gsparc.studies.bench.claims import Claim
 from gsparc.studies.bench.measure import Row
+from gsparc.studies.output import table
+
+ROWS = ("N", "batch", "threads", "kernel", "end to end", "PyTorch", "limit", "kernel / limit")
 
 
 def rows_table(rows: Sequence[Row], title: str) -> Table:
     """Every row: time, limit, ratio."""
-    table = Table(title=title, caption="ms, median; limit: see gsparc/studies/bench/measure.py")
-    for name in ("operation", "projection"):
-        table.add_column(name)
-    for name in ("N", "batch", "threads", "kernel", "end to end", "PyTorch", "limit", "kernel / limit"):
-        table.add_column(name, justify="right")
-    for row in rows:
-        case = row.case
-        table.add_row(
-            *(case.name, case.projection, str(case.count), str(case.batch), str(row.threads)),
-            _ms(float(np.median(row.kernel))),
-            "-" if row.whole is None else _ms(float(np.median(row.whole))),
-            (case.unaffordable or "-") if row.reference is None else _ms(row.reference),
-            f"{_ms(row.limit)} ({row.bound})",
-            f"{row.over:.1f}",
-        )
-    return table
+    found = table(title, ["operation", "projection"], ROWS, map(_row, rows))
+    found.caption = "ms, median; limit: see gsparc/studies/bench/measure.py"
+    return found
 
 
 def claims_table(claims: Sequence[tuple[str, Claim]], title: str) -> Table:
     """Every promise and whether it holds here."""
-    table = Table(title=title)
-    table.add_column("promise")
-    table.add_column("where")
-    for name in ("ratio", "promised", "met"):
-        table.add_column(name, justify="right")
+    found = table(title, ["promise", "where"], ["ratio", "promised", "met"], [])
     for where, claim in claims:
-        sign = "at least" if claim.at_least else "at most"
-        cells = (claim.name, where, f"{claim.ratio:.2f}", f"{sign} {claim.bound:g}")
-        table.add_row(*cells, "yes" if claim.met else "no", style=None if claim.met else "yellow")
-    return table
+        found.add_row(*_claim(where, claim), style=None if claim.met else "yellow")
+    return found
 
 
 def markdown(facts: Mapping[str, object], rows: Sequence[Row], claims: Sequence[tuple[str, Claim]]) -> str:
@@ -52,24 +36,27 @@ def markdown(facts: Mapping[str, object], rows: Sequence[Row], claims: Sequence[
     head += f", {load}, commit {facts['git']}"
     lines = [f"# {head}", "", "Ratios of interleaved rounds (fastest fifth), times in ms (median).", ""]
     lines += ["| promise | where | ratio | promised | met |", "|---|---|---:|---:|---|"]
-    for where, claim in claims:
-        sign, met = "at least" if claim.at_least else "at most", "yes" if claim.met else "no"
-        lines.append(f"| {claim.name} | {where} | {claim.ratio:.2f} | {sign} {claim.bound:g} | {met} |")
-    lines += [
-        "",
-        "| operation | projection | N | batch | threads | kernel | end to end | PyTorch | limit | ratio |",
-    ]
-    lines.append("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|")
-    for row in rows:
-        case = row.case
-        whole = "-" if row.whole is None else _ms(float(np.median(row.whole)))
-        reference = "-" if row.reference is None else _ms(row.reference)
-        lines.append(
-            f"| {case.name} | {case.projection} | {case.count} | {case.batch} | {row.threads} "
-            f"| {_ms(float(np.median(row.kernel)))} | {whole} | {reference} "
-            f"| {_ms(row.limit)} ({row.bound}) | {row.over:.1f} |"
-        )
+    lines += [f"| {' | '.join(_claim(*claim))} |" for claim in claims]
+    lines += ["", f"| operation | projection | {' | '.join(ROWS)} |", "|---|---|" + "---:|" * len(ROWS)]
+    lines += [f"| {' | '.join(_row(row))} |" for row in rows]
     return "\n".join(lines) + "\n"
+
+
+def _row(row: Row) -> list[str]:
+    case = row.case
+    return [
+        *(case.name, case.projection, str(case.count), str(case.batch), str(row.threads)),
+        _ms(float(np.median(row.kernel))),
+        "-" if row.whole is None else _ms(float(np.median(row.whole))),
+        (case.unaffordable or "-") if row.reference is None else _ms(row.reference),
+        f"{_ms(row.limit)} ({row.bound})",
+        f"{row.over:.1f}",
+    ]
+
+
+def _claim(where: str, claim: Claim) -> list[str]:
+    bound = f"{'at least' if claim.at_least else 'at most'} {claim.bound:g}"
+    return [claim.name, where, f"{claim.ratio:.2f}", bound, "yes" if claim.met else "no"]
 
 
 def _ms(value: float) -> str:

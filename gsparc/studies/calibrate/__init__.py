@@ -1,1 +1,1 @@
-"""Whether a confidence can be trusted: what it costs to accept, and thresholds that keep a promise."""
+"""Confidences compared by risk against coverage, and thresholds whose risk is bounded."""

@@ -1,1 +1,1 @@
-"""Every method under the same data, splits, budgets and clock: cells that are kept, a table, a figure."""
+"""Every method under the same data, splits, budgets and clock: stored cells, a table, a figure."""

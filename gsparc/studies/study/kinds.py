@@ -4,25 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
 from gsparc.studies.study.disturb import displaced, thinned, turned
 from gsparc.studies.study.study import Condition
-
-
-class Kind(Protocol):
-    """What a study is about.
-
-    Attributes:
-        title: of its table and figure.
-    """
-
-    title: ClassVar[str]
-
-    def conditions(self) -> list[Condition]:
-        """States of the data."""
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""What trades accuracy for time when a trained model answers: sweep it, draw it, keep it, choose from it."""
+"""Accuracy against latency of a trained model: sweep its reductions, draw the front, keep it."""
