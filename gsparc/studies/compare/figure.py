@@ -10,10 +10,9 @@ from pathlib import Path
 
 import matplotlib
 from matplotlib.artist import Artist
-from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.studies.compare.table import SCORE, Row
-from gsparc.studies.output import panels, save
+from gsparc.studies.output import logarithmic, panels, save
 
 LEAST_S = 1e-3  # faster fits are drawn here
 MARKS = "osD^vP*X<>ph"
@@ -47,11 +46,8 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
         line[0].set_xlabel("training of one model, processor time [s]")
         line[1].set_xlabel("one query, median [ms]")
         for axis in line:
-            axis.set_xscale("log")
+            logarithmic(axis)
             axis.grid(alpha=0.3)
-        line[1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        line[1].xaxis.set_major_formatter("{x:g}")
-        line[1].xaxis.set_minor_formatter(NullFormatter())
         if not any(r.query_ms for r in here):
             line[1].set_visible(False)
     handles: dict[str, Artist] = {}

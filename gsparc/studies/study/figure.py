@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsparc.evaluation.metrics import lower_is_better
-from gsparc.studies.output import panels, save
+from gsparc.studies.output import logarithmic, panels, save
 from gsparc.studies.study.study import Row
 
 
@@ -59,7 +59,7 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
             clean = [row.value for row in rows if row.variant == name and row.what == "none"]
             if clean and panel.what != "none":
                 axes.axhline(clean[0], color=line.get_color(), linestyle=":", linewidth=1)
-        axes.set_xscale("log")
+        logarithmic(axes)
         axes.set_xlabel(panel.label)
         axes.set_ylabel(TRAINING if panel.y else rows[0].figure)
         if panel.y:

@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from matplotlib.ticker import LogLocator, NullFormatter
-
 from gsparc.evaluation.metrics import lower_is_better, score_of
 from gsparc.methods.pareto import Point
-from gsparc.studies.output import panels, save
+from gsparc.studies.output import logarithmic, panels, save
 
 NAMES = {
     "psnr_db": "PSNR [dB]", "nmse": "NMSE", "rmse_db": "RMSE [dB]", "ssim_gauss": "SSIM (11 x 11 Gaussian)"
@@ -70,10 +68,7 @@ def draw(
     for name, other in others.items():
         axes.scatter([other.p50], [other.value], marker="s", c="C1", s=28)
         axes.annotate(name, (other.p50, other.value), xytext=(6, -4), textcoords="offset points", color="C1")
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.xaxis.set_minor_formatter(NullFormatter())
+    logarithmic(axes)
     worst, best = min(y), max(y)  # far-off others would flatten the front
     if lower_is_better(figure_name):
         axes.set_yscale("log")
