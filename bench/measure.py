@@ -17,7 +17,6 @@ import torch
 from record import guarded, output_of
 from torch import Tensor
 
-from gsparc.field.losses import _Kernel, _Similarity, ssim
 from gsparc.ops import (
     Pose,
     SphereGrid,
@@ -29,6 +28,7 @@ from gsparc.ops import (
     operators,
     rasterize,
 )
+from gsparc.training.losses import _Kernel, _Similarity, ssim
 
 GRID = SphereGrid.hemisphere()
 Model = tuple[Tensor, Tensor, Tensor, Tensor]

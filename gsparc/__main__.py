@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from gsparc.studies.commands import COMMANDS, listed, nearest
+from gsparc.commands.listing import COMMANDS, listed, nearest
 
 
 def main() -> None:

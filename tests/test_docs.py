@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_module
 
+from gsparc.commands.listing import COMMANDS
 from gsparc.methods.registry import METHODS
-from gsparc.studies.commands import COMMANDS
 
 ROOT = Path(__file__).parents[1]
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
@@ -113,7 +113,7 @@ def test_choices_are_there(page, group):
 def test_names_that_are_gone_are_not_used(page):
     code = "\n".join(said(page))
     assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
-    assert "python -m gsparc." not in code and "gsparc.studies" not in code, "name the command"
+    assert "python -m gsparc." not in code and "gsparc.commands" not in code, "name the command"
 
 
 def test_the_readme_is_short():

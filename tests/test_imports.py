@@ -16,7 +16,7 @@ from campaigns import brief, spectra
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "physics", "data", "simulate", "field", "methods", "training", "array", "multipath"]
-ROOMS += ["peers", "auto", "evaluation", "studies", "callbacks", "conf"]
+ROOMS += ["peers", "auto", "evaluation", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -28,11 +28,11 @@ ARROWS = {
     "training": "data field methods ops",
     "array": "data field methods ops physics",
     "multipath": "data field methods ops physics",
-    "peers": "data field methods ops physics",
+    "peers": "data field methods ops physics training",
     "auto": "data field methods ops training",
     "evaluation": "data methods",
     "callbacks": "data evaluation field",
-    "studies": "data evaluation field methods multipath ops simulate training",
+    "commands": "data evaluation field methods multipath ops simulate training",
     "conf": "",
 }
 FILES = [

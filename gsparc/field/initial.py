@@ -5,16 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
-from gsparc.field.losses import Snapshot
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
+
+Snapshot = Literal["none", "phase", "phase_timing"]  # what every channel snapshot has of its own
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Site
-from gsparc.field.losses import channel_loss, spectrum_loss
 from gsparc.ops import Pose
+from gsparc.training.losses import channel_loss, spectrum_loss
 
 SSIM_WEIGHT = 0.2
 

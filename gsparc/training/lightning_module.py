@@ -14,11 +14,12 @@ from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.schema import Batch
 from gsparc.field import edit
 from gsparc.field.confidence import weighted
-from gsparc.field.losses import Snapshot, channel_loss, holds_window, spectrum_loss, ssim
+from gsparc.field.initial import Snapshot
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.methods import checkpoint
 from gsparc.methods.method import TrainsByGradient
 from gsparc.ops import UnsoundGaussian
+from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.time_budget import Pace
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
-from gsparc.field.losses import _Kernel, _Similarity
 from gsparc.ops import Optics, SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
 from gsparc.ops.settings import kernel_settings
+from gsparc.training.losses import _Kernel, _Similarity
 
 BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 

@@ -4,7 +4,7 @@ from scipy.spatial.transform import Rotation
 
 from gsparc.data.newrf import load_newrf
 from gsparc.data.own import SSIM_WINDOW, from_arrays, load_own, write_own
-from gsparc.field.losses import WINDOW_RADIUS
+from gsparc.training.losses import WINDOW_RADIUS
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".h5"])

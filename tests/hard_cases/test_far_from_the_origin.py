@@ -12,7 +12,7 @@ import pytest
 from campaigns import brief, compose, spectra
 
 import gsparc
-from gsparc.studies.train import train
+from gsparc.commands.train import train
 
 FAR = 1e5
 

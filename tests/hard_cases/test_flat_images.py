@@ -9,7 +9,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsparc.field.losses import _window, spectrum_loss, ssim
+from gsparc.training.losses import _window, spectrum_loss, ssim
 
 LEVELS = [0.0, 1e-7, 0.6, 0.6 + 1e-7, 1.0]
 

@@ -16,8 +16,8 @@ from contexts import short
 from rasters import GRIDS, origin, random_scene, render
 
 from gsparc.data.load import load, split_for
-from gsparc.field.losses import spectrum_loss
 from gsparc.methods.registry import build
+from gsparc.training.losses import spectrum_loss
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

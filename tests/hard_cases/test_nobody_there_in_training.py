@@ -14,9 +14,9 @@ import torch
 from campaigns import brief, channels, compose, powers, spectra
 from contexts import short
 
+from gsparc.commands.train import train
 from gsparc.data.load import load, split_for
 from gsparc.methods.registry import build
-from gsparc.studies.train import train
 
 PRUNE = (
     "callbacks=densify",

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from campaigns import STILL, brief, channels, compose
 
-from gsparc.studies.train import train
+from gsparc.commands.train import train
 
 
 @pytest.mark.parametrize("kind", ["csi", "rssi", "spectrum"])

@@ -11,8 +11,8 @@ import pytest
 import torch
 from campaigns import brief, compose, spectra
 
+from gsparc.commands.train import train
 from gsparc.ops import composite, make_plan
-from gsparc.studies.train import train
 
 
 @pytest.fixture(autouse=True)

@@ -17,7 +17,7 @@ from ledger import LEDGER
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["crashes", "campaigns", "gsparc.studies.train", "gsparc.training.splatting", "gsparc.callbacks"]
+    ["crashes", "campaigns", "gsparc.commands.train", "gsparc.training.splatting", "gsparc.callbacks"]
 )
 
 
@@ -26,8 +26,8 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     import torch
     from campaigns import compose
 
+    from gsparc.commands.train import train
     from gsparc.evaluation.console import one_line
-    from gsparc.studies.train import train
 
     torch.set_num_threads(1)
     with Limited(most_bytes):

@@ -11,6 +11,7 @@ import torch
 from rooms import directed
 from scenes import error
 
+from gsparc.commands.study.disturb import turned
 from gsparc.data.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.methods.method import FitContext
@@ -19,7 +20,6 @@ from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.visibility_gp import VisibilityGP
 from gsparc.multipath.visibility_update import RayErrorRates, flips
-from gsparc.studies.study.disturb import turned
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
 

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch.library import opcheck
 
-from gsparc.field.losses import _Kernel, _Similarity
 from gsparc.ops import _native, backends
 from gsparc.ops.similarity import similarity_op
+from gsparc.training.losses import _Kernel, _Similarity
 
 backends.named("cpu")  # the operators find its kernels
 

@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 
+from gsparc.commands.check import main as check
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
@@ -23,7 +24,6 @@ from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.shoebox import Room, trace
 from gsparc.simulate.shoebox_engine import ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings
-from gsparc.studies.check import main as check
 
 SCENE = SceneSettings(
     name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),

@@ -53,7 +53,7 @@ def test_without_sionna_the_remedy_is_named(monkeypatch):
 def test_nothing_else_imports_the_ray_tracer():
     """Only `gsparc.simulate` may, and even there not before it is asked to trace."""
     code = (
-        "import sys, gsparc, gsparc.studies.train, gsparc.studies.evaluate, gsparc.data.load\n"
+        "import sys, gsparc, gsparc.commands.train, gsparc.commands.evaluate, gsparc.data.load\n"
         "import gsparc.simulate\n"
         "bad = [m for m in ('mitsuba', 'drjit', 'sionna.rt') if m in sys.modules]\n"
         "assert not bad, bad"

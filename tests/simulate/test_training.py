@@ -8,6 +8,7 @@ import pytest
 from campaigns import compose
 
 import gsparc
+from gsparc.commands.train import train
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.sionna import with_true_targets
@@ -16,7 +17,6 @@ from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import SceneSettings
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import SpectrumSettings
-from gsparc.studies.train import train
 
 SCENE = SceneSettings(
     name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),

@@ -8,8 +8,8 @@ import pytest
 from campaigns import brief, compose, spectra
 from torch import nn
 
+from gsparc.commands.train import train
 from gsparc.methods.method import FitContext
-from gsparc.studies.train import train
 from gsparc.training import time_budget
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.time_budget import Budget, Pace, Stretched

@@ -10,12 +10,12 @@ import pytest
 from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
 
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.report import task
 from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import html, studies, warnings
 from gsparc.evaluation.report.readme import BEGIN, END, refresh
 from gsparc.evaluation.report.runs import find_runs
-from gsparc.studies.commands import COMMANDS
-from gsparc.studies.report import task
 
 arguments = COMMANDS["report"].arguments
 

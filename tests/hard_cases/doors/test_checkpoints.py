@@ -25,13 +25,13 @@ from doors import assert_refused, knock
 from ledger import LEDGER
 
 import gsparc
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.train import main as train
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
 from gsparc.methods.checkpoint import CheckpointError
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build
-from gsparc.studies.commands import COMMANDS
-from gsparc.studies.train import main as train
 
 evaluate = COMMANDS["evaluate"].run
 

@@ -1,6 +1,6 @@
 """Configurations with a slip of the finger at any depth: the nearest right name, before anything is computed.
 
-Remedy: gsparc/data/limits.py (what a setting may be), gsparc/studies/cli.py (one line, the nearest name).
+Remedy: gsparc/data/limits.py (what a setting may be), gsparc/commands/cli.py (one line, the nearest name).
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import pytest
 from campaigns import spectra
 from doors import assert_refused, knock
 
-from gsparc.studies.commands import COMMANDS
-from gsparc.studies.train import main as train
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.train import main as train
 
 evaluate = COMMANDS["evaluate"].run
 

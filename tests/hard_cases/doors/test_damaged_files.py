@@ -17,10 +17,10 @@ import pytest
 from doors import assert_found_bad, knock
 from ledger import LEDGER
 
+from gsparc.commands.check import main as check
 from gsparc.data import hdf5_probe
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
-from gsparc.studies.check import main as check
 
 
 def users_file(path: Path) -> Path:

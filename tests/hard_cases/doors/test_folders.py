@@ -15,8 +15,8 @@ from doors import assert_found_bad, assert_refused, knock
 from PIL import Image
 from releases import GREY, SPOILT, write_release
 
-from gsparc.studies.check import main as check
-from gsparc.studies.train import main as train
+from gsparc.commands.check import main as check
+from gsparc.commands.train import main as train
 
 
 @pytest.fixture(scope="module")

@@ -14,10 +14,10 @@ import pytest
 from doors import assert_found_bad, assert_refused, knock
 from ledger import LEDGER
 
+from gsparc.commands.check import main as check
+from gsparc.commands.train import main as train
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
-from gsparc.studies.check import main as check
-from gsparc.studies.train import main as train
 
 Arrays = dict[str, np.ndarray]
 

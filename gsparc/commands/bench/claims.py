@@ -1,0 +1,134 @@
+"""The ratios that are promised, each measured against its counterpart in the same rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from gsparc.commands.bench import kernels, layers, steps
+from gsparc.commands.bench.case import Call
+from gsparc.commands.bench.measure import Machine, measure, undisturbed
+from gsparc.commands.bench.scene import Scene, scene
+from gsparc.methods.timing import ClockSettings, interleaved
+from gsparc.ops.settings import Projection
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A promised ratio.
+
+    Attributes:
+        name: what is promised.
+        ratio: one time over the other, both of the same rounds.
+        bound: what the ratio is compared with.
+        at_least: whether the ratio must be at least, rather than at most, the bound.
+    """
+
+    name: str
+    ratio: float
+    bound: float
+    at_least: bool = False
+
+    @property
+    def met(self) -> bool:
+        """Whether the promise holds in this run."""
+        return self.ratio >= self.bound if self.at_least else self.ratio <= self.bound
+
+
+@torch.no_grad()
+def claims(
+    projection: Projection,
+    counts: Sequence[int],
+    threads: int,
+    batch: int,
+    machine: Machine,
+    clock: ClockSettings,
+) -> list[Claim]:
+    """Every promise for one projection; `counts` ascending, the middle one for the static receiver."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        fields = [scene(count, projection) for count in counts]
+        middle = fields[len(fields) // 2]
+        return [
+            *_backward(middle, clock),
+            *_forward(fields[1:], machine, clock),
+            *_frozen(middle, batch, clock),
+            *_channels(middle, clock),
+            *_growth(fields, clock),
+            *_learning(projection),
+        ]
+    finally:
+        torch.set_num_threads(before)
+
+
+def _backward(field: Scene, clock: ClockSettings) -> list[Claim]:
+    ratio = _ratio(kernels.backward(field, 1).kernel, kernels.moving(field, 1).kernel, clock)
+    return [Claim(f"backward / forward at {len(field)}", ratio, 3.0)]
+
+
+def _forward(fields: list[Scene], machine: Machine, clock: ClockSettings) -> list[Claim]:
+    rows = [measure(kernels.moving(field, 1), machine, None, clock, references=False) for field in fields]
+    return [Claim(f"forward / limit at {row.case.count}", row.over, 3.0) for row in rows]
+
+
+def _channels(field: Scene, clock: ClockSettings) -> list[Claim]:
+    one, many = (_whole(layers.channel(field, *shape, 1)) for shape in ((1, 1), layers.MANY))
+    return [Claim(f"1664 channels / 1 at {len(field)}", _ratio(many, one, clock), 2.0)]
+
+
+def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
+    moving, one, many = (
+        _whole(case)
+        for case in (kernels.moving(field, 1), kernels.frozen(field, 1), kernels.frozen(field, batch))
+    )
+    times = _times({"moving": moving, "one": one, "many": many}, clock)
+    return [
+        Claim(f"moving / frozen at {len(field)}", times["moving"] / times["one"], 3.0, True),
+        Claim(
+            f"moving / frozen, {batch} at once, per query",
+            *(batch * times["moving"] / times["many"], 10.0, True),
+        ),
+    ]
+
+
+def _learning(projection: Projection) -> list[Claim]:
+    """A step takes the same way in either, to 1e-4: what it costs less, a given accuracy costs less."""
+    case = steps.step(projection)
+    assert case.reference is not None
+    ratio = _ratio(case.reference, case.kernel, ClockSettings(rounds=3, least=2, warmup=1, budget_s=2.0))
+    return [Claim(f"training step, PyTorch / kernels at {case.count}", ratio, 2.0, True)]
+
+
+def _growth(fields: list[Scene], clock: ClockSettings) -> list[Claim]:
+    """Time per doubling of N between neighbouring sizes."""
+    calls = {str(len(field)): kernels.moving(field, 1).kernel for field in fields}
+    times = _times(calls, clock)
+    found = []
+    for small, large in pairwise(fields):
+        doublings = np.log2(len(large) / len(small))
+        growth = (times[str(len(large))] / times[str(len(small))]) ** (1 / doublings)
+        found.append(Claim(f"time per doubling, {len(small)} to {len(large)}", growth, 2.2))
+    return found
+
+
+def _whole(case) -> Call:
+    assert case.whole is not None
+    return case.whole
+
+
+def _ratio(above: Call, below: Call, clock: ClockSettings) -> float:
+    times = _times({"above": above, "below": below}, clock)
+    return times["above"] / times["below"]
+
+
+def _times(calls: dict[str, Call], clock: ClockSettings) -> dict[str, float]:
+    def ignoring(call: Call) -> Callable[[int], object]:
+        return lambda turn: call()
+
+    times = interleaved({name: ignoring(call) for name, call in calls.items()}, clock)
+    return {name: undisturbed(values) for name, values in times.items()}

@@ -1,0 +1,93 @@
+"""`gsparc bench`: timings of kernels and queries as ratios to the machine's limit."""
+
+from __future__ import annotations
+
+import gc
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+from omegaconf import DictConfig
+
+from gsparc.commands.bench import kernels, layers, steps
+from gsparc.commands.bench.case import Case
+from gsparc.commands.bench.claims import claims
+from gsparc.commands.bench.measure import Machine, Row, facts, measure
+from gsparc.commands.bench.report import claims_table, markdown, rows_table
+from gsparc.commands.bench.scene import NETWORK, scene
+from gsparc.commands.output import run_directory
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.methods.timing import ClockSettings, machine_facts, peak_memory
+from gsparc.ops.native import instruction_set
+
+log = logging.getLogger(__name__)
+
+RASTERIZER = (
+    *(kernels.plan, kernels.moving, kernels.static, kernels.frozen, kernels.backward, kernels.weights),
+)
+MOVING = (kernels.plan, kernels.moving, kernels.weights)  # a batch is as many plans
+MOST_PLANNED = 1_000_000  # Gaussians times poses in one call
+
+
+def cases(config: DictConfig) -> Iterator[Case]:
+    """All rows of the configured sizes, one alive at a time."""
+    for count in config.counts:
+        for projection in config.projections:
+            field = scene(count, projection)
+            for make in RASTERIZER:
+                for batch in config.batches:
+                    if make in MOVING and count * batch > MOST_PLANNED:
+                        log.info("%s of %d x %d Gaussians left out: too long", make.__name__, batch, count)
+                        continue
+                    yield make(field, batch)
+            yield layers.channel(field, 1, 1, 1)
+            yield layers.channel(field, *layers.MANY, 1)
+        for batch in config.batches:
+            yield layers.emission(count, batch)
+            yield layers.emission(count, batch, NETWORK)
+            yield layers.emission_backward(count, batch)
+    for batch in config.batches:
+        yield layers.loss(batch)
+    for projection in config.projections:
+        yield steps.step(projection)
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    if config.quick:
+        config = config.copy()
+        config.update(
+            {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
+        )
+    clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
+    machine, console = Machine(), open_console()
+    before = machine_facts()["machine/load"]
+    rows: list[Row] = []
+    gc.collect()
+    gc.freeze()  # what the imports left behind is not searched again in the middle of a call
+    for case in cases(config):
+        for turn, threads in enumerate(config.threads):
+            wanted = turn == 0 and not config.quick
+            rows.append(measure(case, machine, threads, clock, references=wanted))
+        log.info("%s: %.3g ms, %.1f x the limit", case.key, float(rows[-1].kernel.mean()), rows[-1].over)
+    promises = [
+        (f"{projection}, {threads} threads", claim)
+        for projection in config.projections
+        for threads in config.threads
+        for claim in claims(projection, list(config.counts), threads, max(config.batches), machine, clock)
+    ]
+    found: dict[str, Any] = {**machine_facts(), **peak_memory(), **provenance()}
+    found["machine/instruction_set"] = instruction_set()
+    for row in rows:
+        found |= facts(row)
+    for where, claim in promises:
+        stem = f"claim/{claim.name}/{where}".replace(",", "").replace(" ", "_")
+        found |= {f"{stem}/ratio": claim.ratio, f"{stem}/promised": claim.bound, f"{stem}/met": claim.met}
+    found["machine/load_before"] = before
+    run_dir = run_directory()
+    write_summary(run_dir / "summary.json", found)
+    (run_dir / "bench.md").write_text(markdown(found, rows, promises), encoding="utf-8")
+    console.print(rows_table(rows, f"{found['machine/cpu']}, {found['machine/instruction_set']}"))
+    console.print(claims_table(promises, "Promises"))
+    return found

@@ -1,0 +1,109 @@
+"""The rows that time what stands around the rasterizer: emission networks, channels and the loss."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torchmetrics.functional.image import structural_similarity_index_measure
+
+from gsparc.commands.bench.case import Case, Work, size
+from gsparc.commands.bench.scene import GRID, NETWORK, PAPER, Scene, places, receivers, scene
+from gsparc.field.emission import Emission, EmissionSettings
+from gsparc.ops import mean_weights
+from gsparc.ops.channels import channels, summed
+from gsparc.ops.networks import networks, products
+from gsparc.training.losses import spectrum_loss
+
+TONES = (2.4e9, 312_500.0)  # first subcarrier and spacing [Hz]
+MANY = (64, 26)  # antennas and subcarriers of the Argos release: 1,664 channels
+NAMES = {PAPER: "emission 3-16-2", NETWORK: "emission 63-32-2"}
+
+
+def emission(count: int, batch: int, settings: EmissionSettings = PAPER) -> Case:
+    """Networks of N Gaussians at B positions (kernel); encoding, distances and activation too (whole)."""
+    model = scene(count, "tangent", settings).model
+    layers = _layers(model.emission)
+    where = places(batch)
+    encoded = model.emission.encoding(where)
+    return Case(
+        *(NAMES[settings], "-", count, batch),
+        work=_work(layers, encoded, count, batch),
+        kernel=lambda: networks(encoded, *layers),
+        whole=lambda: model.emission(where, model.distances(where)),
+        reference=lambda: products(encoded, *layers),
+    )
+
+
+def emission_backward(count: int, batch: int) -> Case:
+    """Gradients of the networks' weights, the forward pass included."""
+    model = scene(count, "tangent").model
+    layers = [layer.requires_grad_() for layer in _layers(model.emission)]
+    encoded = model.emission.encoding(places(batch))
+    slope = torch.rand((batch, count, 2), generator=torch.Generator().manual_seed(0))
+
+    def gradients(call) -> object:
+        with torch.enable_grad():
+            return torch.autograd.grad(call(encoded, *layers), layers, slope)
+
+    once = _work(layers, encoded, count, batch)
+    return Case(
+        *("emission 3-16-2, backward", "-", count, batch),
+        work=Work(2 * once.bytes + size(layers)),
+        kernel=lambda: gradients(networks),
+        reference=lambda: gradients(products),
+    )
+
+
+def loss(batch: int) -> Case:
+    """L1 and SSIM of B spectra with their gradient."""
+    draw = torch.Generator().manual_seed(0)
+    shape = (batch, GRID.height, GRID.width)
+    target = torch.rand(shape, generator=draw)
+    prediction = torch.rand(shape, generator=draw).requires_grad_()
+
+    def kernel() -> object:
+        with torch.enable_grad():
+            return torch.autograd.grad(spectrum_loss(prediction, target).sum(), prediction)
+
+    def convolved() -> object:
+        with torch.enable_grad():
+            ssim = structural_similarity_index_measure(prediction[:, None], target[:, None], data_range=1.0)
+            assert isinstance(ssim, Tensor)
+            return torch.autograd.grad(ssim + (prediction - target).abs().mean(), prediction)
+
+    return Case(
+        *("loss of spectra, backward", "-", 0, batch),
+        work=Work(5 * target.nbytes),
+        kernel=kernel,
+        reference=convolved,
+    )
+
+
+def channel(field: Scene, antennas: int, subcarriers: int, batch: int) -> Case:
+    """Antennas x subcarriers at a moving receiver: the factored sum (kernel); all of the query (whole)."""
+    count, draw = len(field), torch.Generator().manual_seed(0)
+    steering = torch.randn(count, antennas, 2, generator=draw)
+    delays = 1e-7 * torch.rand(count, generator=draw, dtype=torch.float64)
+    gains = torch.randn(batch, count, 2, generator=draw)
+    poses, tx = receivers(batch), places(batch) + 1
+
+    def whole() -> Tensor:
+        share = mean_weights(field.plan(poses, channels=True), *field.geometry).share
+        emitted = field.model.features(tx, poses)
+        return channels(share.unsqueeze(-1) * emitted, steering, delays, *TONES, subcarriers)
+
+    return Case(
+        *(f"channel of {antennas} x {subcarriers}", field.projection, count, batch),
+        work=Work(size((gains, steering, delays)) + 8 * batch * antennas * subcarriers),
+        kernel=lambda: channels(gains, steering, delays, *TONES, subcarriers),
+        whole=whole,
+        reference=lambda: summed(gains, steering, delays, TONES, subcarriers),
+    )
+
+
+def _layers(module: Emission) -> list[Tensor]:
+    return [p.detach() for p in (module.weight1, module.bias1, module.weight2, module.bias2)]
+
+
+def _work(layers: list[Tensor], encoded: Tensor, count: int, batch: int) -> Work:
+    return Work(size(layers) + encoded.nbytes + 4 * batch * count * 2)

@@ -1,0 +1,113 @@
+"""Timing a case beside the machine's own marks, in the same rounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from gsparc.commands.bench.case import Case
+from gsparc.methods.timing import ClockSettings, interleaved
+from gsparc.ops import machine_limits
+
+COPY_BYTES = 48 * 2**20  # with its copy, beyond every cache
+MARK_TASKS = 16  # of the bare exponential loop, a fraction of a millisecond
+
+
+@dataclass(frozen=True)
+class Row:
+    """Times of one case on some threads.
+
+    Attributes:
+        case, threads: what was timed.
+        kernel, whole: wall times of every round [ms]; whole is None where the case has none.
+        limit: the machine's limit by its marks in the same rounds [ms].
+        over: kernel time over the limit.
+        bound: what the limit comes from, `bytes` or `pairs`.
+        reference: one call in plain PyTorch [ms], or None.
+    """
+
+    case: Case
+    threads: int
+    kernel: np.ndarray
+    whole: np.ndarray | None
+    limit: float
+    over: float
+    bound: str
+    reference: float | None
+
+
+def undisturbed(times: np.ndarray) -> float:
+    """The fastest fifth of the rounds: a competing process stretches long calls more than short ones."""
+    return float(np.quantile(times, 0.2))
+
+
+class Machine:
+    """The marks: a copy that no cache holds, and bare exponentials."""
+
+    def __init__(self) -> None:
+        self._source = torch.ones(COPY_BYTES // 4)
+        self._target = torch.zeros_like(self._source)
+
+    def copy(self, _: int = 0) -> int:
+        """Returns the bytes moved."""
+        return machine_limits.copy(self._source, self._target)
+
+    def exponentials(self, _: int = 0) -> int:
+        """Returns how many."""
+        return machine_limits.exponentials(MARK_TASKS)
+
+
+@torch.no_grad()
+def measure(
+    case: Case, machine: Machine, threads: int | None, clock: ClockSettings, *, references: bool = True
+) -> Row:
+    """Time a case on `threads` threads (None: as now), everything once a round; the reference once."""
+    before = torch.get_num_threads()
+    threads = threads or before
+    torch.set_num_threads(threads)
+    try:
+        moved, counted = machine.copy(), machine.exponentials()
+        contenders = {"kernel": lambda turn: case.kernel()}
+        if case.whole is not None:
+            whole = case.whole
+            contenders["whole"] = lambda turn: whole()
+        contenders |= {"exponentials": machine.exponentials, "copy": machine.copy}
+        times = interleaved(contenders, clock)
+        reference = None
+        if references and case.reference is not None:
+            call = case.reference
+            once = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
+            reference = float(np.median(interleaved({"it": lambda turn: call()}, once)["it"]))
+    finally:
+        torch.set_num_threads(before)
+    by_bytes = undisturbed(times["copy"]) * case.work.bytes / moved
+    by_pairs = undisturbed(times["exponentials"]) * case.work.pairs / counted
+    limit = max(by_bytes, by_pairs)
+    return Row(
+        *(case, threads, times["kernel"], times.get("whole")),
+        limit=limit,
+        over=undisturbed(times["kernel"]) / limit,
+        bound="pairs" if by_pairs > by_bytes else "bytes",
+        reference=reference,
+    )
+
+
+def facts(row: Row) -> dict[str, float | str | None]:
+    """Flat keys of one row for the summary; times in milliseconds."""
+    stem = f"bench/{row.case.key}/t{row.threads}"
+    found: dict[str, float | str | None] = {
+        f"{stem}/kernel_ms_p50": float(np.median(row.kernel)),
+        f"{stem}/kernel_ms_p95": float(np.quantile(row.kernel, 0.95)),
+        f"{stem}/limit_ms": row.limit,
+        f"{stem}/over_limit": row.over,
+        f"{stem}/bound": row.bound,
+        f"{stem}/pairs": row.case.work.pairs,
+        f"{stem}/bytes": row.case.work.bytes,
+        f"{stem}/reference_ms": row.reference,
+    }
+    if row.whole is not None:
+        found[f"{stem}/end_to_end_ms_p50"] = float(np.median(row.whole))
+        found[f"{stem}/end_to_end_ms_p95"] = float(np.quantile(row.whole, 0.95))
+    return found

@@ -1,0 +1,193 @@
+"""`gsparc calibrate ckpt=FILE`: compare confidences, promise an error, check the promise."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+from rich.table import Table
+
+from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
+from gsparc.commands.calibrate.pictures import draw
+from gsparc.commands.calibrate.trial import How, Trial, accept, divisible, trials
+from gsparc.commands.output import run_directory, shown, table
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.argos import published_figures, published_normalisation
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.scores import rows_of
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.methods.confidence import Trusted, keep, threshold_of
+from gsparc.methods.confidence_scores import (
+    CHUNK,
+    Evidence,
+    gather,
+    joined,
+    known_positions,
+    position_kernel,
+)
+from gsparc.methods.method import Method
+from gsparc.methods.risk_threshold import Promise
+from gsparc.methods.timing import machine_facts
+
+log = logging.getLogger(__name__)
+
+
+def collect(
+    paths: list[str], dataset: dict[str, Any], split: dict[str, Any]
+) -> tuple[Evidence, dict[str, Any]]:
+    """Evidence of every checkpoint's own test rows, and the facts that name them; no row twice."""
+    parts, seen = [], np.zeros(0, np.int64)
+    facts: dict[str, Any] = {}
+    for path in paths:
+        run = open_files([path], dataset, split)
+        fold = run.split.folds[0]
+        rows = np.setdiff1d(rows_of(fold, "test"), seen)
+        if len(rows):
+            parts.append(gather(run.methods[0], run.data, fold, rows))
+        seen = np.concatenate([seen, rows])
+        facts = facts or {
+            **_published(run.methods[0], run.data, fold),
+            **dataset_facts(run.data), **split_facts(run.split), "model/name": run.methods[0].name
+        }  # fmt: skip
+    return joined(parts), facts
+
+
+def store(path: str, dataset: dict[str, Any], split: dict[str, Any], how: Settled) -> Trusted:
+    """Choose and calibrate on the checkpoint's own test rows, and keep it with the model."""
+    run = open_files([path], dataset, split)
+    method, data, fold = run.methods[0], run.data, run.split.folds[0]
+    evidence = gather(method, data, fold, rows_of(fold, "test"))
+    used, found, _, _ = accept(evidence, how.promise, how.kind, how.spatial, how.seed)
+    stored = Trusted(
+        used, threshold_of(used, found), how.promise, known_positions(data, fold), position_kernel(data, fold)
+    )
+    keep(path, stored)
+    return stored
+
+
+@dataclass(frozen=True)
+class Settled:
+    """How a confidence and its threshold are chosen; see conf/calibration.yaml."""
+
+    promise: Promise
+    kind: str
+    spatial: bool
+    seed: int
+
+
+def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:
+    """`peers/*` and `denormalised/*` of Argos data: the figures under both normalisations, all test rows."""
+    if data.uplink is None:
+        return {}
+    batches = (data.batch(fold.test[i : i + CHUNK]) for i in range(0, len(fold.test), CHUNK))
+    predicted = np.concatenate([method.answer(batch).mean.numpy() for batch in batches])
+    target = data.target[fold.test]
+    both = {"peers": published_normalisation(data.target, fold.train), "denormalised": (0j, 1.0)}
+    found = {room: published_figures(predicted, target, *removed) for room, removed in both.items()}
+    return {f"{room}/{name}": value for room, one in found.items() for name, value in one.items()}
+
+
+def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[str, Any]:
+    """Flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
+    loss = bounded(evidence.error)
+    facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": perfect_area(loss)}
+    for kind, score in evidence.scores.items():
+        curve = risk_coverage(score, loss)
+        facts |= {
+            f"confidence/{kind}/area": curve.area,
+            f"confidence/{kind}/risk_at_70": curve.at(0.7),
+            f"confidence/{kind}/rank_correlation": rank_correlation(score, loss),
+        }
+    bar = facts["confidence/distance/area"]
+    for kind in evidence.scores:
+        below = 1 - facts[f"confidence/{kind}/area"] / bar if bar > 0 else None  # nothing to save
+        facts[f"confidence/{kind}/area_below_distance"] = below
+    facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
+    for trial in found:
+        facts |= {
+            f"trial/{trial.how}/kind": trial.kind,
+            f"trial/{trial.how}/broken": trial.broken,
+            f"trial/{trial.how}/broken_low": None if trial.interval is None else trial.interval[0],
+            f"trial/{trial.how}/broken_high": None if trial.interval is None else trial.interval[1],
+            f"trial/{trial.how}/broken_of_all": trial.broken_of_all,
+            f"trial/{trial.how}/silent": trial.silent,
+            f"trial/{trial.how}/realised": trial.mean_realised,
+            f"trial/{trial.how}/coverage": float(trial.coverage.mean()),
+            f"trial/{trial.how}/draws": len(trial.realised),
+        }
+    return facts
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Gather, resample, write; returns the facts of `summary.json`."""
+    RunSettings.of(config)
+    run_dir = run_directory()
+    paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
+    settings = plain(config)
+    evidence, known = collect(paths, settings["dataset"], settings["split"])
+    if config.confidence != "auto" and config.confidence not in evidence.scores:
+        raise ValueError(f"confidence={config.confidence}: expected auto or {', '.join(evidence.scores)}")
+    promise = Promise(float(config.limit_db), float(config.alpha), float(config.delta))
+    if not divisible(evidence, "spatial"):
+        log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
+    ways: tuple[How, ...] = ("random", "spatial") if divisible(evidence, "spatial") else ("random",)
+    draws = int(config.draws), config.confidence, float(config.apart_m), int(config.seed)
+    found = [trials(evidence, promise, how, *draws) for how in ways]
+    facts = known | figures(evidence, found, promise) | machine_facts() | provenance()
+    facts["seed"] = config.seed
+    write_summary(run_dir / "summary.json", facts)
+    draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
+    console = open_console()
+    for one in tables(facts, evidence, found):
+        console.print(one)
+    if config.store:
+        how = Settled(promise, config.confidence, bool(config.spatial), int(config.seed))
+        for path in paths:
+            stored = store(path, settings["dataset"], settings["split"], how)
+            threshold = stored.threshold if np.isfinite(stored.threshold) else None
+            facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
+            bound = "no threshold keeps the bound" if threshold is None else f"accepted from {threshold:.4g}"
+            console.print(f"{path}: confidence={stored.kind}, {bound}", highlight=False)
+        write_summary(run_dir / "summary.json", facts)
+    console.print(f"written to {run_dir}", highlight=False)
+    return facts
+
+
+def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> list[Table]:
+    """Confidences side by side; bounds beside what came of them."""
+    wanted = {
+        "area under risk-coverage": ("area", ".4g"), "below distance": ("area_below_distance", ".0%"),
+        "risk at 70 %": ("risk_at_70", ".4g"), "rank": ("rank_correlation", ".2f"),
+    }  # fmt: skip
+    curves = [
+        [kind, *(shown(facts[f"confidence/{kind}/{key}"], form) for key, form in wanted.values())]
+        for kind in evidence.scores
+    ]
+    draws = [
+        [
+            trial.how, trial.kind, f"{trial.coverage.mean():.0%}", shown(trial.mean_realised, ".1%"),
+            _broken(trial), f"{trial.broken_of_all:.1%}", f"{trial.delta:.0%}", f"{trial.silent:.0%}",
+        ]
+        for trial in found
+    ]  # fmt: skip
+    numbers = ["accepted", "bad among them", "broken", "of all draws", "promised", "accepted nobody"]
+    heading = f"{facts['dataset/name']}: {len(evidence)} positions of {facts['model/name']}"
+    promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
+    return [
+        table(heading, ["confidence"], list(wanted), curves),
+        table(promise, ["split", "confidence"], numbers, draws),
+    ]
+
+
+def _broken(trial: Trial) -> str:
+    if trial.broken is None or trial.interval is None:
+        return "-"
+    low, high = trial.interval
+    return f"{trial.broken:.1%}, {low:.0%} to {high:.0%}"

@@ -1,0 +1,216 @@
+"""`gsparc compare`: methods x datasets x splits under equal budgets, one table, one figure."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.markdown import Markdown
+
+from gsparc.commands.compare import figure, table
+from gsparc.commands.compare.cells import Budget, Cell, contenders, plan
+from gsparc.commands.compare.fitting import (
+    Filled,
+    Prepared,
+    Problem,
+    fill,
+    kept_in,
+    load_problems,
+    prepare,
+    stored_problems,
+)
+from gsparc.commands.compare.latency import Latency, latencies
+from gsparc.commands.output import run_directory
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.files import platform_cache
+from gsparc.evaluation.console import one_line, open_console
+from gsparc.evaluation.summary import provenance, write_summary
+
+log = logging.getLogger(__name__)
+
+FREE_S = 5.0  # guessed for a method without a budget, until one was seen
+
+
+def task(config: DictConfig) -> list[table.Row]:
+    """Fill the cells that are asked for and not there yet, time all methods, and report."""
+    RunSettings.of(config)
+    run_dir = run_directory()
+    settings = plain(config)
+    methods = contenders(settings["methods"])
+    kept = kept_in(settings["cells"], platform_cache())
+    problems = _problems(settings, kept)
+    budgets = [
+        Budget(float(b["seconds"]), tuple(int(s) for s in b["seeds"]), tuple(b.get("splits") or ()))
+        for b in settings["budgets"]
+    ]
+    wanted = plan([(r.dataset, r.split, r.kind) for r in problems], methods, budgets, settings["only"])
+    by_name = {(r.dataset, r.split): r for r in problems}
+    prepared = [
+        prepare(c, methods[c.method], settings["datasets"][c.dataset], by_name[c.dataset, c.split], kept)
+        for c in wanted
+    ]
+    limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
+    filled = fill_all(prepared, by_name, bool(settings["train"]), limit_s)
+    if not filled:
+        raise ValueError("no cell is filled: nothing to report (train=true fills them)")
+    timed = _timed(filled, by_name, kept, bool(settings["latency"]))
+    return report(filled, timed, str(settings["ours"]), run_dir)
+
+
+def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
+    """Every dataset under every split, splits outermost: the best-known come first.
+
+    Without its path a dataset is there as far as results were kept, for the table alone.
+    """
+    wanted = [str(pattern) for pattern in settings["only"]]
+    problems: list[Problem] = []
+    for name, paths in settings["datasets"].items():
+        splits = [s for s in settings["splits"] if not wanted or any(_may_match(p, name, s) for p in wanted)]
+        if any((paths or {}).values()):
+            problems += load_problems(name, paths, splits) if splits else []
+            continue
+        stored = stored_problems(kept, name, splits)
+        problems += stored
+        log.warning(
+            "%s %s: say datasets.%s.root=DIR or .file=FILE",
+            name, "is here as far as results were kept" if stored else "is left out", name,
+        )  # fmt: skip
+    problems.sort(key=lambda problem: settings["splits"].index(problem.split))
+    if not problems and not any(any((paths or {}).values()) for paths in settings["datasets"].values()):
+        raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
+    if not problems:
+        raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
+    return problems
+
+
+def _may_match(pattern: str, dataset: str, split: str) -> bool:
+    """Whether a pattern of cells can match this problem, so that others need not be loaded."""
+    for part, name in zip(pattern.split("/"), (dataset, split), strict=False):
+        if "*" in part:  # it may stand for what follows, too
+            return fnmatchcase(name, part.partition("*")[0] + "*")
+        if not fnmatchcase(name, part):
+            return False
+    return True
+
+
+def fill_all(
+    prepared: Sequence[Prepared],
+    problems: Mapping[tuple[str, str], Problem],
+    train: bool = True,
+    limit_s: float | None = None,
+) -> list[Filled]:
+    """Find or fill one cell after another, saying how far it is and how long it will take.
+
+    A cell that cannot be filled is said and left out; the others go on.
+    """
+    filled: list[Filled] = []
+    open_cells = [p for p in prepared if p.found() is None and _problem(p.cell, problems).data is not None]
+    log.info("%d cells, %d of them are there", len(prepared), sum(p.found() is not None for p in prepared))
+    started = time.monotonic()
+    left = sum(_expected_s(p.cell, problems) for p in open_cells) if train else 0.0
+    for number, one in enumerate(prepared, 1):
+        found = one.found()
+        problem = _problem(one.cell, problems)
+        if found is None and train and problem.data is not None:
+            expected = _expected_s(one.cell, problems)
+            if limit_s is not None and time.monotonic() - started + expected > limit_s:
+                log.warning("max_hours: %s is not started", one.cell)
+                filled += _earlier(one, problems)
+                continue
+            log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
+            left -= expected
+            try:
+                found = fill(one, problem)
+            except (ValueError, RuntimeError) as error:
+                log.warning("%s cannot be filled: %s", one.cell, one_line(error))
+                continue
+            score = (
+                f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB"
+                if found.scored()
+                else "-"
+            )
+            log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
+        filled += [found] if found is not None else _earlier(one, problems)
+    return filled
+
+
+def _problem(cell: Cell, problems: Mapping[tuple[str, str], Problem]) -> Problem:
+    return problems[cell.dataset, cell.split]
+
+
+def _earlier(one: Prepared, problems: Mapping[tuple[str, str], Problem]) -> list[Filled]:
+    """What was measured with earlier program text, where nothing newer is there."""
+    found = one.found_earlier(_problem(one.cell, problems))
+    return [] if found is None else [found]
+
+
+def _expected_s(cell: Cell, problems: Mapping[tuple[str, str], Problem]) -> float:
+    """Seconds a cell will take: its budget on every fold, and something for scoring [s]."""
+    problem = _problem(cell, problems)
+    folds = 0 if problem.folds is None else len(problem.folds.folds)
+    return folds * ((cell.budget_s or FREE_S) + 2.0)
+
+
+def _timed(
+    filled: Sequence[Filled],
+    problems: Mapping[tuple[str, str], Problem],
+    kept: Path,
+    measure: bool,
+) -> dict[str, dict[str, Latency]]:
+    """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
+    found: dict[str, dict[str, Latency]] = {}
+    for dataset in dict.fromkeys(one.cell.dataset for one in filled):
+        here = [one for one in filled if one.cell.dataset == dataset]
+        split, file = here[0].cell.split, kept / f"latency-{dataset}.json"
+        first = [one for one in here if one.cell.split == split]
+        present = [one for one in first if one.checkpoint.exists()]
+        absent = {o.cell.method for o in first} - {o.cell.method for o in present}
+        stored = json.loads(file.read_text()) if file.exists() else {}
+        if measure and absent and stored:
+            log.warning(
+                "%s: timings are kept ones; models of %s are not here (cells=EMPTY_FOLDER trains all)",
+                dataset, ", ".join(sorted(absent)),
+            )  # fmt: skip
+        elif measure and present and problems[dataset, split].data is not None:
+            log.info("%s: timing single queries of every method in turns", dataset)
+            found[dataset] = latencies(present, problems[dataset, split])
+            file.parent.mkdir(parents=True, exist_ok=True)
+            rows = {name: asdict(one) for name, one in found[dataset].items()}
+            file.write_text(json.dumps(rows, indent=2))
+            continue
+        found[dataset] = {name: Latency(**values) for name, values in stored.items()}
+    return found
+
+
+def report(
+    filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
+) -> list[table.Row]:
+    """Write `compare.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
+    rows = table.rows(filled, timed)
+    blocks = table.blocks(rows)
+    unscored = {one.cell.method for one in filled if not one.scored()}
+    only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
+    page = table.markdown(blocks, ours, only_timed)
+    table.write_csv(rows, run_dir / "compare.csv")
+    (run_dir / "compare.md").write_text(page, encoding="utf-8")
+    figure.draw(rows, run_dir / "compare.png", ours)
+    facts: dict[str, Any] = {"cells": len(filled), **provenance()}
+    for block in blocks:
+        stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
+        facts[f"{stem}/first"] = block.rows[0].method
+        for row in block.rows:
+            facts[f"{stem}/{row.method}/score_db"] = row.score_db
+            facts[f"{stem}/{row.method}/train_s"] = row.train_s
+            facts[f"{stem}/{row.method}/query_ms_p50"] = row.query_ms
+    write_summary(run_dir / "summary.json", facts)
+    console = open_console()
+    console.print(Markdown(page))
+    console.print(f"written to {run_dir}", highlight=False)
+    return rows

@@ -1,0 +1,70 @@
+"""Single-query latency of all methods of a problem, in turns, on one processor, after all training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gsparc.commands.compare.fitting import Filled, Problem
+from gsparc.commands.study.run import queries
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method
+from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved, reference_copy
+
+SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
+ENDLESS_MS = 10_000.0  # from here on it is timed once
+FAST = ClockSettings(rounds=60, budget_s=30.0)
+SLOW = ClockSettings(rounds=5, least=1, warmup=0, budget_s=20.0)
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Of one method, one query end to end.
+
+    Attributes:
+        p50_ms, p95_ms: [ms].
+        to_copy: p50 in units of a 16 MiB copy timed in the same rounds.
+        rounds: how often it was timed.
+    """
+
+    p50_ms: float
+    p95_ms: float
+    to_copy: float
+    rounds: int
+
+
+def latencies(filled: Sequence[Filled], problem: Problem) -> dict[str, Latency]:
+    """One row per method, from the first of its checkpoints."""
+    data, split = problem.present()
+    methods: dict[str, Method] = {}
+    for one in filled:
+        if one.cell.method not in methods:
+            methods[one.cell.method] = checkpoint.load(one.checkpoint)[0]
+    calls = cycling(methods, queries(data, split.folds[0].test))
+    once = interleaved({**calls, COPY: reference_copy()}, replace(SLOW, rounds=1))
+    endless = {name for name in calls if once[name][0] > ENDLESS_MS}
+    cold = {name: calls[name] for name in calls if once[name][0] > SLOW_MS and name not in endless}
+    warm = interleaved(cold, replace(SLOW, rounds=1))  # a first call may make what later ones keep
+    slow = {name for name in cold if warm[name][0] > SLOW_MS}
+    found = {name: latency for name, latency in _summaries(once).items() if name in endless}
+    for group, clock in ((set(calls) - slow - endless, FAST), (slow, SLOW)):
+        if group:
+            timed = interleaved({**{n: calls[n] for n in calls if n in group}, COPY: reference_copy()}, clock)
+            found |= _summaries(timed)
+    return {name: found[name] for name in methods}
+
+
+def _summaries(times: Mapping[str, np.ndarray]) -> dict[str, Latency]:
+    copy = float(np.median(times[COPY]))
+    return {
+        name: Latency(
+            p50_ms=float(np.median(values)),
+            p95_ms=float(np.quantile(values, 0.95)),
+            to_copy=float(np.median(values)) / copy,
+            rounds=len(values),
+        )
+        for name, values in times.items()
+        if name != COPY
+    }

@@ -1,0 +1,74 @@
+"""`gsparc evaluate ckpt=FILE dataset.root=DIR eval_on=test`: test a checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from gsparc.commands.output import run_directory
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.files import platform_cache
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Split, write_split
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
+from gsparc.methods import checkpoint
+
+
+def evaluate_files(
+    paths: Sequence[str | Path],
+    dataset: Mapping[str, Any] | None = None,
+    split: Mapping[str, Any] | None = None,
+    *,
+    eval_on: str = "test",
+    baselines: Sequence[str] = (),
+    cache: Path | None = None,
+) -> tuple[Evaluation, Measurements, Split]:
+    """Evaluate checkpoints of one run, one per fold.
+
+    Args:
+        paths, dataset, split: see `open_files`.
+        eval_on: `train`, `val` or `test`.
+        baselines: shown beside it.
+        cache: where baselines are kept; None keeps nothing.
+
+    Raises:
+        ValueError: as `open_files`.
+    """
+    run = open_files(paths, dataset, split)
+    seconds = [one.extra.get("train_s") for one in run.stored]
+    train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
+    found = evaluate(
+        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache
+    )
+    return found, run.data, run.split
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    RunSettings.of(config)
+    run_dir = run_directory()
+    paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
+    found, data, split = evaluate_files(
+        paths,
+        plain(config.dataset),
+        plain(config.split),
+        eval_on=config.eval_on,
+        baselines=config.baselines,
+        cache=platform_cache() if config.cache is None else Path(config.cache),
+    )
+    seed = checkpoint.read(paths[0]).configuration.get("seed")
+    facts = {**found.facts, **provenance(), "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
+    write_summary(run_dir / "summary.json", facts)
+    write_samples(run_dir / "per_sample.csv", found.columns)
+    write_split(run_dir / "split.json", split, len(data), data.site.sha256)
+    title = f"{data.site.name}, split {split.name}, {config.eval_on}"
+    console = open_console()
+    console.print(results_table(facts, facts["model/name"], title, config.eval_on))
+    console.print(f"written to {run_dir}", highlight=False)
+    return facts

@@ -1,0 +1,107 @@
+"""Block error rates, throughput and the price of accepting more, drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.commands.link.adaptation import Rates
+from gsparc.commands.link.study import Curve
+from gsparc.commands.output import panels, save
+from gsparc.methods.risk_threshold import binomial_interval
+
+STYLES = {
+    "perfect@accepted": ("perfect, accepted", "black", "-"),
+    "ls@accepted": ("LS pilots, accepted", "tab:grey", "-"),
+    "lmmse@accepted": ("LMMSE pilots, accepted", "tab:green", "-"),
+    "predicted@accepted": ("predicted, accepted", "tab:blue", "-"),
+    "predicted_variance@accepted": ("predicted with its variance, accepted", "tab:purple", "-"),
+    "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", "tab:brown", "-"),
+    "perfect": ("perfect, all", "black", ":"),
+    "lmmse": ("LMMSE pilots, all", "tab:green", ":"),
+    "predicted": ("predicted, all", "tab:red", ":"),
+    "predicted_pilots": ("prediction corrected by pilots, all", "tab:brown", ":"),
+    "fallback": ("predicted, else LMMSE pilots, all", "tab:orange", "--"),
+}
+SHORT = {
+    "perfect": "k-o",
+    "lmmse": "g-o",
+    "predicted": "b-o",
+    "predicted_variance": "m--o",
+    "predicted_pilots": "C5-o",
+}
+NAMES = {
+    "predicted_variance": "predicted with its variance",
+    "predicted_pilots": "prediction corrected by pilots",
+}
+LEAST_RATE = 3e-4
+
+
+def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path) -> None:
+    """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
+    figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn))
+    for column, (modulation, curves) in enumerate(drawn.items()):
+        for name, (label, colour, line) in STYLES.items():
+            if name not in curves:
+                continue
+            curve = curves[name]
+            shown = np.maximum(curve.bler, LEAST_RATE)
+            bounds = [
+                binomial_interval(int(e), int(n)) for e, n in zip(curve.errors, curve.blocks, strict=True)
+            ]
+            low, high = np.maximum(np.array(bounds).T, LEAST_RATE)
+            axes[0, column].errorbar(
+                curve.ebno_db, shown, [np.maximum(shown - low, 0), np.maximum(high - shown, 0)],
+                color=colour, linestyle=line, marker=".", capsize=2, label=label, linewidth=1.2,
+            )  # fmt: skip
+            axes[1, column].plot(
+                curve.ebno_db, np.maximum(curve.ber, 1e-6), color=colour, linestyle=line, marker="."
+            )
+        axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
+        axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
+        for row, what in enumerate(("block error rate", "bit error rate")):
+            axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=what)
+            axes[row, column].grid(alpha=0.3, which="both")
+    axes[0, 0].legend(fontsize=7)
+    save(figure, path)
+
+
+def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
+    """Throughput over noise, and the confidence of right and wrong choices."""
+    figure, grid = panels(11, 4, 1, 2)
+    left, right = grid[0]
+    snr = [one.snr_db for one in found]
+    left.plot(snr, [one.oracle_bps.mean() / 1e6 for one in found], "k-o", label="from the true channel")
+    left.plot(snr, [one.best_bps.mean() / 1e6 for one in found], "k:", label="the most there is")
+    left.plot(snr, [one.chosen_bps.mean() / 1e6 for one in found], "b--o", label="from the predicted one")
+    left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
+    left.legend()
+    left.grid(alpha=0.3)
+    middle = found[len(found) // 2]
+    miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
+    groups = [score[miss == value] for value in range(4)]
+    labels = [f"{name}\n(n={len(g)})" for name, g in zip(("0", "1", "2", "more"), groups, strict=True)]
+    present = [(label, g) for label, g in zip(labels, groups, strict=True) if len(g)]
+    right.boxplot([g for _, g in present], tick_labels=[label for label, _ in present])
+    right.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
+    right.grid(alpha=0.3)
+    save(figure, path)
+
+
+def draw_acceptance(
+    found: Mapping[str, Mapping[str, np.ndarray]], threshold_share: float, path: Path
+) -> None:
+    """Block error rate of the surest share of positions, a panel a modulation."""
+    figure, grid = panels(5.5 * len(found), 4, 1, len(found))
+    for axis, (modulation, trade) in zip(grid[0], found.items(), strict=True):
+        for name, rates in trade.items():
+            if name in SHORT:
+                axis.plot(trade["share"], rates, SHORT[name], label=NAMES.get(name, name))
+        axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
+        axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
+        axis.set_title(f"{modulation.upper()} at {float(trade['ebno_db']):g} dB")
+        axis.legend(fontsize=8)
+        axis.grid(alpha=0.3)
+    save(figure, path)

@@ -1,0 +1,61 @@
+"""`gsparc report RUN_DIR...`: runs side by side, one page that opens offline, CSV and Markdown."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from gsparc.commands.output import run_directory
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.report.page import studies, write
+from gsparc.evaluation.report.readme import refresh
+from gsparc.evaluation.report.runs import columns, find_runs
+from gsparc.evaluation.report.timing import retime
+from gsparc.evaluation.summary import provenance, write_summary
+
+log = logging.getLogger(__name__)
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    paths = [Path(path) for path in config.runs]
+    runs = find_runs(paths)
+    if config.retime:
+        runs = retime(runs, rounds=int(config.rounds), budget_s=float(config.budget_s))
+    out = run_directory()
+    shown = studies(runs, _fronts(paths))
+    origin = provenance()
+    made = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by gsparc at commit {str(origin['git'])[:8]}"
+    write(out, config.title, made, shown)
+    facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(shown), **origin}
+    for run in runs:
+        stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
+        p50, p95 = run.latency
+        facts |= {
+            f"{stem}/{run.figure}": run.figure_of(run.figure),
+            f"{stem}/train_s": run.facts["time/train_s"],
+        }
+        facts |= {f"{stem}/render_ms_p50": p50, f"{stem}/render_ms_p95": p95}
+    write_summary(out / "summary.json", facts)
+    console = open_console()
+    if config.readme:
+        refresh(Path(config.readme), runs)
+        console.print(f"table in {config.readme} written anew", highlight=False)
+    console.print(f"{made}; written to {out / 'report.html'}", highlight=False)
+    return facts
+
+
+def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
+    """Swept fronts in and below the directories, with the names of their datasets."""
+    files = [file for path in paths for file in sorted(path.rglob("tradeoff.csv"))]
+    found = []
+    for file in files:
+        summary = json.loads((file.parent / "summary.json").read_text(encoding="utf-8"))
+        found.append((str(summary["dataset/name"]), columns(file)))
+    return found

@@ -1,0 +1,104 @@
+"""`gsparc simulate scene=... effects=... out=FILE`: a dataset, simulating only what it needs."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from hydra.utils import to_absolute_path
+from omegaconf import DictConfig
+
+from gsparc.commands.output import run_directory
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.evaluation import summary
+from gsparc.evaluation.console import open_console
+from gsparc.simulate import pictures
+from gsparc.simulate.auto import AutoSettings
+from gsparc.simulate.campaign import Outcome, simulate
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.effects import from_config as effects_from_config
+from gsparc.simulate.raytracer import Sampling
+from gsparc.simulate.report import choice_table, figures, reasons
+from gsparc.simulate.scenes.build import from_config as scene_from_config
+from gsparc.simulate.settings import Campaign, CsiSettings
+from gsparc.simulate.spectrum import SpectrumSettings
+
+log = logging.getLogger(__name__)
+
+
+def campaign(config: DictConfig) -> Campaign:
+    """The campaign that a composed configuration describes.
+
+    Raises:
+        ValueError: a setting that does not exist or cannot be.
+    """
+    settings = plain(config)
+    return Campaign(
+        scene_from_config(settings["scene"]),
+        _effects(settings["effects"]),
+        Sampling(**settings["sampling"]),
+        SpectrumSettings(**settings["spectrum"]),
+        CsiSettings(**settings["csi"]),
+        shard=int(settings["shard"]),
+        check=int(settings["check"]),
+        check_seed=int(settings["check_seed"]),
+        weakest_db=float(settings["weakest_db"]),
+        measurement=str(settings["measurement"]),
+    )
+
+
+def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
+    if "full" not in config:
+        return effects_from_config(config)
+    return AutoSettings(**{**config, "full": effects_from_config(config["full"])})
+
+
+def task(config: DictConfig) -> Outcome:
+    """Simulate, then table, summary and pictures."""
+    RunSettings.of(config)
+    run_dir = run_directory()
+    out = Path(to_absolute_path(str(config.out)))
+    begin, busy = time.perf_counter(), time.process_time()
+    outcome = simulate(campaign(config), out)
+    seconds = time.perf_counter() - begin
+    pictures.floor_plan(outcome, run_dir / "floor_plan.png")
+    console = open_console()
+    if outcome.choice is not None:
+        pictures.effect_shares(outcome.choice, run_dir / "effects.png")
+        console.print(choice_table(outcome.choice))
+        for line in reasons(outcome.choice):
+            console.print(line, highlight=False, soft_wrap=True, markup=False)
+    load = os.getloadavg()[0] / (os.cpu_count() or 1)
+    facts = {
+        **figures(outcome),
+        "time/total_s": seconds,
+        "time/cpu_s": time.process_time() - busy,  # of all threads: what a busy machine cannot inflate
+        "machine/load": load,
+        "out": str(config.out),
+        "out/mb": out.stat().st_size / 1e6,
+        **summary.provenance(),
+    }
+    summary.write_summary(run_dir / "summary.json", facts)
+    for line in _closing(outcome, seconds, load):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+    console.print(f"written to {out}; summary and pictures in {run_dir}", highlight=False, soft_wrap=True)
+    return outcome
+
+
+def _closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
+    count = len(outcome.receivers)
+    lines = [
+        f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "
+        + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),
+        f"{outcome.made.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
+    ]
+    if outcome.convergence is not None:
+        error = outcome.convergence
+        lines.append(
+            f"convergence error between two seeds: channel NMSE {error.nmse:.2g}, "
+            f"spectra {error.spectrum_psnr_db:.1f} dB, SSIM {error.spectrum_ssim:.4f}"
+        )
+    return lines

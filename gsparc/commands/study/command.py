@@ -1,0 +1,94 @@
+"""`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
+
+Leaves `study.csv`, `study.png` and `summary.json`, whose `study/<variant>[/<what>/<amount>]/*` hold the
+accuracy under its own name, seconds of training, milliseconds of a query and their ratios to `base`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
+
+from gsparc.commands.context import context_of
+from gsparc.commands.output import columns, run_directory, shown, table
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.study.figure import draw
+from gsparc.commands.study.study import Row, Study, Variant
+from gsparc.data.load import load, split_for
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.summary import provenance, run_conditions, write_samples, write_summary
+from gsparc.methods.method import Method
+from gsparc.methods.registry import build, method_class
+from gsparc.methods.timing import ClockSettings, machine_facts
+
+
+def variants_of(config: DictConfig) -> list[Variant]:
+    """Those of `config.variants`, each overrides of `config.model`, then `config.baselines` by name."""
+
+    def maker(overrides: Any) -> Callable[[], Method]:
+        return lambda: build(OmegaConf.merge(config.model, overrides))  # type: ignore[arg-type]
+
+    found = [Variant(str(name), maker(overrides)) for name, overrides in config.variants.items()]
+    return found + [Variant(name, method_class(name)) for name in config.baselines]
+
+
+def study_of(config: DictConfig) -> Study:
+    """The study that a composed configuration describes."""
+    return Study(
+        variants_of(config),
+        instantiate(config.kind).conditions(),
+        config.base,
+        int(config.rounds),
+        int(config.seed),
+        ClockSettings(rounds=int(config.queries), budget_s=float(config.query_s)),
+    )
+
+
+def task(config: DictConfig) -> list[Row]:
+    """Run the study, show its table, write its files."""
+    settings = RunSettings.of(config)
+    run_dir = run_directory()
+    study = study_of(config)
+    data = load(plain(config.dataset))
+    split = split_for(plain(config.split), data)
+    rows = study.run(data, split, context_of(config, run_dir))
+    facts: dict[str, Any] = {
+        **dataset_facts(data), **split_facts(split), **machine_facts(), **provenance(),
+        "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,
+    }  # fmt: skip
+    for row in rows:
+        facts |= row.facts()
+    title = f"{data.site.name}, split {split.name}: {instantiate(config.kind).title}"
+    write_samples(run_dir / "study.csv", columns(rows, Row))
+    draw(rows, title, run_dir / "study.png")
+    write_summary(run_dir / "summary.json", facts)
+    console = open_console()
+    console.print(table_of(rows, title))
+    for remark in run_conditions(facts):
+        console.print(remark, highlight=False)
+    ratios = "" if study.base is None else f"ratios to {study.base!r}; "
+    console.print(f"{ratios}written to {run_dir}", highlight=False)
+    return rows
+
+
+def table_of(rows: Sequence[Row], title: str) -> Table:
+    """A line per row; conditions and ratios where the study has any."""
+    changed = any(row.what != "none" for row in rows)
+    compared = any(row.train_ratio is not None for row in rows)
+    ratio = ["ratio"] if compared else []
+    lines = []
+    for row in rows:
+        change = row.what if row.what == "none" else f"{row.what} {row.amount:g}"
+        value = f"{row.value:.4g}" + ("" if row.spread is None else f" ± {row.spread:.2g}")
+        train, query = ([row.train_ratio], [row.query_ratio]) if compared else ([], [])
+        numbers = (row.train_s, *train, row.train_cpu_s, row.query_ms, row.query_p95_ms, *query)
+        words = [row.variant, row.effects, *([change] if changed else [])]
+        lines.append([*words, f"{row.rows:g}", value, *(shown(number, ".3g") for number in numbers)])
+    words = ["variant", "effects", *(["changed"] if changed else [])]
+    costs = ["train s", *ratio, "cpu s", "query ms", "p95", *ratio]
+    return table(title, words, ["rows", rows[0].figure, *costs], lines)

@@ -1,0 +1,98 @@
+"""Kinds of studies (`conf/kind`): what is done to the data before every variant is fitted and scored."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+from gsparc.commands.study.disturb import displaced, thinned, turned
+from gsparc.commands.study.study import Condition
+
+
+@dataclass(frozen=True)
+class Effects:
+    """What each effect costs, and what it gains: the data stay as they are."""
+
+    title: ClassVar[str] = "what effects cost and gain"
+
+    def conditions(self) -> list[Condition]:
+        """The data as they are."""
+        return [Condition()]
+
+
+@dataclass(frozen=True)
+class Positions:
+    """What errors of positions and of directions of arrival cost.
+
+    Attributes:
+        errors_m: standard deviations of each coordinate [m].
+        errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
+        train_errors: whether training positions are disturbed, too; else those of queries alone.
+    """
+
+    title: ClassVar[str] = "accuracy against errors of positions and directions"
+    errors_m: Sequence[float] = ()
+    errors_deg: Sequence[float] = ()
+    train_errors: bool = True
+
+    def conditions(self) -> list[Condition]:
+        """No error, then errors of positions in a `query`, in training (`train`), and of `directions`."""
+        errors, degrees = list(map(float, self.errors_m)), list(map(float, self.errors_deg))
+        return [
+            Condition(),
+            *(_query(error) for error in errors),
+            *(_train(error) for error in errors if self.train_errors),
+            *(_directions(error) for error in degrees),
+        ]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Accuracy against the number of measurements.
+
+    Attributes:
+        keep: training sets, as shares of the rows up to 1 or as numbers of rows above; smaller ones are
+            subsets of larger ones. Validation rows are thinned with them, test rows stay.
+    """
+
+    title: ClassVar[str] = "accuracy against the number of measurements"
+    keep: Sequence[float] = (1.0,)
+
+    def __post_init__(self) -> None:
+        if not self.keep or not all(float(keep) > 0 for keep in self.keep):
+            raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
+
+    def conditions(self) -> list[Condition]:
+        """A condition per training set, called `keep`."""
+        return [_keep(float(keep)) for keep in self.keep]
+
+
+def _query(error_m: float) -> Condition:
+    return Condition(
+        "query", error_m,
+        tested=lambda data, split, seed: displaced(
+            data, np.concatenate([fold.test for fold in split.folds]), error_m, seed
+        ),
+    )  # fmt: skip
+
+
+def _train(error_m: float) -> Condition:
+    return Condition(
+        "train", error_m,
+        learned=lambda data, fold, seed: (
+            displaced(data, np.concatenate([fold.train, fold.val]), error_m, seed), fold
+        ),
+    )  # fmt: skip
+
+
+def _directions(error_deg: float) -> Condition:
+    return Condition(
+        "directions", error_deg, learned=lambda data, fold, seed: (turned(data, error_deg, seed), fold)
+    )
+
+
+def _keep(keep: float) -> Condition:
+    return Condition("keep", keep, learned=lambda data, fold, seed: (data, thinned(fold, keep, seed)))

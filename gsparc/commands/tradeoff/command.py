@@ -1,0 +1,196 @@
+"""`gsparc tradeoff ckpt=FILE`: accuracy against latency; the front is kept with the model."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from omegaconf import DictConfig
+
+from gsparc.commands.output import run_directory, table
+from gsparc.commands.settings import plain
+from gsparc.commands.tradeoff.picture import Other, beaten_by, draw
+from gsparc.commands.tradeoff.sweep import candidate, sweep
+from gsparc.data.files import platform_cache
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
+from gsparc.evaluation.metrics import DECIDING, score_of
+from gsparc.evaluation.open_runs import Opened, open_files
+from gsparc.evaluation.scores import rows_of, score
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.methods import checkpoint, stored_front
+from gsparc.methods.method import Method
+from gsparc.methods.pareto import Point, cost_of_halving, front
+from gsparc.methods.predictor import Predictor
+from gsparc.methods.reduced import combinations, contributions, reduced
+from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
+
+log = logging.getLogger(__name__)
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    run_dir = run_directory()
+    run = open_files([config.ckpt], plain(config.dataset), plain(config.split))
+    fold, data, method = run.split.folds[0], run.data, run.methods[0]
+    rows = rows_of(fold, config.eval_on)
+    learned = np.sort(np.concatenate([fold.train, fold.val]))
+    measured = contributions(method, data, learned)
+    settings = list(combinations(method, plain(config.grid), plain(config.singles)))
+    threads = _threads(config.threads)
+    log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
+    candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
+    others = _others(config, run)
+    places = data.moving[rows] + data.site.origin
+    clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
+    clock = replace(BLOCKS, rounds=config.rounds, budget_s=config.budget_s)
+    timed = {COPY: reference_copy(), **clocks}
+    points, other_ms = sweep(candidates, data, fold, eval_on=config.eval_on, clock=clock, others=timed)
+    figure = DECIDING[data.site.kind]
+    shown = front([p.p50 for p in points], [score_of(figure, p.value(figure)) for p in points])
+    chosen = front([p.p50 for p in points], [p.closeness_db for p in points])
+    if config.store:
+        stored_front.keep(Path(config.ckpt), [points[i] for i in chosen], figure, measured)
+    beside = {
+        name: Other(value, float(np.median(other_ms[name])), float(np.quantile(other_ms[name], 0.95)))
+        for name, (_, value) in others.items()
+        if value is not None
+    }
+    copy_ms = float(np.median(other_ms[COPY]))
+    write_samples(run_dir / "tradeoff.csv", _columns(points, shown, chosen, copy_ms))
+    best = [points[i] for i in shown]
+    title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
+    draw(points, shown, beside, figure, title, run_dir / "tradeoff.png")
+    facts = {
+        **_facts(points, best, figure, beside, copy_ms),
+        **machine_facts(), **peak_memory(), **provenance(), **dataset_facts(data), **split_facts(run.split),
+        "model/name": method.name,
+        "ckpt": str(config.ckpt),
+        "seed": run.stored[0].configuration.get("seed"),
+        "time/includes": "one query end to end: world position in, physical units out; warm",
+        "tradeoff/stored": len(chosen) if config.store else 0,
+    }  # fmt: skip
+    write_summary(run_dir / "summary.json", facts)
+    _show(best, figure, facts, title, run_dir)
+    for p in best:
+        other = beaten_by(p, beside, figure)
+        if other is not None:
+            log.warning("%s: %s is as fast and better", p.label, other)
+    return facts
+
+
+def _threads(given: Sequence[int] | None) -> list[int]:
+    found = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
+    cores = os.cpu_count() or 1
+    if not found or found[0] < 1 or found[-1] > cores:
+        raise ValueError(
+            f"threads={found}: numbers between 1 and the {cores} cores of this machine are needed"
+        )
+    return found
+
+
+def _others(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | None]]:
+    """Baselines and the methods in other checkpoints, with the deciding figure of each."""
+    figure, fold, data = DECIDING[run.data.site.kind], run.split.folds[0], run.data
+    cache = platform_cache() if config.cache is None else Path(config.cache)
+    found: dict[str, tuple[Method, float | None]] = {}
+    for name in config.baselines:
+        fitted = baseline(name, data, run.split, config.eval_on, cache)
+        found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
+    for path in config.peers:
+        method, other = checkpoint.load(path)
+        if other.extra.get("split_sha256") not in (None, run.split.sha256):
+            raise ValueError(f"peers: {path} was trained on another split than {config.ckpt}")
+        name = next(
+            n for n in (method.name, f"{method.name} ({Path(path).parent.name})", path) if n not in found
+        )
+        found[name] = (method, _scored(method, data, fold, config.eval_on)[figure])
+    return found
+
+
+def _scored(method: Method, data: Measurements, fold: Fold, eval_on: str) -> dict[str, float | None]:
+    return score([method], data, Split("tradeoff", (fold,), ""), eval_on).figures()
+
+
+def _columns(
+    points: list[Point], shown: list[int], chosen: list[int], copy_ms: float
+) -> dict[str, list[Any]]:
+    """Columns of `tradeoff.csv`, fastest point first."""
+    order = sorted(range(len(points)), key=lambda i: points[i].p50)
+    rows = [points[i] for i in order]
+    knobs = list(dict.fromkeys(knob for p in points for knob in p.settings))
+    return {
+        "label": [p.label for p in rows],
+        "render_ms_p50": [p.p50 for p in rows],
+        "render_ms_p95": [p.p95 for p in rows],
+        "ratio_to_copy": [p.p50 / copy_ms for p in rows],
+        **{figure: [p.figures[figure] for p in rows] for figure in points[0].figures},
+        "difference_to_full": [p.difference[0] for p in rows],
+        "difference_se": [p.difference[1] for p in rows],
+        "closeness_db": [p.closeness_db for p in rows],
+        "front": [int(i in shown) for i in order],
+        "kept_with_model": [int(i in chosen) for i in order],
+        "threads": [p.threads for p in rows],
+        "num_gaussians": [p.size for p in rows],
+        **{f"set/{knob}": [_cell(p.settings.get(knob)) for p in rows] for knob in knobs},
+    }
+
+
+def _cell(value: Any) -> Any:
+    return "+".join(map(str, value)) if isinstance(value, (list, tuple)) else value
+
+
+def _facts(
+    points: list[Point], best: list[Point], figure: str, others: dict[str, Other], copy_ms: float
+) -> dict[str, Any]:
+    full = min((p for p in points if not p.settings), key=lambda p: p.p50)
+    useful = [p for p in best if beaten_by(p, others, figure) is None]  # a slope of points that others beat
+    halving = cost_of_halving([p.p50 for p in useful], [score_of(figure, p.value(figure)) for p in useful])
+    facts: dict[str, Any] = {
+        "tradeoff/points": len(points),
+        "tradeoff/front": len(best),
+        "tradeoff/span": best[-1].p50 / best[0].p50,
+        "tradeoff/per_halving": halving,
+        "tradeoff/figure": figure,
+        "tradeoff/front_beaten_by_others": sum(beaten_by(p, others, figure) is not None for p in best),
+        "time/copy_ms": copy_ms,
+        "time/render_ms_p50": full.p50,
+        "time/render_ms_p95": full.p95,
+        f"test/{figure}": full.value(figure),
+    }
+    for number, p in enumerate(best, 1):
+        stem = f"front/{number}"
+        facts |= {f"{stem}/render_ms_p50": p.p50, f"{stem}/render_ms_p95": p.p95, f"{stem}/label": p.label}
+        facts |= {f"{stem}/{name}": value for name, value in p.figures.items()}
+    for name, other in others.items():
+        facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
+    return facts
+
+
+def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run_dir: Path) -> None:
+    rows = []
+    for p in best:
+        gap, error = p.difference
+        apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
+        rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
+    console = open_console()
+    console.print(table(title, ["not beaten"], ["ms p50", "ms p95", figure, "difference to full"], rows))
+    slope = facts["tradeoff/per_halving"]
+    if slope is not None:
+        beaten = facts["tradeoff/front_beaten_by_others"]
+        rest = f" ({len(best) - beaten} that no baseline beats)" if beaten else ""
+        console.print(
+            f"{len(best)} points span {facts['tradeoff/span']:.1f} times in latency; each halving costs "
+            f"{slope:.2g} dB on average along the front{rest}",
+            highlight=False,
+        )
+    console.print(f"written to {run_dir}", highlight=False)

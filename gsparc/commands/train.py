@@ -1,0 +1,248 @@
+"""Compose, fit, test, write: what `train.py` and `gsparc train` do."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
+from lightning.pytorch.loggers import Logger
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.commands import cli
+from gsparc.commands.context import context_of
+from gsparc.commands.settings import RunSettings
+from gsparc.data.files import platform_cache
+from gsparc.data.instantiate import suggest
+from gsparc.data.load import datamodule, split_for
+from gsparc.data.schema import Kind, Measurements
+from gsparc.data.splits import Split, write_split
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.evaluate import Evaluation, evaluate
+from gsparc.evaluation.metrics import DECIDING, figure_names, score_of
+from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.pictures import draw_predictions
+from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
+from gsparc.methods import checkpoint
+from gsparc.methods.method import Method, Resumable, TrainsByGradient
+from gsparc.methods.registry import build
+
+log = logging.getLogger(__name__)
+
+LEAST_ROWS = 4  # fewer training rows than this teach nothing
+
+
+@dataclass(frozen=True)
+class Objects:
+    """What a run made, for callers from Python.
+
+    Attributes:
+        methods: one fitted method per fold.
+        checkpoints: their files.
+        data, split: what they learned from.
+        evaluation: figures and per-sample columns.
+    """
+
+    methods: tuple[Method, ...]
+    checkpoints: tuple[Path, ...]
+    data: Measurements
+    split: Split
+    evaluation: Evaluation
+
+
+def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
+    """Fit a method on every fold of a split, test it beside the baselines, and write it all down.
+
+    Args:
+        config: as composed from conf/train.yaml.
+        run_dir: where checkpoints, curves, pictures and `summary.json` go.
+
+    Returns:
+        The facts of `summary.json`, and the objects they were computed from.
+
+    Raises:
+        ValueError: bad data, settings or checkpoint; one line each.
+    """
+    RunSettings.of(config)
+    _refuse_absent(config.ckpt_path)
+    _anchor(config)
+    module = datamodule(config.dataset)
+    if config.get("init_from") is not None:
+        module.measurements = _seen_from(config.init_from, module.measurements)
+    data = module.measurements
+    objective_of(config, data.site.kind)  # refused now, not after the training
+    split = split_for(_plain(config.split), data)
+    _refuse_empty(split)
+    write_split(run_dir / "split.json", split, len(data), data.site.sha256)
+    config_yaml = OmegaConf.to_yaml(config, resolve=True)
+    methods, files, seconds = [], [], []
+    with _loggers(config) as loggers:
+        for number, fold in enumerate(split.folds):
+            folder = run_dir if len(split.folds) == 1 else run_dir / f"fold{number}"
+            method = build(config.model)
+            _refuse_start(config, method)
+            for guess in method.guesses if number == 0 else ():
+                log.info("guess: %s", guess)
+            resume = _resume(config, number, len(split.folds))
+            if resume is not None and not isinstance(method, Resumable):
+                raise ValueError(
+                    f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path"
+                )
+            report = method.fit(data, fold, context_of(config, folder, module, loggers, resume))
+            _note_unused_trainer(method)
+            for note in report.notes:
+                log.info("%s", note)
+            file = folder / "model.ckpt"
+            extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
+            checkpoint.save(file, method, config_yaml, extra)
+            methods.append(method)
+            files.append(file)
+            seconds.append(report.seconds)
+        found = evaluate(
+            methods, seconds, data, split,
+            eval_on=config.eval_on, baselines=list(config.baselines), cache=platform_cache(),
+        )  # fmt: skip
+        facts = {**found.facts, **provenance(), "seed": int(config.seed)}
+        for logger in loggers:
+            logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
+    draw_predictions(
+        methods[0],
+        data,
+        split.folds[0],
+        f"{data.site.name}: test rows of {methods[0].name}",
+        run_dir / "test.png",
+    )
+    write_samples(run_dir / "per_sample.csv", found.columns)
+    write_summary(run_dir / "summary.json", facts)
+    return facts, Objects(tuple(methods), tuple(files), data, split, found)
+
+
+def _plain(node: DictConfig) -> dict[str, Any]:
+    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
+
+
+def _anchor(config: DictConfig) -> None:
+    """Data paths become absolute, so that a checkpoint finds its data from any folder."""
+    for key in ("root", "file"):
+        if not OmegaConf.is_missing(config.dataset, key) and config.dataset.get(key):
+            config.dataset[key] = str(Path(config.dataset[key]).resolve())
+
+
+def _refuse_empty(split: Split) -> None:
+    for number, fold in enumerate(split.folds):
+        if len(fold.train) < LEAST_ROWS or not len(fold.test):
+            raise ValueError(
+                f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
+                f"rows; at least {LEAST_ROWS} and 1 are needed"
+            )
+
+
+def _refuse_absent(path: str | None) -> None:
+    """Before anything is read or simulated: there is nothing to go on with."""
+    if path is not None and not Path(path).exists():
+        raise ValueError(f"ckpt_path={path}: no such file")
+
+
+def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
+    """The checkpoint to go on from; a run with several folds resumes each from its own folder."""
+    if config.ckpt_path is None:
+        return None
+    path = Path(config.ckpt_path)
+    if folds == 1:
+        return path
+    own = path / f"fold{number}" / "last.ckpt"
+    if path.is_file():
+        raise ValueError(
+            f"ckpt_path={path}: split={config.split.name} has {folds} folds, give the run's folder"
+        )
+    return own if own.exists() else None
+
+
+def _seen_from(path: str, data: Measurements) -> Measurements:
+    """`data` in the local coordinates and units of the model that training starts from."""
+    try:
+        return aligned(data, checkpoint.read(path).site)
+    except ValueError as error:
+        raise ValueError(f"init_from={path}: {error}") from None
+
+
+def _refuse_start(config: DictConfig, method: Method) -> None:
+    """Weights to start from mean nothing to a method without any."""
+    if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
+        raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
+
+
+def _note_unused_trainer(method: Method) -> None:
+    """Say so when options of the Trainer were asked for and the method had no use for them."""
+    if isinstance(method, TrainsByGradient) and method.trainer_options():
+        return
+    said = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+    unused = [o for o in said if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]
+    log.log(
+        logging.WARNING if unused else logging.DEBUG,
+        "%s does not train by gradient: trainer options (%s) are not used",
+        method.name,
+        ", ".join(unused) or "accelerator, devices, precision, max_steps, ...",
+    )
+
+
+@contextmanager
+def _loggers(config: DictConfig) -> Iterator[Sequence[Logger]]:
+    """The run's loggers, closed whatever happens."""
+    made: list[Logger] = []
+    status = "failed"
+    try:
+        made.extend(instantiate(node) for node in (config.logger or {}).values())
+        yield made
+        status = "success"
+    finally:
+        for logger in made:
+            logger.finalize(status)
+            if hasattr(logger, "experiment") and hasattr(logger.experiment, "finish"):
+                logger.experiment.finish(exit_code=0 if status == "success" else 1)
+
+
+def objective_of(config: DictConfig, kind: Kind) -> str:
+    """The figure that a search improves, of rows `eval_on`; `objective: null` takes the deciding one.
+
+    Raises:
+        ValueError: there is no such figure.
+    """
+    figures = [DECIDING[kind], *figure_names(kind), "skill"]
+    known = {f"{config.eval_on}/{figure}": figure for figure in figures}
+    asked = config.get("objective")
+    if asked is not None and asked not in known:
+        raise ValueError(f"objective={asked}: no such figure{suggest(str(asked), known)}")
+    return known[asked] if asked is not None else DECIDING[kind]
+
+
+def task(config: DictConfig) -> float:
+    """Train as configured and show the table.
+
+    Returns:
+        The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned.
+    """
+    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    facts, objects = train(config, run_dir)
+    figure = objective_of(config, objects.data.site.kind)
+    title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
+    console = open_console()
+    console.print(results_table(facts, facts["model/name"], title, config.eval_on))
+    for remark in remarks(facts, config.eval_on):
+        console.print(remark, highlight=False)
+    console.print(f"written to {run_dir}", highlight=False)
+    value = facts[f"{config.eval_on}/{figure}"]
+    if value is None:
+        raise ValueError(f"objective={config.eval_on}/{figure}: these data and baselines do not tell it")
+    return score_of(figure, value)
+
+
+def main() -> None:
+    """Entry point."""
+    cli.run(task, "train")

@@ -1,0 +1,177 @@
+"""Task losses, one value per sample."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.field.initial import Snapshot
+from gsparc.ops.similarity import served, similarity_op
+
+WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
+WINDOW_RADIUS = 5
+"""Unknown offset of each snapshot: none, a phase, or a phase and a delay."""
+
+DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in the gradient
+STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
+
+
+class _Similarity(torch.autograd.Function):
+    """Mean SSIM per image with its own backward: three windowed maps instead of autograd's ten."""
+
+    @staticmethod
+    def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
+        # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
+        shift = target.mean(dim=(-2, -1), keepdim=True)
+        p, t = prediction - shift, target - shift
+        mean_p, mean_t = _window(p), _window(t)
+        square_p, square_t, cross = _window(p * p), _window(t * t), _window(p * t)
+        variance_p = square_p - mean_p**2
+        rounded = variance_p < 0  # only rounding makes a variance negative
+        spread = variance_p.clamp_min(0) + (square_t - mean_t**2).clamp_min(0) + STABILITY[1]
+        covariance = 2 * (cross - mean_p * mean_t) + STABILITY[1]
+        light_p, light_t = mean_p + shift, mean_t + shift
+        power = light_p**2 + light_t**2 + STABILITY[0]
+        product = 2 * light_p * light_t + STABILITY[0]
+        similarity = product * covariance / (power * spread)
+        if ctx.needs_input_grad[0]:
+            share = 1 / (similarity.shape[-1] * similarity.shape[-2])
+            by_cross = 2 * share * product / (power * spread)
+            by_square = (-share * similarity / spread).masked_fill_(rounded, 0)
+            by_light = 2 * share * (light_t * covariance / spread - light_p * similarity) / power
+            by_mean = by_light - mean_t * by_cross - 2 * mean_p * by_square
+            ctx.save_for_backward(p, t, by_mean, by_square, by_cross)
+        return similarity.mean(dim=(-2, -1))
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        p, t, by_mean, by_square, by_cross = ctx.saved_tensors
+        slope = _spread(by_mean).addcmul_(p, _spread(by_square), value=2).addcmul_(t, _spread(by_cross))
+        return slope * upstream[:, None, None], None
+
+
+class _Kernel(torch.autograd.Function):
+    """`_Similarity` by a kernel for float32 images."""
+
+    @staticmethod
+    def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
+        wanted = ctx.needs_input_grad[0]
+        value, slope = similarity_op(prediction.detach(), target.detach(), _taps(), STABILITY, wanted)
+        if wanted:
+            ctx.save_for_backward(slope)
+        return value
+
+    @staticmethod
+    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        (slope,) = ctx.saved_tensors
+        return slope * upstream[:, None, None], None
+
+
+@functools.lru_cache(maxsize=1)
+def _taps() -> tuple[float, ...]:
+    offsets = range(-WINDOW_RADIUS, WINDOW_RADIUS + 1)
+    weights = [math.exp(-0.5 * (k / WINDOW_SIGMA) ** 2) for k in offsets]
+    return tuple(w / sum(weights) for w in weights)
+
+
+def _window(images: Tensor) -> Tensor:
+    """Gaussian window over (B, H, W), valid part: (B, H - 10, W - 10). Shifted sums beat a convolution."""
+    for axis in (1, 2):
+        length = images.shape[axis] - 2 * WINDOW_RADIUS
+        taps = _taps()
+        total = images.narrow(axis, 0, length) * taps[0]
+        for k in range(1, len(taps)):
+            total.add_(images.narrow(axis, k, length), alpha=taps[k])
+        images = total
+    return images
+
+
+def _spread(images: Tensor) -> Tensor:
+    """The transpose of `_window`: (B, H - 10, W - 10) -> (B, H, W)."""
+    for axis in (2, 1):
+        shape = list(images.shape)
+        length = shape[axis]
+        shape[axis] += 2 * WINDOW_RADIUS
+        total = images.new_zeros(shape)
+        for k, tap in enumerate(_taps()):
+            total.narrow(axis, k, length).add_(images, alpha=tap)
+        images = total
+    return images
+
+
+def holds_window(images: Tensor | np.ndarray) -> bool:
+    """Whether images (..., H, W) are as large as the window of `ssim`, 11 x 11."""
+    return min(images.shape[-2:]) > 2 * WINDOW_RADIUS
+
+
+def ssim(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5, data range 1.
+
+    Args:
+        prediction, target: (B, H, W) in [0, 1]; differentiable in the prediction.
+
+    Returns:
+        (B,) in [-1, 1]. Wang et al. 2004, eq. 13.
+
+    Raises:
+        ValueError: an image smaller than the window.
+    """
+    if not holds_window(prediction):
+        raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
+    kernel = prediction.dtype == target.dtype and served(prediction)
+    return (_Kernel if kernel else _Similarity).apply(prediction, target)
+
+
+def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:
+    """(1 - l) L1 + l (1 - SSIM) per image (paper, eq. 6): (B, H, W) twice -> (B,).
+
+    L1 alone for images smaller than SSIM's window, which have no SSIM.
+    """
+    absolute = (prediction - target).abs().mean(dim=(-2, -1))
+    if ssim_weight == 0 or not holds_window(prediction):
+        return absolute
+    return (1 - ssim_weight) * absolute + ssim_weight * (1 - ssim(prediction, target))
+
+
+def channel_loss(
+    prediction: Tensor, target: Tensor, mask: Tensor | None = None, snapshot: Snapshot = "none"
+) -> Tensor:
+    """Mean squared error of complex channels scaled to unit power (paper, eq. 5): (B, ...) -> (B,).
+
+    Args:
+        prediction, target: alike; (B, A, K) complex where snapshots have offsets.
+        mask: like target, True where measured.
+        snapshot: `phase`: the least error over one phase per sample; `phase_timing`: over a phase
+            and a delay, `exp(j (phi - 2 pi f tau))`, tones evenly spaced. Both leave the amplitude as it is.
+
+    Raises:
+        ValueError: shapes differ; broadcasting would hide a missing antenna.
+    """
+    if prediction.shape != target.shape:
+        raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
+    if snapshot != "none":
+        return _up_to_offsets(prediction, target, mask, snapshot == "phase_timing")
+    error = (
+        (prediction - target).abs().square() if prediction.is_complex() else (prediction - target).square()
+    )
+    if mask is None:
+        return error.flatten(1).mean(1)
+    return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
+
+
+def _up_to_offsets(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
+    """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p, h>|."""
+    known = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
+    product = (prediction.conj() * target * known).sum(1)  # (B, K)
+    if timing and product.shape[1] > 1:
+        period = DELAYS_PER_TONE * product.shape[1]
+        best = torch.fft.ifft(product.detach(), period).abs().argmax(1, keepdim=True)
+        turn = 2 * math.pi / period * best * torch.arange(product.shape[1], device=product.device)
+        product = product * torch.polar(torch.ones_like(turn), turn)
+    power = ((prediction.abs().square() + target.abs().square()) * known).flatten(1).sum(1)
+    alike = torch.view_as_real(product.sum(1)).square().sum(1).clamp_min(1e-20).sqrt()
+    return (power - 2 * alike) / known.flatten(1).sum(1).clamp_min(1)

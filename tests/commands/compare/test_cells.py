@@ -1,0 +1,98 @@
+"""Which cells there are, in which order, and when a kept one is still the same."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+from campaigns import compose
+from omegaconf import OmegaConf
+
+import gsparc.peers
+from gsparc.commands.compare.cells import Budget, Contender, code_version, contenders, key, plan
+
+METHODS = {
+    "gp": Contender("gp", ("model=gp",)),
+    "fast": Contender("fast", ("model=gsrf",), ("model.budget_s={budget_s}",)),
+    "slow": Contender("slow", ("model=nerf2",), ("model.budget_s={budget_s}",), only_longest=True),
+    "waves": Contender("waves", ("model=ngrf",), ("model.budget_s={budget_s}",), ("csi",)),
+}
+BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
+
+
+def names(*only: str, kind: str = "spectrum") -> list[str]:
+    return [str(c) for c in plan([("rfid", "random", kind)], METHODS, BUDGETS, only)]
+
+
+def test_a_whole_table_comes_before_further_seeds_and_budgets():
+    assert names() == [
+        "rfid/random/gp/any/any", "rfid/random/fast/60/0",
+        "rfid/random/fast/300/0", "rfid/random/slow/300/0", "rfid/random/fast/60/1",
+    ]  # fmt: skip
+    assert "rfid/random/waves/60/1" in names(kind="csi")
+
+
+def test_every_room_has_its_first_table_before_any_has_a_second():
+    rooms = [("a", "random", "spectrum"), ("b", "random", "spectrum"), ("a", "grouped", "spectrum")]
+    budgets = [Budget(60, (0, 1), ("random",)), Budget(12, (0,), ("grouped",))]
+    found = [str(c) for c in plan(rooms, METHODS, budgets)]
+    assert found == [
+        "a/random/gp/any/any", "b/random/gp/any/any", "a/grouped/gp/any/any",
+        "a/random/fast/60/0", "a/random/slow/60/0", "b/random/fast/60/0", "b/random/slow/60/0",
+        "a/grouped/fast/12/0", "a/random/fast/60/1", "b/random/fast/60/1",
+    ]  # fmt: skip
+
+
+def test_only_filters_and_a_pattern_of_nothing_is_an_error():
+    assert names("*/gp/*", "*/fast/300/*") == ["rfid/random/gp/any/any", "rfid/random/fast/300/0"]
+    with pytest.raises(ValueError, match="only: 'rfid/rndom/\\*' matches no cell"):
+        names("rfid/rndom/*")
+
+
+def test_budgets_leave_room_for_what_they_do_not_count():
+    contender = Contender("x", ("model=gsparc",), ("model.b={budget_s}",), reserve_s=10)
+    assert contender.overrides(60, 2) == ["model=gsparc", "model.b=50", "seed=2"]
+    assert contender.overrides(None, None) == ["model=gsparc", "seed=0"]
+
+
+def test_every_method_of_the_default_comparison_composes():
+    config = OmegaConf.to_container(compose(config="compare"), resolve=True)
+    for contender in contenders(config["methods"]).values():
+        assert compose(*contender.overrides(60, 0)).model
+    assert config["ours"] in config["methods"]
+    with pytest.raises(ValueError, match=r"methods\.x: .*chose"):
+        contenders({"x": {"chose": ["model=gp"]}})
+
+
+MODULE = '''"""{doc}"""
+from gsparc.methods.mean import Mean
+
+
+class Toy(Mean):
+    """{doc}"""
+    VALUE = {value}
+'''
+
+
+def test_words_do_not_make_another_method_and_numbers_do(tmp_path, monkeypatch):
+    monkeypatch.setattr("gsparc.peers.__path__", [*gsparc.peers.__path__, str(tmp_path)])
+    versions = []
+    for doc, value in (("One.", 1), ("Other words.  # and a comment", 1), ("One.", 2)):
+        (tmp_path / "toy.py").write_text(MODULE.format(doc=doc, value=value))
+        monkeypatch.delitem(sys.modules, "gsparc.peers.toy", raising=False)
+        versions.append(code_version({"_target_": "gsparc.peers.toy.Toy"}))
+    assert versions[0] == versions[1] != versions[2]
+    assert code_version({"_target_": "gsparc.peers.gsrf.GSRF"}) != code_version(
+        {"_target_": "gsparc.methods.mean.Mean"}
+    )
+
+
+def test_a_key_names_data_split_and_settings():
+    model = {"_target_": "gsparc.methods.mean.Mean"}
+    base = key(model, {}, "data", "split")
+    assert base == key(dict(model), {}, "data", "split")
+    others = [
+        key(model, {}, "data2", "split"), key(model, {}, "data", "split2"),
+        key({**model, "x": 1}, {}, "data", "split"), key(model, {"max_steps": 1}, "data", "split"),
+    ]  # fmt: skip
+    assert len({base, *others}) == 5

@@ -1,0 +1,126 @@
+"""The command: fills what is missing, finds what is there, goes on after a failure."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from campaigns import spectra
+from hydra import initialize_config_module
+
+from gsparc.commands.compare.cells import Cell, Contender
+from gsparc.commands.compare.command import _may_match, _timed
+from gsparc.commands.compare.fitting import Filled, Prepared, Problem, prepare, stored_problems
+
+ROOT = Path(__file__).parents[3]
+
+
+def compare(tmp_path, *more: str) -> subprocess.CompletedProcess:
+    command = [
+        sys.executable, "-m", "gsparc", "compare", f"+datasets.own.file={tmp_path / 'own.npz'}",
+        "splits=[random]", "budgets=[{seconds: 0.3, seeds: [0]}]", f"cells={tmp_path / 'cells'}",
+        f"hydra.run.dir={tmp_path / 'run'}", *more,
+    ]  # fmt: skip
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
+    """Results travel as text, models do not: their timings must not be replaced by those of a few."""
+    kept = {"gp": {"p50_ms": 1.5, "p95_ms": 2.0, "to_copy": 0.5, "rounds": 60}}
+    (tmp_path / "latency-toy.json").write_text(json.dumps(kept))
+    cells = [Filled(Cell("toy", "random", "gp", None, None), tmp_path / "gp", {})]
+    assert _timed(cells, {}, tmp_path, measure=True)["toy"]["gp"].p50_ms == 1.5
+    assert "models of gp are not here" in caplog.text
+    assert _timed(cells, {}, tmp_path / "none", measure=True) == {"toy": {}}
+
+
+def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
+    """Published cells would vanish from the table with every edit of a method."""
+    cell = Cell("toy", "random", "gp", None, None)
+    prepared = Prepared(cell, None, tmp_path / "toy-random-gp-today")
+    problem = Problem("toy", "random", "spectrum", ("d", "s"))
+    facts = {
+        "seed": None, "budget_s": None, "git": "0123456789",
+        "dataset/kind": "spectrum", "dataset/sha256": "d", "split/sha256": "s",
+    }  # fmt: skip
+
+    def write(name: str, **changes: str) -> None:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
+
+    write("toy-random-gp-other", **{"dataset/sha256": "e"})
+    assert prepared.found() is None and prepared.found_earlier(problem) is None
+    write("toy-random-gp-old", made="2026-01-01")
+    write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
+    found = prepared.found_earlier(problem)
+    assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
+    write("toy-random-gp-today")
+    assert prepared.found().earlier is None
+    assert stored_problems(tmp_path, "toy", ["random", "sparse"]) == [problem] and not stored_problems(
+        tmp_path, "t", ["random"]
+    )
+
+
+@pytest.mark.parametrize("model", ["gsparc", "moving_array"])
+def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_path):
+    """A model was trained as if there were no budget: one of 5 s was found again as one of 60 s."""
+    problem = Problem("own", "random", "spectrum", ("d", "s"))
+    contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        short, long = (
+            prepare(Cell("own", "random", model, budget_s, 0), contender, {"file": "x"}, problem, tmp_path)
+            for budget_s in (5.0, 60.0)
+        )
+    assert short.config.budget_s == 5 and short.folder != long.folder
+
+
+@pytest.mark.slow
+def test_cells_are_filled_once_and_reported_again(tmp_path):
+    spectra(tmp_path / "own.npz")
+    only = "only=[own/random/mean/*,own/random/nearest/*,own/random/swiftwrf/*]"
+    first = compare(tmp_path, only)
+    assert first.returncode == 0, first.stderr
+    assert "3 cells, 0 of them are there" in first.stdout and "min left" in first.stdout
+    summary = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert summary["own/random/0.3/first"] in ("nearest", "mean", "swiftwrf")
+    assert summary["own/random/0.3/swiftwrf/query_ms_p50"] > 0
+    for file in ("compare.csv", "compare.md", "compare.png"):
+        assert (tmp_path / "run" / file).exists()
+    again = compare(tmp_path, only, "latency=false")
+    assert "3 cells, 3 of them are there" in again.stdout
+    assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+    absent = compare(tmp_path, only, "datasets.own.file=null", "train=false")
+    assert absent.returncode == 0 and "as far as results were kept" in absent.stdout + absent.stderr
+    assert "3 cells, 3 of them are there" in absent.stdout
+    # A cell whose result is not whole does not count.
+    (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")
+    cell.write_text("{")
+    assert "3 cells, 2 of them are there" in compare(tmp_path, only, "latency=false").stdout
+
+
+@pytest.mark.slow
+def test_mistakes_are_one_line(tmp_path):
+    spectra(tmp_path / "own.npz")
+    done = compare(tmp_path, "only=[own/random/meen/*]")
+    assert done.returncode == 1 and "matches no cell" in done.stderr and "Traceback" not in done.stderr
+    done = compare(tmp_path, "train=false", "only=[own/random/mean/*]")
+    assert done.returncode == 1 and "no cell is filled" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("pattern", "rfid", "newrf"),
+    [
+        ("*/gp/*", True, True),  # one star stands for dataset and split: rooms were left out without a word
+        ("newrf/*", False, True),
+        ("new*/60/0", False, True),
+        ("rfid/random/gp/any/any", True, False),
+        ("*", True, True),
+        ("rfid/sparse/*", False, False),
+    ],
+)
+def test_a_star_may_stand_for_several_parts_of_a_cell(pattern, rfid, newrf):
+    assert _may_match(pattern, "rfid", "random") == rfid
+    assert _may_match(pattern, "newrf", "random") == newrf

@@ -1,0 +1,81 @@
+"""The table says who is first, who is fast, and when a simple baseline wins."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsparc.commands.compare.cells import Cell
+from gsparc.commands.compare.figure import draw
+from gsparc.commands.compare.fitting import EARLIER, Filled
+from gsparc.commands.compare.latency import Latency
+from gsparc.commands.compare.table import blocks, markdown, remarks, rows, score_db, write_csv
+
+
+def filled(method, psnr, seed=None, budget=None, split="random", load=0.1):
+    facts = {
+        "dataset/kind": "spectrum", "test/psnr_db": psnr, "test/ssim": 0.9, "time/train_s": budget or 1.0,
+        "time/train_cpu_s": 1.0, "machine/load": load,
+    }  # fmt: skip
+    return Filled(Cell("rfid", split, method, budget, seed), None, facts)
+
+
+FOUND = [
+    filled("gp", 30.0),
+    Filled(Cell("rfid", "random", "unscored", None, None), None, {"dataset/kind": "spectrum"}),
+    *(filled("gsparc", 29.0 + s, s, 60.0) for s in (0.0, 1.0)),
+    *(filled("gsrf", 20.0 + s, s, 60.0, load=3.0) for s in (0.0, 2.0)),
+    filled("gsrf", 25.0, 0, 300.0),
+    filled("gp", 31.0, split="grouped"),
+]
+TIMED = {"rfid": {"gp": Latency(2.0, 3.0, 1.5, 60), "gsparc": Latency(0.5, 0.6, 0.4, 60)}}
+
+
+def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
+    found = blocks(rows(FOUND, TIMED))
+    assert [(b.split, b.budget_s, [r.method for r in b.rows]) for b in found] == [
+        ("random", 60.0, ["gp", "gsparc", "gsrf"]),
+        ("random", 300.0, ["gp", "gsrf"]),
+        ("grouped", None, ["gp"]),
+    ]
+    gsparc = found[0].rows[1]
+    assert gsparc.score_db == 29.5 and gsparc.spread_db == pytest.approx(0.7071, abs=1e-4)
+    assert gsparc.seeds == 2 and gsparc.query_ms == 0.5 and found[0].rows[2].query_ms is None
+
+
+def test_losers_are_not_hidden():
+    said = " | ".join(remarks(blocks(rows(FOUND, TIMED))[0], "gsparc"))
+    assert "first: gp" in said and "a simple baseline wins: take gp" in said
+    assert "gsparc is 0.50 dB behind gp, within the seeds' spread" in said
+    assert "fastest within 0.5 dB of the first: gsparc, 0.5 ms" in said
+    assert "busy (load up to 3.0 per core)" in said
+    far = [*FOUND[:1], filled("nearest", 29.0), filled("gsparc", 28.0, 0, 60.0)]
+    said = " | ".join(remarks(blocks(rows(far, {}))[0], "gsparc"))
+    assert "2.00 dB behind gp" in said and "spread" not in said
+    assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
+
+
+def test_what_an_earlier_program_measured_is_said():
+    old = filled("gsrf", 29.0, 0, 60.0)
+    old = Filled(old.cell, None, {**old.facts, EARLIER: "0123abcd"})
+    found = blocks(rows([*FOUND[:1], old], {}))[0]
+    assert found.rows[1].earlier == "0123abcd" and not found.rows[0].earlier
+    assert "last changed (at commit): gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
+
+
+def test_scores_are_decibels_of_which_more_are_better():
+    assert score_db("csi", {"test/nmse": 0.1}) == pytest.approx(10.0)
+    assert score_db("rssi", {"test/rmse_db": 4.0}) == -4.0
+
+
+def test_page_sheet_and_picture_show_every_method(tmp_path):
+    found = rows(FOUND, TIMED)
+    page = markdown(
+        blocks(found), "gsparc", {"rfid": {**TIMED["rfid"], "nerf2": Latency(60e3, 61e3, 1.0, 1)}}
+    )
+    assert "nerf2 on rfid: 60 s a query, timed only" in page and "gp on rfid" not in page
+    assert "### rfid, split random, 60 s of training per model" in page
+    assert "**29.50 ± 0.71**" in page and "| gsrf | 21.00 ± 1.41 | 0.9 |" in page
+    write_csv(found, tmp_path / "compare.csv")
+    assert len((tmp_path / "compare.csv").read_text().splitlines()) == 1 + len(found)
+    draw(found, tmp_path / "compare.png", "gsparc")
+    assert (tmp_path / "compare.png").stat().st_size > 10_000

@@ -1,0 +1,172 @@
+"""Risk and coverage, thresholds with a promise, and whether promises hold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsparc.commands.calibrate.command import figures, tables
+from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
+from gsparc.commands.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
+from gsparc.methods.confidence_scores import Evidence, gather, joined
+from gsparc.methods.method import FitContext
+from gsparc.methods.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
+
+
+def _evidence(count: int = 900, seed: int = 0) -> Evidence:
+    """Errors grow with the distance from the middle; `learned` knows it up to noise, `distance` does not."""
+    rng = np.random.default_rng(seed)
+    position = rng.uniform(-1, 1, (count, 3))
+    error = 10 ** (-2 + 2 * np.linalg.norm(position[:, :2], axis=1) + rng.normal(0, 0.3, count))
+    scores = {
+        "learned": -np.linalg.norm(position[:, :2], axis=1) + rng.normal(0, 0.1, count),
+        "distance": rng.normal(size=count),
+    }
+    return Evidence(np.arange(count), position, error, scores)
+
+
+def test_curve_by_hand() -> None:
+    curve = risk_coverage(np.array([3.0, 1.0, 2.0]), np.array([0.0, 0.9, 0.3]))
+    assert np.allclose(curve.risk, [0, 0.15, 0.4]) and np.isclose(curve.area, 0.55 / 3)
+    assert curve.at(0.7) == curve.risk[1]
+
+
+def test_equal_scores_have_no_order() -> None:
+    loss = np.random.default_rng(0).uniform(size=50)
+    flat = risk_coverage(np.zeros(50), loss)
+    assert np.allclose(flat.risk, loss.mean())
+
+
+def test_knowing_the_errors_is_best() -> None:
+    evidence = _evidence()
+    loss = bounded(evidence.error)
+    areas = {kind: risk_coverage(score, loss).area for kind, score in evidence.scores.items()}
+    assert perfect_area(loss) < areas["learned"] < 0.8 * areas["distance"]
+    assert rank_correlation(evidence.scores["learned"], loss) > 0.7
+    assert rank_correlation(np.zeros(3), np.arange(3.0)) is None
+    assert best_kind(evidence, np.arange(200)) == "learned"
+
+
+def test_threshold_counts_the_bad_and_bounds_their_share() -> None:
+    promise = Promise(alpha=0.1, delta=0.1)
+    score = np.linspace(1, 0, 400)
+    bad = np.arange(400) >= 200
+    found = choose(score, bad, levels_of(score), promise)
+    assert 180 <= found.accepted < 230 and found.bad == max(0, found.accepted - 200)
+    assert found.bound(0.1) <= 0.1 + 1e-9
+    assert choose(score, np.ones(400, bool), levels_of(score), promise).value == float("inf")
+    assert Threshold(0.0, 0, 0).bound(0.1) == 1.0
+
+
+def test_too_few_to_test_promise_nothing() -> None:
+    score = np.linspace(1, 0, 15)
+    found = choose(score, np.zeros(15, bool), levels_of(score), Promise(alpha=0.1, delta=0.1))
+    assert found.accepted == 0  # 0.9^15 = 0.2 > delta
+
+
+@pytest.mark.parametrize("how", ["random", "spatial"])
+def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
+    trial = trials(_evidence(), Promise(limit_db=-5, alpha=0.2, delta=0.1), how, 200)
+    assert trial.kind == "learned" and trial.coverage.mean() > 0.2
+    # Resampled from one pool: the share itself scatters by about 0.02.
+    # Test cells are few and unlike: what is realised in them scatters more than the promise's own doubt.
+    assert trial.broken <= (0.16 if how == "random" else 0.2)
+    assert trial.mean_realised < 0.2
+
+
+def test_promise_breaks_where_the_site_is_not_alike() -> None:
+    """Calibrated on the good half, tested on the bad one: nothing protects from a shift."""
+    evidence = _evidence()
+    score = np.zeros(len(evidence))
+    promise = Promise(limit_db=-5, alpha=0.2, delta=0.1)
+    bad = promise.bad(evidence.error)
+    radius = np.linalg.norm(evidence.position[:, :2], axis=1)
+    good = radius < 0.4
+    found = choose(score[good], bad[good], levels_of(score), promise)
+    assert found.accepted == good.sum() and bad[~good].mean() > 0.4
+
+
+def test_parts_are_disjoint_and_cells_stay_whole() -> None:
+    evidence = _evidence()
+    parts = divided(evidence, "spatial", np.random.default_rng(0))
+    assert len(np.unique(np.concatenate(parts))) == sum(map(len, parts)) == len(evidence)
+    cell = np.floor((evidence.position[:, :2] - evidence.position[:, :2].min(0)) / (2 / 6) * 0.9999)
+    names = [set(map(tuple, cell[part])) for part in parts]
+    assert len(names[1] & names[2]) < 8  # only where the cells above differ by rounding at their edges
+
+
+def test_thinned_rows_keep_their_distance() -> None:
+    evidence = _evidence()
+    kept = spread_out(evidence.position, np.arange(300), 0.3, np.random.default_rng(0))
+    apart = np.linalg.norm(evidence.position[kept][:, None] - evidence.position[kept], axis=-1)
+    assert apart[np.triu_indices(len(kept), 1)].min() > 0.3
+    assert np.array_equal(
+        spread_out(evidence.position, np.arange(9), 0, np.random.default_rng(0)), np.arange(9)
+    )
+
+
+def test_evidence_of_a_method(campaign, folds) -> None:
+    from gsparc.methods.gp import GaussianProcess
+    from gsparc.methods.mean import Mean
+
+    data, split = campaign("csi", rows=60, static_end="tx"), folds(60)
+    fold = split.folds[0]
+    for make, kinds in ((GaussianProcess, {"learned", "expected", "distance", "gp_variance"}),
+                        (Mean, {"distance", "gp_variance"})):  # fmt: skip
+        method = make()
+        method.fit(data, fold, FitContext())
+        found = gather(method, data, fold, fold.test)
+        assert set(found.scores) == kinds and (found.scores["distance"] <= 0).all()
+    assert len(joined([found, found])) == 2 * len(fold.test)
+
+
+def test_impossible_promises_are_refused() -> None:
+    with pytest.raises(ValueError, match="between 0 and 1"):
+        Promise(alpha=1.5)
+
+
+def test_nobody_accepted_is_no_promise_kept() -> None:
+    """A draw that accepts nobody says nothing: it is counted by itself, not among the kept."""
+    trial = Trial("learned", "random", np.array([np.nan, 0.05, 0.2]), np.array([0.0, 0.5, 0.5]), 0.1, 0.1)
+    assert trial.silent == 1 / 3 and trial.broken == 0.5 and trial.broken_of_all == 1 / 3
+    low, high = trial.interval
+    assert low < 0.5 < high
+    mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
+    assert mute.broken is None and mute.interval is None and mute.silent == 1
+
+
+def test_a_picture_of_nobody_accepted(tmp_path) -> None:
+    """Nothing to divide by is no reason to draw nothing."""
+    from gsparc.commands.calibrate.pictures import draw
+
+    mute = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1, 0.1)
+    draw(_evidence(), [mute], "silent", tmp_path / "confidence.png")
+    assert (tmp_path / "confidence.png").stat().st_size > 1000
+
+
+def test_few_positions_or_patches_are_refused_in_words() -> None:
+    """Two clusters, or two rows, ended in an index out of bounds."""
+    rng = np.random.default_rng(0)
+    two = _evidence(40)
+    two.position[:] = np.where(np.arange(40)[:, None] < 20, 0.0, 5.0)
+    assert divisible(two, "random") and not divisible(two, "spatial")
+    with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
+        divided(two, "spatial", rng)
+    with pytest.raises(ValueError, match="2 positions cannot be parted"):
+        divided(two.at(np.arange(2)), "random", rng)
+
+
+def test_positions_on_a_plumb_line_have_patches() -> None:
+    upright = _evidence(60)
+    upright.position[:, :2] = 1.0
+    assert divisible(upright, "spatial") and len(np.unique(cells(upright.position))) == 6
+
+
+def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
+    """Predictions without any error: 0 / 0 ended the command."""
+    exact = replace(_evidence(30), error=np.zeros(30))
+    facts = figures(exact, [], Promise())
+    assert facts["confidence/learned/area_below_distance"] is None
+    assert tables(facts | {"dataset/name": "d", "model/name": "m"}, exact, [])[0].row_count == 2

@@ -1,0 +1,92 @@
+import io
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from gsparc.commands.check import check, main
+from gsparc.data.load import load
+from gsparc.data.own import write_own
+
+
+@pytest.fixture
+def arrays():
+    rng = np.random.default_rng(0)
+    return {
+        "rx_position": np.array([4.0, 1.0, 2.0]),
+        "tx_position": rng.uniform(0, 3, (10, 3)),
+        "spectrum": rng.uniform(0, 1, (10, 9, 36)),
+    }
+
+
+def _said(path):
+    out = io.StringIO()
+    good = check(str(path), Console(file=out, width=40))
+    return good, out.getvalue()
+
+
+def test_good_file_is_described(tmp_path, arrays):
+    write_own(tmp_path / "hall [b].h5", {**arrays, "frequency_hz": np.array(3e9), "junk": np.ones(2)})
+    good, text = _said(tmp_path / "hall [b].h5")
+    assert good
+    for words in ("10 images of 9 x 36", "the receiver, at (4.000, 1.000, 2.000) m", "wavelengths",
+                  "3 GHz", "elevations 0 to 80 degrees", "closing the circle", "junk: not part of the schema",
+                  "hall [b].h5: good"):  # fmt: skip
+        assert words in text, text
+
+
+@pytest.mark.parametrize(
+    ("change", "doubt"),
+    [
+        ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
+        ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
+        ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
+    ],
+)
+def test_units_in_doubt_are_said_by_check_and_by_training(tmp_path, arrays, change, doubt, caplog):
+    """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
+    kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}
+    write_own(tmp_path / "a.npz", kept)
+    good, text = _said(tmp_path / "a.npz")
+    assert good and doubt in text
+    load({"name": "own", "file": str(tmp_path / "a.npz")})
+    assert doubt in caplog.text
+
+
+def test_receivers_in_one_plane_are_noted(tmp_path, arrays):
+    arrays["csi"] = arrays.pop("spectrum")[:, 0, 0] + 1j
+    arrays["frequency_hz"] = np.array(2.4e9)
+    write_own(tmp_path / "a.npz", arrays)
+    assert "about a plane" not in _said(tmp_path / "a.npz")[1]
+    arrays["tx_position"][:, 2] = 1.5
+    write_own(tmp_path / "flat.npz", arrays)
+    assert "about a plane" in _said(tmp_path / "flat.npz")[1]
+
+
+def test_path_that_is_not_utf8(tmp_path):
+    good, text = _said(tmp_path / "\udcff.npz")
+    assert not good and "no such file" in text
+
+
+def test_unknown_carrier_is_said(tmp_path, arrays):
+    write_own(tmp_path / "a.npz", arrays)
+    assert "unknown; give frequency_hz" in _said(tmp_path / "a.npz")[1]
+
+
+def test_each_problem_is_one_line(tmp_path, arrays):
+    arrays["spectrum"][4, 0, 0] = np.nan
+    arrays["tx_position"][7] = np.inf
+    np.savez(tmp_path / "bad.npz", **arrays, maks=np.ones(3))
+    good, text = _said(tmp_path / "bad.npz")
+    lines = text.strip().splitlines()
+    assert not good and len(lines) == 4
+    assert "did you mean mask" in lines[0] and "row 7" in lines[1] and "row 4" in lines[2]
+    assert lines[3].endswith("bad.npz: refused, 3 problems")
+
+
+def test_exit_status(tmp_path, arrays, capsys):
+    write_own(tmp_path / "a.npz", arrays)
+    assert main([str(tmp_path / "a.npz")]) == 0
+    assert main([str(tmp_path / "a.npz"), str(tmp_path / "absent.npz")]) == 1
+    assert main([str(tmp_path)]) == 1
+    assert "a folder without gateway_info.yml" in capsys.readouterr().out

@@ -1,0 +1,279 @@
+"""Grids, beams, statistics and the export; with Sionna itself in the slow part."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+import torch
+from campaigns import compose
+from cities import city, fold
+
+from gsparc import load
+from gsparc.commands.link.adaptation import Rates
+from gsparc.commands.link.beams import gain, loss_db
+from gsparc.commands.link.channels import truth
+from gsparc.commands.link.statistics import crossing
+from gsparc.commands.link.study import beam_facts, rate_facts
+from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
+from gsparc.methods.resource_grid import centred, interpolated, resource_grid
+from gsparc.methods.risk_threshold import binomial_interval
+from gsparc.multipath.uplink.method import UplinkField
+from gsparc.multipath.uplink.search import SearchSettings
+
+needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    data = city("all")
+    method = UplinkField(SearchSettings(rounds=4, picks=4, final=2), teachers=60)
+    method.fit(data, fold(), FitContext())
+    file = tmp_path_factory.mktemp("link") / "model.ckpt"
+    checkpoint.save(file, method)
+    return data, file
+
+
+def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
+    tones = 2.4e9 + 312.5e3 * np.arange(26)
+    delays = np.array([0, 80e-9, 210e-9, 700e-9])
+    gains = np.array([1, 0.6j, -0.4, 0.1 + 0.1j])
+
+    def response(frequency):
+        turns = np.outer(delays, frequency - 2.4e9)
+        return torch.from_numpy((gains @ np.exp(-2j * np.pi * turns)).astype(np.complex64))[None, None]
+
+    wanted = centred(float(tones.mean()), 30e3, 240)
+    miss = interpolated(response(tones), tones, wanted) - response(wanted)
+    assert miss.abs().square().mean() < 1e-3 * response(wanted).abs().square().mean()
+    with pytest.raises(ValueError, match="fewer blocks"):
+        interpolated(response(tones), tones, centred(float(tones.mean()), 30e3, 2400))
+
+
+def test_one_tone_is_flat() -> None:
+    assert torch.equal(
+        interpolated(torch.ones(2, 1, 1), np.array([1e9]), np.arange(3.0)), torch.ones(2, 1, 3)
+    )
+
+
+def test_grid_is_sionna_s_order() -> None:
+    channel = torch.arange(12.0).reshape(2, 3, 2)
+    down = resource_grid(channel, 14, "rx")
+    assert down.shape == (2, 1, 1, 3, 14, 2) and torch.equal(down[1, 0, 0, 2, 5], channel[1, 2])
+    up = resource_grid(channel, 14, "tx")
+    assert up.shape == (1, 3, 2, 1, 14, 2) and torch.equal(up[0, 2, 1, 0, 5], channel[1, 2])
+
+
+def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
+    generator = torch.Generator().manual_seed(0)
+    true = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
+    assert torch.allclose(gain(true, true).mean(), torch.tensor(16.0), rtol=0.01)
+    assert loss_db(true, true * (2 - 1j)).abs().max() < 1e-4
+    noise = torch.randn(200, 16, 4, dtype=torch.complex64, generator=generator)
+    # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
+    assert abs(float(loss_db(true, true + noise).mean()) - 3.0) < 0.3
+
+
+def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
+    """A prediction of exactly 0, or one silent test channel, ended the command: -inf is no figure."""
+    true = torch.randn(4, 2, 3, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    silent = true.clone()
+    silent[1] = 0
+    nothing = beam_facts(true, torch.zeros_like(true), np.ones(4, bool))
+    assert nothing["beams/2/loss_db"] == pytest.approx(100) == nothing["beams/2/loss_db_mean"]
+    some = beam_facts(silent, silent, np.array([False, True, False, False]))
+    assert some["beams/silent"] == 1 and some["beams/2/loss_db_max"] == pytest.approx(0, abs=1e-5)
+    assert some["beams/2/loss_db_accepted"] is None
+    assert beam_facts(0 * true, true, np.ones(4, bool)) == {"beams/positions": 4, "beams/silent": 4}
+    for facts in (nothing, some):
+        assert all(value is None or np.isfinite(value) for value in facts.values())
+
+
+def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
+    """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
+    none = np.zeros(2)
+    rates = Rates(-50.0, none, none, none, none, none, none + 1, none, none == 0, 0.0)
+    facts = rate_facts({"expected": [rates]}, np.array([True, False]), np.array([0.2, 0.4]))
+    assert facts["mcs/-50dB/shortfall"] is None and facts["mcs/-50dB/shortfall_calm_30%"] is None
+    assert all(value is None or np.isfinite(value) for value in facts.values())
+
+
+def test_crossing_and_intervals() -> None:
+    x = np.array([0.0, 1, 2])
+    assert np.isclose(crossing(x, np.array([1.0, 0.1, 0.01])), 1.0)
+    assert crossing(x, np.array([1.0, 0.5, 0.2])) is None
+    low, high = binomial_interval(10, 100)
+    assert (
+        low < 0.1 < high
+        and binomial_interval(0, 10)[0] == 0
+        and binomial_interval(10, 10)[1] == 1
+        and binomial_interval(0, 0) == (0, 1)
+    )
+
+
+def test_truth_of_the_streets_is_in_the_snapshot_s_own_frame() -> None:
+    """Recomputed rays, turned by offsets found on the uplink, equal the measured downlink up to its noise."""
+    data = city("all")
+    rows = fold().test
+    exact, source = truth(data, rows, data.site.subcarriers_hz)
+    miss = (exact - data.targets(rows)).abs().square().mean((1, 2))
+    power = exact.abs().square().mean((1, 2))
+    # Noise, and the tones a frequency offset leaks into one another.
+    assert source == "rays" and (miss < 1.2 * float(data.noise_variance[0]) + 1e-3 * power).all()
+
+
+def test_export_on_any_grid(trained) -> None:
+    data, file = trained
+    predictor = load(file)
+    rows = fold().test[:2]
+    heard = data.uplink[rows] * data.site.target_scale
+    wanted = centred(float(data.site.subcarriers_hz.mean()), 30e3, 48)
+    slot = predictor.csi(uplink=heard, frequency_hz=wanted, symbols=14)
+    assert slot.shape == (2, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
+    tones = predictor.csi(uplink=heard)
+    assert tones.shape == (2, 64, 26)
+    exact, _ = truth(data, rows, wanted)
+    miss = np.abs(slot[:, 0, 0, :, 0] - exact.numpy() * data.site.target_scale) ** 2
+    assert miss.mean() < 0.3 * np.mean(np.abs(exact.numpy() * data.site.target_scale) ** 2)
+    found = predictor.paths(heard)
+    assert found.gain.shape == found.delay_s.shape == (2, 16) and found.cosines.shape == (2, 16, 2)
+    assert np.abs(found.delay_s).max() < 1 / 312.5e3
+    with pytest.raises(ValueError, match=r"expected \(B, 64, 26\)"):
+        predictor.csi(uplink=heard[:, :8])
+
+
+def test_a_coarse_look_may_be_all_there_is() -> None:
+    """coarse = fine once asked for a second part of no blocks."""
+    from gsparc.commands.link.pusch import Blocks
+    from gsparc.commands.link.study import transmit
+
+    class Half:
+        def run(self, true, predicted, variance, level, order, batch):
+            assert len(order)
+            failed = np.arange(len(order)) % 2 == 0
+            both = ("perfect", "predicted")
+            return Blocks(level, order, dict.fromkeys(both, failed), dict.fromkeys(both, failed * 0.1))
+
+    nothing = torch.zeros(5, 1)
+    for fine, blocks in ((8, 8), (20, 20)):
+        found = transmit(Half(), nothing, nothing, nothing, [1.0], (8, fine, 4), lambda now: None)
+        assert len(found[0].position) == blocks
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_rates_of_the_true_channel_are_the_oracle_s() -> None:
+    from gsparc.commands.link.adaptation import Adaptation, Band
+
+    generator = torch.Generator().manual_seed(0)
+    true = torch.randn(40, 26, dtype=torch.complex64, generator=generator)
+    known = Band(true, true, torch.zeros(40))
+    loop = Adaptation()
+    found = loop.rates(known, 0.03)
+    assert np.array_equal(found.oracle, found.chosen) and found.oracle_bps.mean() > 5e6
+    assert np.allclose(loop.rates(known, 0.03, 1.0, "expected").chosen_bps, found.best_bps)
+    assert (found.best_bps >= found.oracle_bps).all()
+    careful = loop.rates(known, 0.03, 3.0)
+    assert (careful.chosen <= found.oracle).all() and (careful.chosen < found.oracle).mean() > 0.5
+    deaf = loop.rates(known, 1e4)
+    assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_doubt_makes_the_choice_careful_and_carries_more() -> None:
+    from gsparc.commands.link.adaptation import Adaptation, Band
+
+    generator = torch.Generator().manual_seed(0)
+    true = torch.randn(200, 1, dtype=torch.complex64, generator=generator).expand(200, 26)
+    error = torch.randn(200, 1, dtype=torch.complex64, generator=generator).expand(200, 26) * 0.2
+    band = Band(true, true + error, torch.full((200,), 0.04))
+    loop = Adaptation()
+    bold, careful = (loop.rates(band, 0.01, care, "expected") for care in (0.0, 1.0))
+    assert careful.chosen.mean() < bold.chosen.mean()
+    assert bold.chosen_bps.mean() < careful.chosen_bps.mean() < careful.best_bps.mean()
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_pusch_knows_who_knows_more() -> None:
+    from gsparc.commands.link.pusch import Pusch, frequency_correlation
+
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    true = torch.randn(16, 1, dtype=torch.complex64, generator=generator).expand(16, 48).contiguous()
+    error = torch.randn(16, 48, dtype=torch.complex64, generator=generator) * 0.6
+    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
+    pusch = Pusch("qpsk", 4, 30, known, iterations=8)
+    assert np.isclose(pusch.pilot_share, 2 / 14)
+    power = true.abs().square().mean(1, keepdim=True).sqrt()
+    found = pusch.run(true, true + error * power, torch.full((16,), 0.36), 3.0, np.arange(128) % 16, 64)
+    wrong = {name: failed.mean() for name, failed in found.failed.items()}
+    assert wrong["perfect"] <= wrong["lmmse"] + 0.05 and wrong["lmmse"] <= wrong["ls"] + 0.05
+    assert wrong["predicted"] > wrong["perfect"] + 0.3
+    bits = {name: share.mean() for name, share in found.bit_errors.items()}
+    assert bits["perfect"] < bits["predicted"]
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
+    from gsparc.commands.link.pusch import Pusch, frequency_correlation
+
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    true, error = torch.randn(2, 16, 1, dtype=torch.complex64, generator=generator).expand(2, 16, 48)
+    share = 0.2
+    guess, doubt = true + share**0.5 * true.abs() * error, share * true[:, 0].abs().square()
+    known = frequency_correlation(true, np.array([1.0]), 30e3, 48)
+    pusch = Pusch("qpsk", 4, 30, known, 8, ["perfect", "lmmse", "predicted", "predicted_pilots"])
+    found = pusch.run(true.contiguous(), guess, doubt, 3.0, np.arange(256) % 16, 64)
+    wrong = {name: failed.mean() for name, failed in found.failed.items()}
+    assert wrong["predicted_pilots"] < wrong["predicted"] - 0.05
+    assert wrong["perfect"] - 0.02 <= wrong["predicted_pilots"] <= wrong["lmmse"] + 0.02
+    # Without any doubt the pilots are not listened to, with all of it the prediction is not.
+    sure, deaf = (pusch.receivers[name]._channel_estimator for name in ("predicted_pilots", "lmmse"))
+    y = torch.randn(4, 1, 1, 14, 48, dtype=torch.complex64, generator=generator)
+    pusch._prior = guess[:4], torch.zeros(4)
+    assert torch.allclose(sure(y, torch.tensor(0.1))[0][:, 0, 0, 0, 0, 0], guess[:4], atol=1e-2)
+    pusch._prior = torch.zeros(4, 48), torch.ones(4)
+    assert torch.allclose(sure(y, torch.tensor(0.1))[0], deaf(y, torch.tensor(0.1))[0], atol=1e-5)
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
+    from hydra.core.hydra_config import HydraConfig
+
+    import gsparc.commands.link.command as command
+
+    data, file = trained
+    monkeypatch.setattr("gsparc.evaluation.open_runs.load", lambda settings: data)
+    monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
+    config = compose(
+        f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
+        "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]", "mcs.backoff_db=[0.0]",
+        "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
+        config="link",
+    )  # fmt: skip
+    monkeypatch.setattr(
+        HydraConfig, "get", lambda: type("H", (), {"runtime": type("R", (), {"output_dir": tmp_path})})
+    )
+    facts = command.task(config)
+    assert {"mcs.png", "bler.png", "acceptance.png", "summary.json"} <= {p.name for p in tmp_path.iterdir()}
+    assert facts["beams/64/gain_db"] > facts["beams/8/gain_db"]
+    assert facts["pusch/qpsk/perfect/4dB/bler"] <= facts["pusch/qpsk/perfect/3dB/bler"]
+    assert facts["pusch/truth"] == "rays"
+
+
+def _split():
+    from gsparc.data.splits import Split, indices_hash
+
+    rows = np.arange(120)
+    one = fold()
+    whole = type(one)(
+        one.train[:40], one.val, rows[40:80].tolist() and np.concatenate([rows[40:80], one.test])
+    )
+    return Split("toy", (whole,), indices_hash((whole,)))

@@ -1,0 +1,207 @@
+"""`train()` and its command, end to end on files of a second."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaigns import brief, channels, compose, powers, spectra
+from omegaconf import open_dict
+
+import gsparc
+from gsparc.commands import evaluate
+from gsparc.commands.train import Objects, train
+from gsparc.methods import checkpoint
+from gsparc.training.splatting import LearnedField
+
+ROOT = Path(__file__).parents[2]
+CONTRACT = {  # what scripts read of a summary
+    "time/train_s", "time/render_ms_p50", "time/render_ms_p95", "time/includes", "machine/threads",
+    "machine/load", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
+    "dataset/sha256", "dataset/stand_in", "dataset/convergence_error", "split/name", "split/sha256", "seed",
+    "git", "versions",
+}  # fmt: skip
+FIGURES = {
+    "spectrum": {"ssim", "ssim_median", "ssim_gauss", "psnr_db", "nmse", "skill"},
+    "csi": {"nmse", "snr_db", "skill", "nmse_scalar"},
+    "rssi": {"rmse_db", "nmse", "skill"},
+}
+PAIRED = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": None}
+KINDS = {"spectrum": spectra, "csi": channels, "rssi": powers}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_leaves_every_key_of_the_contract(kind, tmp_path):
+    file = KINDS[kind](tmp_path / "own.npz")
+    facts, objects = train(compose(*brief(file, "baselines=[nearest,mean,gp]")), tmp_path / "run")
+    stored = json.loads((tmp_path / "run" / "summary.json").read_text())
+    assert set(stored) >= CONTRACT and {f"test/{name}" for name in FIGURES[kind]} <= set(stored)
+    assert {"baseline/nearest/skill", "baseline/gp/train_s", "baseline/mean/render_ms_p50"} <= set(stored)
+    if PAIRED[kind]:
+        assert {f"paired/gp/{PAIRED[kind]}", f"paired/gp/{PAIRED[kind]}_se"} <= set(stored)
+    assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
+    assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
+    assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
+    assert isinstance(objects, Objects) and isinstance(objects.methods[0], LearnedField)
+    assert objects.checkpoints[0].exists() and (tmp_path / "run" / "per_sample.csv").exists()
+    assert (tmp_path / "run" / "split.json").exists() and (tmp_path / "run" / "learning_curve.csv").exists()
+
+
+@pytest.mark.parametrize("model", ["zero", "mean", "nearest", "idw", "gp"])
+def test_methods_without_a_gradient_take_the_same_road(model, tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    settings = [s for s in brief(file) if not s.startswith("model.")]
+    facts, objects = train(compose(*settings, f"model={model}"), tmp_path / "run")
+    assert facts["model/name"] == model and facts["time/train_s"] >= 0
+    assert np.isfinite(facts["test/psnr_db"]) and objects.checkpoints[0].exists()
+
+
+def test_a_checkpoint_evaluates_to_the_same_figures(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    facts, objects = train(compose(*brief(file)), tmp_path / "run")
+    found, _, _ = evaluate.evaluate_files(objects.checkpoints, baselines=["mean"])
+    same = [key for key in facts if key.startswith("test/")]
+    assert len(same) > 5 and all(found.facts[key] == facts[key] for key in same)
+    image = gsparc.load(objects.checkpoints[0]).spectrum(tx=[0.1, 0.2, 0.1])
+    assert image.shape == (16, 32) and image.max() <= 1
+
+
+def test_folds_have_folders_and_are_pooled(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    settings = brief(file, "split=grouped", "split.folds=2", "model.refit=false", "split.buffer_m=0")
+    facts, objects = train(compose(*settings), tmp_path / "run")
+    assert [p.parent.name for p in objects.checkpoints] == ["fold0", "fold1"]
+    assert facts["split/folds"] == 2 and facts["test/samples"] == 40
+    assert facts["time/train_total_s"] == pytest.approx(2 * facts["time/train_s"])
+
+
+def test_the_simulated_stand_in_says_so(tmp_path):
+    settings = [s for s in brief(tmp_path) if not s.startswith("dataset")]
+    config = compose(*settings, "dataset=rfid_sim", "dataset.count=30", f"dataset.root={tmp_path}")
+    facts, _ = train(config, tmp_path / "run")
+    assert facts["dataset/name"] == "rfid-sim" and facts["dataset/stand_in"]
+
+
+def test_loss_decreases_and_the_field_beats_the_mean_on_simulated_channels(tmp_path):
+    file = channels(tmp_path / "own.npz", rows=150)
+    config = compose(
+        *brief(file, "trainer.max_steps=150", "trainer.val_check_interval=25", "model.field.count=80")
+    )
+    facts, _ = train(config, tmp_path / "run")
+    rows = (tmp_path / "run" / "learning_curve.csv").read_text().splitlines()
+    column = rows[0].split(",").index("train/task_loss")
+    losses = [float(row.split(",")[column]) for row in rows[1:]]
+    assert losses[-1] < 0.5 * losses[0]
+    assert facts["test/nmse"] < 0.8 * facts["baseline/mean/nmse"]
+
+
+class Recording:
+    """A logger that remembers how it was closed."""
+
+    made: list = []  # noqa: RUF012
+
+    def __init__(self) -> None:
+        from lightning.pytorch.loggers import CSVLogger
+
+        self.inner = CSVLogger(os.devnull)
+        self.closed: list[str] = []
+        Recording.made.append(self)
+
+    def log_metrics(self, metrics, step=None):
+        self.metrics = metrics
+
+    def finalize(self, status):
+        self.closed.append(status)
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_loggers_are_closed_whatever_happens(tmp_path, monkeypatch, fails):
+    file = spectra(tmp_path / "own.npz")
+    settings = [s for s in brief(file) if not s.startswith("model.")]
+    config = compose(*settings, "model=mean")
+    with open_dict(config):
+        config.logger = {"own": {"_target_": f"{__name__}.Recording"}}
+    Recording.made.clear()
+    if fails:
+        monkeypatch.setattr("gsparc.commands.train.evaluate", lambda *a, **k: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            train(config, tmp_path / "run")
+    else:
+        train(config, tmp_path / "run")
+        assert Recording.made[0].metrics["baseline/mean/psnr_db"]
+    assert Recording.made[0].closed == ["failed" if fails else "success"]
+
+
+def test_a_finished_model_is_no_training_state(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    _, objects = train(compose(*brief(file, "model.refit=false")), tmp_path / "run")
+    with pytest.raises(ValueError, match=r"resume from last\.ckpt instead"):
+        train(compose(*brief(file, f"ckpt_path={objects.checkpoints[0]}")), tmp_path / "again")
+
+
+def test_another_methods_model_is_no_training_state(tmp_path):
+    """It was taken for an interrupted run: `gsparc has not been trained: call fit() or load a checkpoint`."""
+    file = spectra(tmp_path / "own.npz")
+    settings = [s for s in brief(file) if not s.startswith("model.")]
+    _, objects = train(compose(*settings, "model=nearest"), tmp_path / "run")
+    with pytest.raises(ValueError, match=r"resume from last\.ckpt instead"):
+        train(compose(*brief(file, f"ckpt_path={objects.checkpoints[0]}")), tmp_path / "again")
+
+
+def test_a_missing_checkpoint_is_named(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    with pytest.raises(ValueError, match=r"gone\.ckpt: no such file"):
+        train(compose(*brief(file, "ckpt_path=gone.ckpt")), tmp_path / "run")
+
+
+def start(file: Path, folder: Path, *more: str) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "train.py", *brief(file, *more), f"hydra.run.dir={folder}"],
+        cwd=ROOT, env={**os.environ, "OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+
+
+def test_an_interrupt_leaves_a_checkpoint_that_goes_on(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    more = (
+        "trainer.max_steps=100000",
+        "callbacks.checkpoint.every_n_train_steps=10",
+        "model.refit=false",
+        "trainer.val_check_interval=50000",
+    )
+    run = start(file, tmp_path / "run", *more)
+    last = tmp_path / "run" / "last.ckpt"
+    until = time.monotonic() + 120
+    while not last.exists() and time.monotonic() < until:
+        time.sleep(0.01)
+    run.send_signal(signal.SIGINT)
+    _, said = run.communicate(timeout=60)
+    assert run.returncode == 130 and f"go on with ckpt_path={last}" in said and "Traceback" not in said
+    reached = checkpoint.read(last).extra["trainer"]["global_step"]
+    more = (
+        f"trainer.max_steps={reached + 5}",
+        f"ckpt_path={last}",
+        "model.refit=false",
+        "trainer.val_check_interval=50000",
+    )
+    facts, _ = train(compose(*brief(file, *more)), tmp_path / "on")
+    assert np.isfinite(facts["test/psnr_db"])
+    assert checkpoint.read(tmp_path / "on" / "model.ckpt").method == "gsparc"
+
+
+@pytest.mark.slow
+def test_wandb_offline_is_closed(tmp_path):
+    file = spectra(tmp_path / "own.npz")
+    run = start(file, tmp_path / "run", "logger=wandb")
+    _, said = run.communicate(timeout=240)
+    assert run.returncode == 0, said
+    (folder,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
+    assert list(folder.glob("*.wandb"))

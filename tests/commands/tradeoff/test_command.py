@@ -1,0 +1,137 @@
+"""`gsparc tradeoff`: a table, a picture, points kept; and loading within a budget."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from campaigns import compose
+from hydra.core.hydra_config import HydraConfig
+
+import gsparc
+from gsparc.commands.tradeoff.command import task
+from gsparc.commands.tradeoff.sweep import Recorded, closeness
+from gsparc.evaluation.scores import score
+from gsparc.methods import checkpoint, operating_point, stored_front
+from gsparc.methods.pareto import Point
+from gsparc.methods.timing import ClockSettings, interleaved
+
+
+@pytest.fixture(scope="module")
+def swept(field, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("swept")
+    ckpt = folder / "model.ckpt"
+    shutil.copy(field.checkpoints[0], ckpt)
+    config = compose(
+        f"ckpt='{ckpt}'", "threads=[1]", "rounds=5",
+        "grid.keep=[1.0,0.3]", "grid.stride=[1,2]", "grid.cutoff=[1]",
+        "baselines=[mean]", f"peers=['{field.checkpoints[0]}']", f"cache='{folder}/cache'", config="tradeoff",
+    )  # fmt: skip
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": folder})})
+        )
+        return task(config), folder, ckpt
+
+
+def test_a_misspelt_subset_is_refused_in_words_before_anything_is_measured(field, tmp_path, monkeypatch):
+    """Without baselines it was an AttributeError, after every combination had been made."""
+    monkeypatch.setattr(
+        HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": tmp_path})})
+    )
+    config = compose(f"ckpt='{field.checkpoints[0]}'", "baselines=[]", "eval_on=tset", config="tradeoff")
+    with pytest.raises(ValueError, match="eval_on='tset' is none of train, val, test"):
+        task(config)
+
+
+def test_it_leaves_a_table_a_picture_and_a_summary(swept):
+    facts, folder, _ = swept
+    with (folder / "tradeoff.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == facts["tradeoff/points"] == 7  # as trained, 2 alone, 2 x 2 without confidence
+    times = [float(row["render_ms_p50"]) for row in rows]
+    assert times == sorted(times) and all(
+        float(row["render_ms_p95"]) >= t for row, t in zip(rows, times, strict=True)
+    )
+    assert sum(int(row["front"]) for row in rows) == facts["tradeoff/front"] >= 1
+    full = next(row for row in rows if row["label"].startswith("as trained"))
+    assert float(full["difference_to_full"]) == 0 and float(full["psnr_db"]) == facts["test/psnr_db"]
+    assert (folder / "tradeoff.png").stat().st_size > 20_000
+    stored_facts = json.loads((folder / "summary.json").read_text())
+    assert stored_facts["baseline/mean/render_ms_p50"] > 0 and "baseline/gsparc/psnr_db" in stored_facts
+    assert stored_facts["time/copy_ms"] > 0 and stored_facts["machine/load"] is not None
+
+
+def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
+    _, _, ckpt = swept
+    before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
+    points, measured = stored_front.kept(after.extra)
+    assert points and "contribution" in measured and stored_front.kept(before.extra) == ([], {})
+    assert after.config == before.config and set(after.extra) == {*before.extra, stored_front.KEY}
+    place = field.data.site.origin + 0.1
+    same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
+    assert np.array_equal(*same)
+
+
+def test_what_is_kept_is_decided_without_a_measurement(swept, field):
+    _, folder, _ = swept
+    with (folder / "tradeoff.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["kept_with_model"] == "1"]
+    close = [float(row["closeness_db"]) for row in rows]
+    assert close == sorted(close) and close[-1] == 100.0  # the last is as near as the full model itself
+    data = field.data
+    blind = dataclasses.replace(data, target=np.zeros_like(data.target))
+    recorded = [Recorded(field.methods[0]) for _ in range(2)]
+    for one, seen in zip(recorded, (blind, data), strict=True):
+        score([one], seen, field.split)
+    answers, again = (torch.cat(one.means) for one in recorded)
+    assert torch.equal(answers, again) and closeness(answers, answers) == 100.0
+    assert closeness(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
+
+
+def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
+    _, _, ckpt = swept
+    points, _ = stored_front.kept(checkpoint.read(ckpt).extra)
+    pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
+    monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
+    best = max(points, key=lambda p: p.score)
+    assert gsparc.load(ckpt, budget_ms=1e6).point == best
+    assert gsparc.load(ckpt, budget_ms=1.5).point == points[0]
+    with pytest.raises(ValueError, match=r"budget_ms=0.5: no operating point .* fastest .* takes 1 ms"):
+        gsparc.load(ckpt, budget_ms=0.5)
+
+
+def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
+    _, _, ckpt = swept
+    threads = torch.get_num_threads()
+    predictor = gsparc.load(ckpt, budget_ms=1000)
+    place = predictor.site.origin + 0.1
+    assert predictor.spectrum(tx=place).shape == (16, 32) and 0 <= predictor.confidence(tx=place) <= 1
+    times = interleaved({0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1})
+    assert np.median(times[0]) <= 1000
+    torch.set_num_threads(threads)
+
+
+def test_a_model_never_swept_says_what_to_do(field):
+    with pytest.raises(ValueError, match=r"no operating point .* `gsparc tradeoff ckpt="):
+        gsparc.load(field.checkpoints[0], budget_ms=1e-6)
+    with pytest.raises(ValueError, match="a positive number of milliseconds"):
+        gsparc.load(field.checkpoints[0], budget_ms=-1)
+
+
+def test_a_kill_while_points_are_stored_leaves_the_model(field, tmp_path, monkeypatch):
+    ckpt = tmp_path / "model.ckpt"
+    shutil.copy(field.checkpoints[0], ckpt)
+    before = ckpt.read_bytes()
+    monkeypatch.setattr(
+        "gsparc.data.files.os.replace", lambda *paths: (_ for _ in ()).throw(KeyboardInterrupt)
+    )
+    point = Point("as trained", {}, 1, {"psnr_db": 1.0}, 1.0, np.ones(3))
+    with pytest.raises(KeyboardInterrupt):
+        stored_front.keep(ckpt, [point], "psnr_db", {})
+    assert ckpt.read_bytes() == before and list(tmp_path.iterdir()) == [ckpt]

@@ -1,0 +1,49 @@
+"""Who is beaten, and what a halving costs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gsparc.commands.tradeoff.picture import Other, beaten_by
+from gsparc.methods.pareto import Point, cost_of_halving, front, worded
+
+PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)
+
+
+@given(PAIRS)
+def test_nobody_on_the_front_is_beaten_and_everybody_else_is(pairs):
+    latency, score = zip(*pairs, strict=True)
+    kept = front(latency, score)
+    for i in range(len(pairs)):
+        beaten = any(
+            latency[j] <= latency[i]
+            and score[j] >= score[i]
+            and (latency[j], -score[j]) < (latency[i], -score[i])
+            for j in range(len(pairs))
+        )
+        same = any((latency[j], score[j]) == (latency[i], score[i]) for j in kept)
+        assert (i in kept) == (not beaten and (i in kept)) and (beaten or same)
+    assert [latency[i] for i in kept] == sorted(latency[i] for i in kept)
+
+
+def test_a_halving_costs_the_slope_of_the_front():
+    assert cost_of_halving([1, 2, 4, 8], [20, 21, 22, 23]) == pytest.approx(1.0)
+    assert cost_of_halving([1], [20]) is None and cost_of_halving([1, 1], [20, 21]) is None
+
+
+def test_settings_are_said_in_words():
+    assert worded({}) == "as trained"
+    assert (
+        worded({"keep": 0.25, "stride": 3, "confidence": False})
+        == "25% kept, 1 of 3 x 3 pixels, no confidence"
+    )
+
+
+def test_a_point_that_another_method_beats_is_said():
+    point = Point("p", {}, 1, {"psnr_db": 20.0}, 0.0, np.full(3, 1.0))
+    others = {"nearest": Other(26.0, 0.5, 0.6), "gp": Other(29.0, 2.0, 3.0), "mean": Other(15.0, 0.1, 0.1)}
+    assert beaten_by(point, others, "psnr_db") == "nearest"
+    assert beaten_by(point, {"gp": others["gp"], "mean": others["mean"]}, "psnr_db") is None
