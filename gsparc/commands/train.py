@@ -17,7 +17,8 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands import cli
 from gsparc.commands.context import context_of
-from gsparc.commands.settings import RunSettings
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.commands.study.run import fit_and_score
 from gsparc.data.files import platform_cache
 from gsparc.data.instantiate import suggest
 from gsparc.data.load import datamodule, split_for
@@ -30,7 +31,7 @@ from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
-from gsparc.methods.method import Method, Resumable, TrainsByGradient
+from gsparc.methods.method import FitReport, Method, Resumable, TrainsByGradient
 from gsparc.methods.registry import build
 
 log = logging.getLogger(__name__)
@@ -77,35 +78,37 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         module.measurements = _seen_from(config.init_from, module.measurements)
     data = module.measurements
     objective_of(config, data.site.kind)  # refused now, not after the training
-    split = split_for(_plain(config.split), data)
+    split = split_for(plain(config.split), data)
     _refuse_empty(split)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     config_yaml = OmegaConf.to_yaml(config, resolve=True)
-    methods, files, seconds = [], [], []
+    count = len(split.folds)
+    folders = [run_dir] if count == 1 else [run_dir / f"fold{number}" for number in range(count)]
+    files = tuple(folder / "model.ckpt" for folder in folders)
+    resumes = [_resume(config, number, count) for number in range(count)]
+    unfitted = build(config.model)
+    _refuse_start(config, unfitted)
+    if any(resumes) and not isinstance(unfitted, Resumable):
+        raise ValueError(f"ckpt_path: {unfitted.name} trains in one piece; start again without ckpt_path")
+    for guess in unfitted.guesses:
+        log.info("guess: %s", guess)
+
+    def keep(number: int, method: Method, report: FitReport) -> None:
+        _note_unused_trainer(method)
+        for note in report.notes:
+            log.info("%s", note)
+        extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
+        checkpoint.save(files[number], method, config_yaml, extra)
+
     with _loggers(config) as loggers:
-        for number, fold in enumerate(split.folds):
-            folder = run_dir if len(split.folds) == 1 else run_dir / f"fold{number}"
-            method = build(config.model)
-            _refuse_start(config, method)
-            for guess in method.guesses if number == 0 else ():
-                log.info("guess: %s", guess)
-            resume = _resume(config, number, len(split.folds))
-            if resume is not None and not isinstance(method, Resumable):
-                raise ValueError(
-                    f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path"
-                )
-            report = method.fit(data, fold, context_of(config, folder, module, loggers, resume))
-            _note_unused_trainer(method)
-            for note in report.notes:
-                log.info("%s", note)
-            file = folder / "model.ckpt"
-            extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
-            checkpoint.save(file, method, config_yaml, extra)
-            methods.append(method)
-            files.append(file)
-            seconds.append(report.seconds)
+        fitted = fit_and_score(
+            lambda: build(config.model), data, split,
+            lambda number: context_of(config, folders[number], module, loggers, resumes[number]),
+            eval_on=None, keep=keep,
+        )  # fmt: skip
+        methods = fitted.methods
         found = evaluate(
-            methods, seconds, data, split,
+            methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=list(config.baselines), cache=platform_cache(),
         )  # fmt: skip
         facts = {**found.facts, **provenance(), "seed": int(config.seed)}
@@ -120,11 +123,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     )
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_summary(run_dir / "summary.json", facts)
-    return facts, Objects(tuple(methods), tuple(files), data, split, found)
-
-
-def _plain(node: DictConfig) -> dict[str, Any]:
-    return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
+    return facts, Objects(methods, files, data, split, found)
 
 
 def _anchor(config: DictConfig) -> None:

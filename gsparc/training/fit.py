@@ -35,6 +35,7 @@ DEFAULTS = partial(
     L.Trainer,
     accelerator="cpu",
     devices=1,
+    precision="32-true",
     max_steps=400,
     val_check_interval=100,
     num_sanity_val_steps=0,
