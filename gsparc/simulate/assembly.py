@@ -22,6 +22,7 @@ from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import Shards
 from gsparc.simulate.spectrum import spectra
 
+STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
 
 
@@ -72,23 +73,20 @@ def assemble(
     shards: Shards,
     out: Path,
 ) -> Assembled:
-    """Put the shards together, write the file, drop the shards.
+    """Put the shards, all of them there, together, write the file `out`, drop the shards.
 
     Args:
         campaign, engine, receivers, effects, choice, convergence: what the file is of.
         seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
-        shards: all of them there.
-        out: the file.
+        shards, out: from where and where to.
 
     Raises:
         ValueError: nothing reaches any receiver.
     """
     parts = [shards.get(n) for n in range(-(-len(receivers) // campaign.shard))]
-    seconds += sum(float(p[SECONDS]) for p in parts)
-    whole = {
-        k: np.concatenate([p[k] for p in parts]) for k in parts[0] if k not in (*ARRAYS, "offsets", SECONDS)
-    }
-    paths = join([Paths(*(p[name] for name in ("offsets", *ARRAYS))) for p in parts])
+    seconds += sum(float(p.pop(SECONDS)) for p in parts)
+    paths = join([Paths(*(p.pop(name) for name in ("offsets", *ARRAYS))) for p in parts])
+    whole = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
     del parts
     power = whole["received_power"]
     reached = power > 0
@@ -101,14 +99,11 @@ def assemble(
         np.linalg.norm(receivers - engine.transmitter, axis=1),
         campaign.spectrum.near_field(engine.wavelength),
     )
-    facts |= {
-        "silent_receivers": float((~reached).sum()),
-        "paths_per_receiver": len(paths.order) / len(receivers),
-    }
+    facts["silent_receivers"] = float((~reached).sum())
+    facts["paths_per_receiver"] = len(paths.order) / len(receivers)
     arrays = _arrays(campaign, engine, receivers, effects, whole, paths)
     about = _provenance(campaign, engine, effects, choice, convergence, facts)
-    about["simulate_s"] = seconds
-    data = write_own(out, arrays, about)
+    data = write_own(out, arrays, {**about, "simulate_s": seconds})
     shards.remove()
     return Assembled(data, power, whole["delay_spread"], facts)
 
@@ -134,14 +129,9 @@ def _arrays(
         "spectrum_peak": peak,
         "frequency_hz": scene.frequency_hz,
         "carrier_hz": np.array(scene.carrier_hz),
-        "received_power": whole["received_power"],
-        "delay_spread": whole["delay_spread"],
-        "path_offsets": paths.offsets,
-        "path_direction": paths.direction,
+        **{name: whole[name] for name in ("received_power", "delay_spread")},
+        **{f"path_{name}": getattr(paths, name) for name in STORED},
         "path_gain": paths.gain[:, 0] if paths.gain.shape[1] == 1 else paths.gain,
-        "path_delay": paths.delay,
-        "path_order": paths.order,
-        "path_mechanisms": paths.mechanisms,
         "line_of_sight": paths.per_receiver((paths.order == 0).astype(float)) > 0,
         "split_train": np.sort(order[tests:]),
         "split_test": np.sort(order[:tests]),
@@ -190,5 +180,5 @@ def _provenance(
     if convergence is not None:
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
     if choice is not None:
-        about["auto"] = json.dumps(choice.as_dict())
+        about["auto"] = json.dumps(asdict(choice))
     return about

@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -122,22 +122,13 @@ class Choice:
         """Share of the tracing time that the choice saves against everything."""
         return 1 - self.seconds_chosen / self.seconds_all if self.seconds_all > 0 else 0.0
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain numbers and strings, for a file."""
-        return asdict(self)
-
     @staticmethod
     def from_dict(stored: Mapping[str, Any]) -> Choice:
-        """Inverse of `as_dict`."""
-        verdict = stored["verdict"]
+        """Inverse of `dataclasses.asdict`."""
+        verdict = None if stored["verdict"] is None else Verification(**stored["verdict"])
+        table = tuple(EffectRow(**row) for row in stored["table"])
         return Choice(
-            Effects(**stored["effects"]),
-            stored["deliverable"],
-            tuple(EffectRow(**row) for row in stored["table"]),
-            float(stored["seconds_all"]),
-            float(stored["seconds_chosen"]),
-            float(stored["seconds"]),
-            None if verdict is None else Verification(**verdict),
+            **{**stored, "effects": Effects(**stored["effects"]), "table": table, "verdict": verdict}
         )
 
 
@@ -178,15 +169,14 @@ def decide(
     seconds = {name: _timed(engine, timed, less) for name, less in dropped.items()}
     costs = {s: _estimate(s, full, seconds, seconds_all) for s in combinations(full, removable)}
     chosen = _cheapest(costs, lambda some: holds(probe.errors(some, deliverable)[reached]), full)
-    why = explain(probe)
-    table = []
+    why, table = explain(probe), []
     for name, less in dropped.items():
-        share, nmse = probe.shares(less)[reached], probe.nmse(less)[reached]
-        kept = _keeps(chosen, name)
-        reason = why.get("depth" if name.startswith("depth") else name, "")
+        share, nmse, error = probe.shares(less)[reached], probe.nmse(less)[reached], errors[name]
+        effect, _, depth = name.partition(" > ")
+        kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, name))
         table.append(EffectRow(
             name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-            float(np.median(errors[name])), _p95(errors[name]), seconds[name], reason, kept,
+            float(np.median(error)), _p95(error), seconds[name], why.get(effect, ""), kept,
         ))  # fmt: skip
     seconds_chosen = seconds_all if chosen == full else _timed(engine, timed, chosen)
     return Choice(
@@ -240,19 +230,11 @@ def _estimate(some: Effects, full: Effects, seconds: Mapping[str, float], everyt
 
     Leaving an effect out never costs time: a measurement that says so is noise.
     """
-    saved = []
-    if some.depth < full.depth:
-        saved.append(f"depth > {some.depth}")
+    saved = [f"depth > {some.depth}"] if some.depth < full.depth else []
     saved += [name for name in full.on if name in seconds and name not in some.on]
-    if full.polarisation and not some.polarisation and "polarisation" in seconds:
+    if full.polarisation and not some.polarisation:
         saved.append("polarisation")
     return everything * math.prod(min(seconds[name] / everything, 1.0) for name in saved)
-
-
-def _keeps(effects: Effects, name: str) -> bool:
-    if name.startswith("depth"):
-        return effects.depth > int(name.rpartition(" ")[2])
-    return bool(getattr(effects, name))
 
 
 def _p95(values: np.ndarray) -> float:

@@ -23,6 +23,7 @@ from gsparc.simulate.shards import Shards
 
 log = logging.getLogger(__name__)
 
+STAGES = ("build", "decide", "trace", "converge", "write")
 PARTS = 2  # version of what a shard holds: those of another are refused
 
 
@@ -72,45 +73,36 @@ def simulate(campaign: Campaign, out: Path) -> Outcome:
     """
     if out.exists():
         raise ValueError(f"out={out} exists; remove it or choose another")
-    clock = _Clock()
+    laps = [time.perf_counter()]
     engine, receivers = build(campaign.scene, campaign.sampling)
     shards = Shards(out, {**asdict(campaign), "parts": PARTS})
-    clock.lap("build")
-    choice, changed, effects = None, None, campaign.effects
+    laps.append(time.perf_counter())
+    choice, changed, effects, decided_s = None, None, campaign.effects, 0.0
     if isinstance(effects, AutoSettings):
-        choice, changed = _choose(campaign, effects, engine, receivers, shards)
+        choice, changed, decided_s = _choose(campaign, effects, engine, receivers, shards)
         effects = choice.effects
     effects = engine.supported(effects)
-    clock.lap("decide")
+    laps.append(time.perf_counter())
     _trace_all(campaign, engine, receivers, effects, shards)
-    clock.lap("trace")
+    laps.append(time.perf_counter())
     convergence = _converge(campaign, engine, receivers, effects)
-    clock.lap("converge")
-    other_s = clock.seconds["build"] + _decided_s(shards) + clock.seconds["converge"]
+    laps.append(time.perf_counter())
+    other_s = laps[1] - laps[0] + decided_s + laps[4] - laps[3]
     made = assemble(campaign, engine, receivers, effects, choice, convergence, other_s, shards, out)
-    clock.lap("write")
-    return Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, clock.seconds)
-
-
-class _Clock:
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
-
-    def lap(self, name: str) -> None:
-        now = time.perf_counter()
-        self.seconds[name], self._last = now - self._last, now
+    laps.append(time.perf_counter())
+    seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
+    return Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, seconds)
 
 
 def _choose(
     campaign: Campaign, settings: AutoSettings, engine: Engine, receivers: np.ndarray, shards: Shards
-) -> tuple[Choice, Changed]:
-    """The decision of `auto`, taken once and stored with the shards, and errors by the dropped effects."""
+) -> tuple[Choice, Changed, float]:
+    """The decision of `auto`, taken once and stored with the shards; errors it makes; its time [s]."""
     begin = time.perf_counter()
     stored = shards.read_note("choice")
     if stored is not None:
         changed = Changed(np.array(stored["rows"], dtype=int), np.array(stored["errors"]))
-        return Choice.from_dict(stored["choice"]), changed
+        return Choice.from_dict(stored["choice"]), changed, float(stored["seconds"])
     chosen = spread(receivers, settings.probes + settings.held_back, campaign.scene.seed)
     # Farthest-point order: taking every so many leaves both groups spread out.
     taken = np.zeros(len(chosen), dtype=bool)
@@ -128,18 +120,16 @@ def _choose(
     log.info("auto: keeps %s; verifying on %d held-back receivers", choice.effects, len(held))
     probe = _probe(campaign, engine, receivers, held, full)
     choice = auto.verify(choice, settings, probe)
-    deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
-    changed = Changed(held, probe.errors(choice.effects, deliverable))
-    shards.write_note(
-        "choice",
-        {
-            "choice": choice.as_dict(),
-            "rows": held.tolist(),
-            "errors": changed.errors.tolist(),
-            "seconds": time.perf_counter() - begin,
-        },
-    )
-    return choice, changed
+    errors = probe.errors(choice.effects, Deliverable.parse(settings.deliverable, settings.quantile))
+    seconds = time.perf_counter() - begin
+    decision = {
+        "choice": asdict(choice),
+        "rows": held.tolist(),
+        "errors": errors.tolist(),
+        "seconds": seconds,
+    }
+    shards.write_note("choice", decision)
+    return choice, Changed(held, errors), seconds
 
 
 def _probe(
@@ -176,24 +166,15 @@ def _trace_all(
 ) -> None:
     """Every shard that is not there yet, with progress in the log."""
     starts = range(0, len(receivers), campaign.shard)
-    missing = [n for n in range(len(starts)) if not shards.done(n)]
+    parts = {n: receivers[i : i + campaign.shard] for n, i in enumerate(starts)}
+    missing = {n: places for n, places in parts.items() if not shards.path(n).exists()}
     if len(missing) < len(starts):
         log.info("%d of %d shards are there already", len(starts) - len(missing), len(starts))
-    begin, done = time.perf_counter(), 0
-    todo = sum(min(campaign.shard, len(receivers) - starts[n]) for n in missing)
-    for number in missing:
-        places = receivers[starts[number] : starts[number] + campaign.shard]
+    begin, done, left = time.perf_counter(), 0, sum(map(len, missing.values()))
+    for number, places in missing.items():
         start = time.perf_counter()
         made = shard_arrays(engine.trace(places, effects), campaign, engine.wavelength)
         shards.put(number, {**made, SECONDS: np.array(time.perf_counter() - start)})
-        done += len(places)
-        rate = done / (time.perf_counter() - begin)
-        standing = len(receivers) - todo + done
-        left = (todo - done) / rate
-        log.info("%d of %d receivers, %.1f per s, %.0f s left", standing, len(receivers), rate, left)
-
-
-def _decided_s(shards: Shards) -> float:
-    """Time of the decision, in whichever run took it [s]."""
-    stored = shards.read_note("choice")
-    return 0.0 if stored is None else float(stored["seconds"])
+        done, left = done + len(places), left - len(places)
+        rate, count = done / (time.perf_counter() - begin), len(receivers)
+        log.info("%d of %d receivers, %.1f per s, %.0f s left", count - left, count, rate, left / rate)

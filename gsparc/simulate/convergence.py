@@ -30,13 +30,7 @@ class Convergence:
 
     def attributes(self) -> dict[str, float | int]:
         """For the file, beside `convergence_error`, which is `nmse`."""
-        return {
-            "convergence_spectrum_nmse": self.spectrum_nmse,
-            "convergence_spectrum_mse": self.spectrum_mse,
-            "convergence_spectrum_psnr_db": self.spectrum_psnr_db,
-            "convergence_spectrum_ssim": self.spectrum_ssim,
-            "convergence_receivers": self.receivers,
-        }
+        return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
 
 
 def compare(first: Probe, second: Probe) -> Convergence:

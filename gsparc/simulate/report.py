@@ -52,12 +52,13 @@ def verdict(choice: Choice) -> str:
 
 def figures(outcome: Outcome) -> dict[str, Any]:
     """Flat facts."""
+    made = outcome.made
     facts: dict[str, Any] = {
-        "dataset/name": outcome.made.data.site.name,
-        "dataset/sha256": outcome.made.data.site.sha256,
+        "dataset/name": made.data.site.name,
+        "dataset/sha256": made.data.site.sha256,
         "dataset/receivers": len(outcome.receivers),
         "effects": str(outcome.effects),
-        **{f"scene/{name}": value for name, value in outcome.made.facts.items()},
+        **{f"scene/{name}": value for name, value in made.facts.items()},
         **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
         "time/receivers_per_s": len(outcome.receivers) / max(outcome.seconds["trace"], 1e-9),
     }
@@ -67,22 +68,16 @@ def figures(outcome: Outcome) -> dict[str, Any]:
     choice = outcome.choice
     if choice is not None:
         facts |= {
-            "auto/deliverable": choice.deliverable,
-            "auto/seconds_all": choice.seconds_all,
-            "auto/seconds_chosen": choice.seconds_chosen,
-            "auto/saved": choice.saved,
             "auto/decide_s": choice.seconds,
+            **{
+                f"auto/{k}": getattr(choice, k)
+                for k in ("deliverable", "seconds_all", "seconds_chosen", "saved")
+            },
         }
         for row in choice.table:
             name = row.effect.replace(" > ", "_over_")
-            facts |= {
-                f"auto/{name}/share": row.share,
-                f"auto/{name}/nmse": row.nmse,
-                f"auto/{name}/nmse_p95": row.nmse_p95,
-                f"auto/{name}/error_p95": row.error_p95,
-                f"auto/{name}/seconds": row.seconds,
-                f"auto/{name}/kept": row.kept,
-            }
+            for k in ("share", "nmse", "nmse_p95", "error_p95", "seconds", "kept"):
+                facts[f"auto/{name}/{k}"] = getattr(row, k)
         if choice.verdict is not None:
             facts |= {f"auto/verdict/{k}": v for k, v in vars(choice.verdict).items()}
     return facts

@@ -40,12 +40,11 @@ class Shards:
                 f"{self.folder} holds parts of a different simulation; remove it, or choose another out="
             )
         if not stored.exists():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            _write(stored, text.encode())
+            _write(stored, text)
 
     def write_note(self, name: str, content: Mapping[str, Any]) -> None:
         """Store a decision, so that a resumed run does not decide again."""
-        _write(self.folder / f"{name}.json", json.dumps(content, indent=1).encode())
+        _write(self.folder / f"{name}.json", json.dumps(content, indent=1))
 
     def read_note(self, name: str) -> dict[str, Any] | None:
         """The stored decision, or None."""
@@ -53,12 +52,8 @@ class Shards:
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
 
     def path(self, number: int) -> Path:
-        """File of a shard."""
+        """File of a shard; it is there once the shard is finished."""
         return self.folder / f"shard_{number:04d}.npz"
-
-    def done(self, number: int) -> bool:
-        """Whether a shard is finished."""
-        return self.path(number).exists()
 
     def put(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write a shard, whole or not at all."""
@@ -82,6 +77,6 @@ class Shards:
             shutil.rmtree(self._removed)
 
 
-def _write(path: Path, content: bytes) -> None:
+def _write(path: Path, content: str) -> None:
     with whole_file(path) as partial:
-        partial.write_bytes(content)
+        partial.write_text(content, encoding="utf-8")

@@ -181,4 +181,4 @@ def test_removals_and_combinations_are_complete():
 
 def test_a_choice_survives_its_file():
     choice = decided("coverage +-1 dB")
-    assert Choice.from_dict(choice.as_dict()) == choice
+    assert Choice.from_dict(dataclasses.asdict(choice)) == choice
