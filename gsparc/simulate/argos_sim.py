@@ -8,21 +8,20 @@ release's files (`csidata.npy` of 8 antennas, `base-station.yml`) there are all 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import yaml
 
+from gsparc.data import argos
+from gsparc.data.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.streets import Rays, Streets, trace
 
-STAND_IN = "argos-sim"  # `dataset_name` of the simulated replacement
-CARRIER_HZ = 2.4e9
-SPACING_HZ = 312.5e3  # 20 MHz in 64 tones, of which 52 are used
-TONES = np.concatenate([np.arange(-26, 0), np.arange(1, 27)])
-FFT = 64
+TONES = np.array(argos.TONES)
+FFT = 64  # 20 MHz in 64 tones, of which 52 are used
 SIDE = 8
 LOWER, UPPER = np.array([-140.0, -105.0]), np.array([140.0, 105.0])  # [m] where users walk
 HEIGHT_M = (1.0, 1.9)
@@ -52,24 +51,19 @@ def scene(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
     half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
-    buildings = np.stack([centres - half, centres + half], axis=1)
-    streets = Streets(
-        buildings=buildings,
-        reflection=-rng.uniform(0.7, 0.9, 9),
-        scatterers=np.zeros((0, 3)),
-        cross_section=np.zeros(0),
-        scatterer_phase=np.zeros(0),
-        base=np.array([-50.0, 37.0, 9.0]),
+    buildings, none, base = (
+        np.stack([centres - half, centres + half], 1),
+        np.zeros(0),
+        np.array([-50.0, 37, 9]),
     )
+    streets = Streets(buildings, -rng.uniform(0.7, 0.9, 9), np.zeros((0, 3)), none, none, base)
     places = rng.uniform(1.5 * LOWER, 1.5 * UPPER, (max(400, 6 * scatterers), 2))
     places = places[streets.open(places)][:scatterers]
-    return Streets(
-        buildings=streets.buildings,
-        reflection=streets.reflection,
+    return replace(
+        streets,
         scatterers=np.column_stack([places, rng.uniform(1, 6, len(places))]),
         cross_section=10 ** rng.uniform(2.5, 4.5, len(places)),
         scatterer_phase=rng.uniform(0, 2 * np.pi, len(places)),
-        base=streets.base,
     )
 
 
@@ -149,9 +143,7 @@ def snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
     return measured
 
 
-def write_argos_sim(
-    folder: Path, count: int, seed: int, offsets: Offsets, scatterers: int = SCATTERERS
-) -> None:
+def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatterers: int) -> None:
     """Write `count` snapshots in the release's layout; the folder must not exist."""
     truth = world(count, seed, scatterers)
     measured = snapshots(truth, offsets, seed)
@@ -159,21 +151,14 @@ def write_argos_sim(
         np.save(partial / "csidata.npy", measured[:, :SIDE])
         np.save(partial / "csidata-64.npy", measured)
         np.save(partial / "positions.npy", truth.users)
+        places = (scene(seed).base + array()).round(6)
         description = {
-            "dataset_name": STAND_IN,
-            "carrier_hz": CARRIER_HZ,
-            "spacing_hz": SPACING_HZ,
-            "tones": TONES.tolist(),
-            "noise_power": truth.noise_power,
-            "base_station": (scene(seed).base + array()[:SIDE]).round(6).tolist(),
-            "base_station_64": (scene(seed).base + array()).round(6).tolist(),
-            "count": count,
-            "seed": seed,
-            "scatterers": scatterers,
-        }
-        (partial / "base-station.yml").write_text(
-            yaml.safe_dump(description, sort_keys=False), encoding="utf-8"
-        )
+            "dataset_name": STAND_IN, "carrier_hz": CARRIER_HZ, "spacing_hz": SPACING_HZ,
+            "tones": TONES.tolist(), "noise_power": truth.noise_power, "base_station": places[:SIDE].tolist(),
+            "base_station_64": places.tolist(), "count": count, "seed": seed, "scatterers": scatterers,
+        }  # fmt: skip
+        text = yaml.safe_dump(description, sort_keys=False)
+        (partial / "base-station.yml").write_text(text, encoding="utf-8")
         order = np.random.default_rng(seed).permutation(count)
         test = max(round(0.2 * count), 1)
         for name, rows in (("test", order[:test]), ("train", order[test:])):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -44,19 +45,19 @@ class Deliverable:
         """
         found = REQUIREMENT.fullmatch(text.strip())
         if not (found and 0 < quantile < 1):
-            raise ValueError(
-                f"effects.deliverable={text!r}: expected 'coverage +-1 dB', 'csi -20 dB' or "
-                "'spectrum skill 0.9'"
-            )
-        kind, number = found[1].lower(), None if found[2] is None else float(found[2])
+            expected = "'coverage +-1 dB', 'csi -20 dB' or 'spectrum skill 0.9'"
+            raise ValueError(f"effects.deliverable={text!r}: expected {expected}")
+        kind = found[1].lower()
+        number = (
+            {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}[kind] if found[2] is None else float(found[2])
+        )
         if kind == "coverage":
-            return Deliverable("coverage", abs(1.0 if number is None else number), quantile)
+            return Deliverable("coverage", abs(number), quantile)
         if kind == "csi":
-            return Deliverable("csi", -20.0 if number is None else -abs(number), quantile)
-        skill = 0.9 if number is None else number
-        if not 0 < skill < 1:
+            return Deliverable("csi", -abs(number), quantile)
+        if not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
-        return Deliverable("spectrum", round(1 - skill, 6), quantile)
+        return Deliverable("spectrum", round(1 - number, 6), quantile)
 
     def __str__(self) -> str:
         share = f"for {self.quantile:.0%} of the receivers"
@@ -89,9 +90,16 @@ class Probe:
     spectrum: SpectrumSettings
     nearest: Paths | None = None
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_channels", self._channel(self.effects))
-        object.__setattr__(self, "_images", {})
+    @cached_property
+    def _channels(self) -> np.ndarray:
+        return self._channel(self.effects)
+
+    @cached_property
+    def _images(self) -> tuple[np.ndarray, np.ndarray]:
+        """With everything, and of the nearest other receivers."""
+        if self.nearest is None:
+            raise ValueError("spectra are compared with the nearest receiver's: trace it too")
+        return self._render(self.paths), self._render(self.nearest)
 
     @property
     def reached(self) -> np.ndarray:
@@ -105,8 +113,7 @@ class Probe:
 
     def nmse(self, kept: Effects) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
-        full: np.ndarray = self._channels  # type: ignore[attr-defined]
-        rest = self._channel(kept)
+        full, rest = self._channels, self._channel(kept)
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
         energy = (np.abs(full) ** 2).sum((1, 2))
@@ -119,25 +126,13 @@ class Probe:
             return np.abs(10 * np.log10(remains))
         if deliverable.kind == "csi":
             return 10 * np.log10(np.maximum(self.nmse(kept), 10 ** (-SILENCE_DB / 10)))
-        full, near = self._image(self.effects), self._image(None)
-        error = ((self._image(kept) - full) ** 2).mean((1, 2))
-        rival = ((near - full) ** 2).mean((1, 2))
+        full, near = self._images
+        left = full if kept == self.effects else self._render(self.paths.under(kept))
+        error, rival = (((image - full) ** 2).mean((1, 2)) for image in (left, near))
         return error / np.maximum(rival, 1e-12)
 
     def _channel(self, kept: Effects) -> np.ndarray:
         return self.paths.under(kept).responses(self.frequency_hz, self.elements, self.wavelength)
-
-    def _image(self, kept: Effects | None) -> np.ndarray:
-        if kept is None and self.nearest is None:
-            raise ValueError("spectra are compared with the nearest receiver's: trace it too")
-        memory: dict[Effects | None, np.ndarray] = self._images  # type: ignore[attr-defined]
-        if kept is not None and kept != self.effects:
-            return self._render(self.paths.under(kept))
-        if kept not in memory:
-            source = self.nearest if kept is None else self.paths
-            assert source is not None
-            memory[kept] = self._render(source)
-        return memory[kept]
 
     def _render(self, paths: Paths) -> np.ndarray:
         return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]
@@ -145,10 +140,8 @@ class Probe:
 
 def removals(full: Effects) -> dict[str, Effects]:
     """What can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation."""
-    dropped = {name: _without(full, name) for name in full.on}
-    found = {name: less for name, less in dropped.items() if less is not None}
-    for depth in range(full.depth - 1, 0, -1):
-        found[f"depth > {depth}"] = replace(full, depth=depth)
+    found = {name: less for name in full.on if (less := _without(full, name)) is not None}
+    found |= {f"depth > {depth}": replace(full, depth=depth) for depth in range(full.depth - 1, 0, -1)}
     if full.polarisation:
         found["polarisation"] = replace(full, polarisation=False)
     return found
@@ -158,9 +151,8 @@ def combinations(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
     """Every set of switches that leaves out some of `removable` (names as in `removals`); `full` first."""
     sets = {full}
     for name in removable:
-        if name.startswith("depth"):
-            depth = int(name.rpartition(" ")[2])
-            sets |= {replace(s, depth=min(s.depth, depth)) for s in sets}
+        if name.startswith("depth > "):
+            sets |= {replace(s, depth=min(s.depth, int(name[8:]))) for s in sets}
         elif name == "polarisation":
             sets |= {replace(s, polarisation=False) for s in sets}
         else:

@@ -110,25 +110,21 @@ def _choose(
     probes, held = chosen[taken], chosen[~taken]
     full = engine.supported(settings.full)
     log.info("auto: %d probes with %s", len(probes), full)
-    choice = auto.decide(
-        engine,
-        receivers[probes],
-        settings,
+    probe, places, materials = (
         _probe(campaign, engine, receivers, probes, full),
-        lambda probe: priors.reasons(probe, engine.transmitter, receivers[probes], engine.materials()),
+        receivers[probes],
+        engine.materials(),
+    )
+    choice = auto.decide(
+        engine, places, settings, probe, lambda p: priors.reasons(p, engine.transmitter, places, materials)
     )
     log.info("auto: keeps %s; verifying on %d held-back receivers", choice.effects, len(held))
     probe = _probe(campaign, engine, receivers, held, full)
     choice = auto.verify(choice, settings, probe)
     errors = probe.errors(choice.effects, Deliverable.parse(settings.deliverable, settings.quantile))
     seconds = time.perf_counter() - begin
-    decision = {
-        "choice": asdict(choice),
-        "rows": held.tolist(),
-        "errors": errors.tolist(),
-        "seconds": seconds,
-    }
-    shards.write_note("choice", decision)
+    cost = {"rows": held.tolist(), "errors": errors.tolist(), "seconds": seconds}
+    shards.write_note("choice", {"choice": asdict(choice), **cost})
     return choice, Changed(held, errors), seconds
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -64,11 +66,8 @@ class Effects:
 
     def without(self, *names: str) -> Effects:
         """The same with some switched off, and with what needs them."""
-        off = set(names)
-        if "specular" in off:
-            off.add("diffuse")
-        if "diffraction" in off:
-            off.add("edge_diffraction")
+        needs = {"specular": "diffuse", "diffraction": "edge_diffraction"}
+        off = {*names, *(needs[name] for name in names if name in needs)}
         return replace(self, **dict.fromkeys(off, False))
 
     def allows(self, mechanisms: np.ndarray, order: np.ndarray) -> np.ndarray:
@@ -87,14 +86,19 @@ class Effects:
         return ", ".join([name.replace("_", " ") for name in self.on] + extra)
 
 
-def from_config(config: dict[str, object]) -> Effects:
+def from_config(config: Mapping[str, Any]) -> Effects:
     """Switches from the config group `effects`.
 
     Raises:
         ValueError: a switch that does not exist, or a contradiction.
     """
-    known = {f.name for f in fields(Effects)}
-    unknown = [key for key in config if key not in known]
-    if unknown:
-        raise ValueError(f"effects.{unknown[0]}: no such effect; there are {', '.join(sorted(known))}")
-    return Effects(**config)  # type: ignore[arg-type]
+    return Effects(**known_keys(config, Effects, "effects", "effect"))
+
+
+def known_keys(config: Mapping[str, Any], kind: type, group: str, noun: str) -> Mapping[str, Any]:
+    """`config` when all its keys are fields of the dataclass `kind`; else a ValueError names one `noun`."""
+    known = {field.name for field in fields(kind)}
+    for key in config:
+        if key not in known:
+            raise ValueError(f"{group}.{key}: no such {noun}; there are {', '.join(sorted(known))}")
+    return config

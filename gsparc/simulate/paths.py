@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -46,15 +46,12 @@ class Paths:
     def select(self, kept: np.ndarray) -> Paths:
         """Only the paths where `kept` (P,) bool is true; receivers stay."""
         counts = np.bincount(self.owner[kept], minlength=len(self))
-        parts = (getattr(self, name)[kept] for name in ARRAYS)
-        return Paths(np.concatenate([[0], np.cumsum(counts)]), *parts)
+        return Paths(starts(counts), *(getattr(self, name)[kept] for name in ARRAYS))
 
     def under(self, effects: Effects) -> Paths:
         """What remains of a full simulation under these switches."""
         kept = self.select(effects.allows(self.mechanisms, self.order))
-        if effects.polarisation or kept.gain.shape[1] == 1:
-            return kept
-        return Paths(kept.offsets, kept.gain[:, :1], *(getattr(kept, n) for n in ARRAYS[1:]))
+        return kept if effects.polarisation else replace(kept, gain=kept.gain[:, :1])
 
     def per_receiver(self, values: np.ndarray) -> np.ndarray:
         """Sums of `values` (P,) over the paths of each receiver (R,)."""
@@ -94,8 +91,14 @@ class Paths:
 ARRAYS = ("gain", "delay", "direction", "mechanisms", "order")
 
 
+def starts(counts: np.ndarray) -> np.ndarray:
+    """Offsets (R + 1,) of consecutive groups of `counts` (R,) paths."""
+    return np.concatenate([[0], np.cumsum(counts)])
+
+
 def join(parts: Sequence[Paths]) -> Paths:
     """Receivers of all parts, one after the other."""
     counts = np.concatenate([np.diff(part.offsets) for part in parts])
-    columns = (np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
-    return Paths(np.concatenate([[0], np.cumsum(counts)]), *columns)
+    return Paths(
+        starts(counts), *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
+    )

@@ -25,28 +25,14 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     panels = figure.subplots(1, count)
     reached = outcome.made.power > 0
     size = float(np.clip(6000 / len(places), 2, 40))
-    power = 10 * np.log10(outcome.made.power[reached])
-    _map(panels[0], places[reached], power, "received power [dB]", size, robust=True)
-    _map(
-        panels[1],
-        places[reached],
-        outcome.made.delay_spread[reached] * 1e9,
-        "delay spread [ns]",
-        size,
-        robust=True,
-    )
+    power, delay_ns = 10 * np.log10(outcome.made.power[reached]), outcome.made.delay_spread[reached] * 1e9
+    _map(panels[0], places[reached], power, "received power [dB]", size)
+    _map(panels[1], places[reached], delay_ns, "delay spread [ns]", size)
     if changed is not None:
         known = reached[changed.rows]
-        errors = changed.errors[known]
+        errors, rows = changed.errors[known], changed.rows[known]
         label = "error by what was dropped" if np.ptp(errors) > 0 else "nothing dropped, no error"
-        _map(
-            panels[2],
-            places[changed.rows][known],
-            errors,
-            f"{label}: held-back receivers",
-            40.0,
-            robust=False,
-        )
+        _map(panels[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
     for panel in panels:
         if (~reached).any():
             x, y = places[~reached, 0], places[~reached, 1]
@@ -56,14 +42,15 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         panel.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", fontsize="small")
-    figure.suptitle(
-        f"{outcome.made.data.site.name}: {len(places)} receivers, {outcome.effects}", fontsize="medium"
-    )
+    title = f"{outcome.made.data.site.name}: {len(places)} receivers, {outcome.effects}"
+    figure.suptitle(title, fontsize="medium")
     figure.savefig(path, dpi=110)
 
 
-def _map(axes: Axes, places: np.ndarray, values: np.ndarray, label: str, size: float, robust: bool) -> None:
-    low, high = np.quantile(values, [0.01, 0.99]) if robust else (values.min(), values.max())
+def _map(
+    axes: Axes, places: np.ndarray, values: np.ndarray, label: str, size: float, clipped: float = 0.01
+) -> None:
+    low, high = np.quantile(values, [clipped, 1 - clipped])
     drawn = axes.scatter(places[:, 0], places[:, 1], c=values, s=size, vmin=low, vmax=high, linewidths=0)
     assert axes.figure is not None
     axes.figure.colorbar(drawn, ax=axes, location="bottom", label=label, shrink=0.8)

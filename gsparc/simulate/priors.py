@@ -24,23 +24,19 @@ def reasons(
     wavelength, paths = probe.wavelength, probe.paths
     distance = float(np.median(np.linalg.norm(receivers - transmitter, axis=1)))
     sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
-    fresnel = np.sqrt(wavelength * distance) / 2
+    zone = f"first Fresnel zone {np.sqrt(wavelength * distance) / 2:.2g} m wide at {distance:.3g} m"
     rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]
     found = {
         "line_of_sight": f"{sight.mean():.0%} of the receivers see the transmitter",
-        "diffraction": (
-            f"first Fresnel zone {fresnel:.2g} m wide at {distance:.3g} m; {1 - sight.mean():.0%} shadowed"
-        ),
+        "diffraction": f"{zone}; {1 - sight.mean():.0%} shadowed",
         "diffuse": f"smooth below {wavelength / 8 * 1e3:.2g} mm of relief (Rayleigh)"
         + (f"; S^2 is {min(rough):.1%} to {max(rough):.1%} of a reflection" if rough else ""),
     }
     losses = {name: _normal_incidence(m, wavelength) for name, m in materials.items() if _slab(m)}
     if losses:
-        through = {name: loss for name, (_, loss) in losses.items()}
-        clearest, densest = min(through, key=lambda n: through[n]), max(through, key=lambda n: through[n])
-        found["refraction"] = (
-            f"a sheet costs {through[clearest]:.1f} dB ({clearest}) to {through[densest]:.1f} dB ({densest})"
-        )
+        through = {f"{loss:.1f} dB ({name})": loss for name, (_, loss) in losses.items()}
+        clearest, densest = min(through, key=through.__getitem__), max(through, key=through.__getitem__)
+        found["refraction"] = f"a sheet costs {clearest} to {densest}"
         mirror = -10 * np.log10(np.median([10 ** (-loss / 10) for loss, _ in losses.values()]))
         found["depth"] = f"a reflection costs about {mirror:.0f} dB"
     return found

@@ -54,26 +54,13 @@ def hand_moved(count: int, seed: int) -> np.ndarray:
     return np.concatenate(pieces)[:count].round(3)  # the release has millimetres
 
 
-def simulate_rfid(positions: np.ndarray, seed: int = 0, max_order: int = MAX_ORDER) -> np.ndarray:
-    """Array vectors (S, 16) complex of tags at `positions` (S, 3) [m], world."""
-    rotation = Rotation.from_quat(ORIENTATION).as_matrix()
-    traced = trace(
-        ROOM,
-        positions,
-        GATEWAY,
-        LIGHT / WAVELENGTH,
-        max_order=max_order,
-        array=planar_array() @ rotation.T,
-        snr_db=SNR_DB,
-        seed=seed,
-    )
-    return traced.csi[:, :, 0]
-
-
 def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     """Write `count` spectra in the release's layout; the folder must not exist."""
     positions = hand_moved(count, seed)
-    vectors = simulate_rfid(positions, seed)
+    array, frequency = planar_array() @ Rotation.from_quat(ORIENTATION).as_matrix().T, LIGHT / WAVELENGTH
+    vectors = trace(
+        ROOM, positions, GATEWAY, frequency, max_order=MAX_ORDER, array=array, snr_db=SNR_DB, seed=seed
+    ).csi[:, :, 0]
     with whole_folder(folder) as partial:
         (partial / "spectrum").mkdir()
         grid = SphereGrid.hemisphere(HEIGHT, WIDTH)
@@ -82,20 +69,16 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
             image = np.abs(vector.astype(np.complex64) @ matrix.conj()).reshape(HEIGHT, WIDTH)
             grey = np.round(255 * image / image.max()).astype(np.uint8)
             Image.fromarray(grey).save(partial / "spectrum" / f"{i + 1:05d}.png", compress_level=1)
-        lines = ["x,y,z", *(",".join(f"{v:.4f}" for v in p) for p in positions)]
-        (partial / "tx_pos.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-        (partial / "gateway_info.yml").write_text(
-            f"dataset_name: {STAND_IN}\n"
-            "gateway1:\n"
-            f"  position: {GATEWAY.tolist()}\n"
-            f"  orientation: {ORIENTATION.tolist()}  # quaternion, scalar last\n",
-            encoding="utf-8",
+        np.savetxt(partial / "tx_pos.csv", positions, fmt="%.4f", delimiter=",", header="x,y,z", comments="")
+        gateway = (
+            f"dataset_name: {STAND_IN}\ngateway1:\n  position: {GATEWAY.tolist()}\n"
+            f"  orientation: {ORIENTATION.tolist()}  # quaternion, scalar last\n"
         )
+        (partial / "gateway_info.yml").write_text(gateway, encoding="utf-8")
         order = np.random.default_rng(seed).permutation(count)
         test = max(round(0.2 * count), 1)
         for name, rows in (("test", order[:test]), ("train", order[test:])):
-            text = "".join(f"{i + 1:05d}\n" for i in np.sort(rows))
-            (partial / f"{name}_index.txt").write_text(text, encoding="utf-8")
+            np.savetxt(partial / f"{name}_index.txt", np.sort(rows) + 1, fmt="%05d")
 
 
 def ensure_rfid_sim(parent: Path, count: int = 640, seed: int = 0) -> Path:

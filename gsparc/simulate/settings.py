@@ -28,8 +28,9 @@ class CsiSettings:
 
     def elements(self, wavelength: float) -> np.ndarray:
         """Positions (M, 3) [m]."""
-        lattice = SpectrumSettings(rows=self.rows, columns=self.columns, spacing=self.spacing)
-        return lattice.elements(wavelength)
+        return SpectrumSettings(rows=self.rows, columns=self.columns, spacing=self.spacing).elements(
+            wavelength
+        )
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from itertools import product
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
 
@@ -42,8 +43,8 @@ class Room:
             raise ValueError(f"room.occluders: expected (n, 2, 3), got {np.shape(self.occluders)}")
 
     @staticmethod
-    def uniform(size: tuple[float, float, float], reflection: complex = -0.7, **kwargs) -> Room:
-        """A room from the origin to `size` [m] whose walls are alike."""
+    def uniform(size: ArrayLike, reflection: complex | np.ndarray = -0.7, **kwargs) -> Room:
+        """A room from the origin to `size` (3,) [m]; `reflection` of all six walls, or (6,)."""
         return Room(np.zeros(3), np.array(size, dtype=float), np.full(6, reflection), **kwargs)
 
     def contains(self, points: np.ndarray) -> np.ndarray:

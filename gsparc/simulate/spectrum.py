@@ -14,9 +14,10 @@ import numpy as np
 import torch
 
 from gsparc.ops import SphereGrid
-from gsparc.simulate.paths import Paths
+from gsparc.simulate.paths import ARRAYS, Paths
 
 BLOCK = 64  # receivers at once
+CHOICES = {"kind": ("bartlett", "beam"), "scale": ("amplitude", "power"), "normalisation": ("max", "none")}
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,7 @@ class SpectrumSettings:
     width: int = 360
 
     def __post_init__(self) -> None:
-        for name, allowed in (
-            ("kind", ("bartlett", "beam")),
-            ("scale", ("amplitude", "power")),
-            ("normalisation", ("max", "none")),
-        ):
+        for name, allowed in CHOICES.items():
             if getattr(self, name) not in allowed:
                 raise ValueError(
                     f"spectrum.{name}={getattr(self, name)}: expected one of {', '.join(allowed)}"
@@ -66,9 +63,7 @@ class SpectrumSettings:
     def elements(self, wavelength: float) -> np.ndarray:
         """Positions (M, 3) [m] of the array's elements about its middle."""
         x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing * wavelength for n in (self.rows, self.columns))
-        return np.stack(
-            [*(v.ravel() for v in np.meshgrid(x, y, indexing="ij")), np.zeros(len(x) * len(y))], 1
-        )
+        return np.stack(np.meshgrid(x, y, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def near_field(self, wavelength: float) -> float:
         """Fraunhofer distance of the array, 2 D^2 / wavelength [m]; nearer, waves over it are not plane."""
@@ -97,17 +92,15 @@ def spectra(
     """
     above = paths.select(paths.direction[:, 2] >= 0)
     images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)
-    if settings.kind == "bartlett":
-        elements = settings.elements(wavelength)
-        render = _Bartlett(settings)
+    elements = settings.elements(wavelength)
+    bartlett = _Bartlett(settings) if settings.kind == "bartlett" else None
     for start in range(0, len(paths), BLOCK):
-        rows = slice(start, min(start + BLOCK, len(paths)))
-        some = _rows(above, rows)
-        if settings.kind == "bartlett":
-            channels = some.responses(frequency_hz, elements, wavelength)
-            images[rows] = render(channels.reshape(len(some), -1, len(elements), len(frequency_hz)))
-        else:
+        rows, some = slice(start, start + BLOCK), _rows(above, start, start + BLOCK)
+        if bartlett is None:
             images[rows] = _beams(some, settings)
+        else:
+            channels = some.responses(frequency_hz, elements, wavelength)
+            images[rows] = bartlett(channels.reshape(len(some), -1, len(elements), len(frequency_hz)))
     if settings.scale == "amplitude":
         np.sqrt(images, out=images)
     peak = images.max(axis=(1, 2)) if settings.normalisation == "max" else np.full(len(images), images.max())
@@ -116,13 +109,10 @@ def spectra(
     return images, peak
 
 
-def _rows(paths: Paths, rows: slice) -> Paths:
-    first, last = paths.offsets[rows.start], paths.offsets[rows.stop]
-    some = slice(first, last)
-    return Paths(
-        paths.offsets[rows.start : rows.stop + 1] - first,
-        paths.gain[some], paths.delay[some], paths.direction[some], paths.mechanisms[some], paths.order[some],
-    )  # fmt: skip
+def _rows(paths: Paths, start: int, stop: int) -> Paths:
+    offsets = paths.offsets[start : stop + 1]
+    arrays = (getattr(paths, name)[offsets[0] : offsets[-1]] for name in ARRAYS)
+    return Paths(offsets - offsets[0], *arrays)
 
 
 class _Bartlett:

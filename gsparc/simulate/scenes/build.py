@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from gsparc.simulate.effects import known_keys
 from gsparc.simulate.engine import Engine
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
@@ -85,11 +86,7 @@ def from_config(config: Mapping[str, Any]) -> SceneSettings:
     Raises:
         ValueError: a setting that does not exist or cannot be.
     """
-    known = {f.name for f in fields(SceneSettings)}
-    unknown = [key for key in config if key not in known]
-    if unknown:
-        raise ValueError(f"scene.{unknown[0]}: no such setting; there are {', '.join(sorted(known))}")
-    return SceneSettings(**config)
+    return SceneSettings(**known_keys(config, SceneSettings, "scene", "setting"))
 
 
 def build(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, np.ndarray]:
@@ -107,7 +104,9 @@ def build(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, np.ndarray]
 def _engine(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, Callable[[np.ndarray], np.ndarray]]:
     transmitter = np.array(scene.transmitter_m, dtype=np.float64)
     if scene.room is not None:
-        room = _room(scene.room)
+        boxes = np.array(scene.room.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
+        reflection = np.array(scene.room.get("reflection", -0.7), dtype=np.complex128)
+        room = Room.uniform(scene.room["size_m"], reflection, occluders=boxes)
         return ShoeboxEngine(room, transmitter, scene.carrier_hz), room.contains
     if scene.builder is not None:
         if scene.builder not in BUILDERS:
@@ -122,10 +121,3 @@ def _engine(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, Callable[
         return free & tracer.under_open_sky(points) if scene.open_sky else free
 
     return tracer, allowed
-
-
-def _room(config: Mapping[str, Any]) -> Room:
-    size = np.array(config["size_m"], dtype=np.float64)
-    reflection = np.broadcast_to(np.array(config.get("reflection", -0.7), dtype=np.complex128), (6,))
-    boxes = np.array(config.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
-    return Room(np.zeros(3), size, reflection, boxes)

@@ -29,10 +29,9 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
     """Floor, ceiling, and walls whose panels stand out by up to a decimetre; closed behind the panels."""
     x, y, z = SIZE
     solids = [
-        sheet("floor", "concrete", np.zeros(3), np.array([x, 0, 0]), np.array([0, y, 0])),
-        sheet("ceiling", "ceiling_board", np.array([0, 0, z]), np.array([0, y, 0]), np.array([x, 0, 0])),
+        sheet("floor", "concrete", (0, 0, 0), (x, 0, 0), (0, y, 0)),
+        sheet("ceiling", "ceiling_board", (0, 0, z), (0, y, 0), (x, 0, 0)),
     ]
-    up = np.array([0, 0, z])
     corners = np.array([[0, 0, 0], [x, 0, 0], [x, y, 0], [0, y, 0]], dtype=float)
     for w, materials in enumerate(WALLS):
         start, end = corners[w], corners[(w + 1) % 4]
@@ -44,64 +43,54 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
         for i, material in enumerate(materials):
             base = start + cuts[i] * along + depths[i] * inwards
             name = f"wall{w}_{i}"
-            solids.append(sheet(name, material, base, (cuts[i + 1] - cuts[i]) * along, up))
-            step = (depths[i] - depths[i - 1]) * inwards if i else None
-            if step is not None and np.linalg.norm(step) > 0:
+            solids.append(sheet(name, material, base, (cuts[i + 1] - cuts[i]) * along, (0, 0, z)))
+            if i and depths[i] != depths[i - 1]:
                 edge = start + cuts[i] * along + depths[i - 1] * inwards
-                solids.append(sheet(f"{name}_step", material, edge, step, up))
+                step = (depths[i] - depths[i - 1]) * inwards
+                solids.append(sheet(f"{name}_step", material, edge, step, (0, 0, z)))
     return solids
 
 
 def _partitions() -> list[Solid]:
     """Two glass partitions that cut a corner office off, and a free-standing one; sheets, open at a door."""
     return [
-        sheet(
-            "glass_office_a", "glass", np.array([9.6, 6.4, 0]), np.array([4.3, 0, 0]), np.array([0, 0, 2.8])
-        ),
-        sheet(
-            "glass_office_b", "glass", np.array([9.6, 7.5, 0]), np.array([0, 2.4, 0]), np.array([0, 0, 2.8])
-        ),
-        sheet("glass_free", "glass", np.array([3.2, 2.0, 0]), np.array([2.6, 0.5, 0]), np.array([0, 0, 2.2])),
+        sheet("glass_office_a", "glass", (9.6, 6.4, 0), (4.3, 0, 0), (0, 0, 2.8)),
+        sheet("glass_office_b", "glass", (9.6, 7.5, 0), (0, 2.4, 0), (0, 0, 2.8)),
+        sheet("glass_free", "glass", (3.2, 2.0, 0), (2.6, 0.5, 0), (0, 0, 2.2)),
     ]
 
 
 def _pillars() -> list[Solid]:
     return [
-        box("pillar_a", "concrete", np.array([4.7, 6.6, 0]), np.array([5.2, 7.1, 4.0])),
-        box("pillar_b", "concrete", np.array([9.1, 3.0, 0]), np.array([9.6, 3.5, 4.0])),
+        box("pillar_a", "concrete", (4.7, 6.6, 0), (5.2, 7.1, 4.0)),
+        box("pillar_b", "concrete", (9.1, 3.0, 0), (9.6, 3.5, 4.0)),
     ]
 
 
 def _tables(rng: np.random.Generator) -> list[Solid]:
     """A long table of the meeting with chairs around, and two desks."""
     solids = []
-    tables = [
-        ("table_long", 6.9, 5.0, 4.8, 1.4),
-        ("desk_a", 2.2, 8.4, 1.8, 0.9),
-        ("desk_b", 12.0, 8.3, 1.8, 0.9),
-    ]
-    for name, x, y, length, width in tables:
-        half = np.array([length / 2, width / 2])
-        low, high = np.array([x, y]) - half, np.array([x, y]) + half
-        solids.append(box(name, "wood", np.array([*low, 0.70]), np.array([*high, 0.74])))
-        for i, sign in enumerate((-1, 1)):
-            foot = np.array([x + sign * (half[0] - 0.35), y])
-            size = np.array([0.06, half[1] - 0.15])
-            solids.append(
-                box(
-                    f"{name}_leg{i}", "metal", np.array([*(foot - size), 0]), np.array([*(foot + size), 0.69])
-                )
-            )
+    tables = {
+        "table_long": (6.9, 5.0, 4.8, 1.4),
+        "desk_a": (2.2, 8.4, 1.8, 0.9),
+        "desk_b": (12.0, 8.3, 1.8, 0.9),
+    }
+    for name, (x, y, length, width) in tables.items():
+        a, b = length / 2, width / 2
+        solids.append(box(name, "wood", (x - a, y - b, 0.70), (x + a, y + b, 0.74)))
+        for i, foot in enumerate((x - (a - 0.35), x + (a - 0.35))):
+            low, high = (foot - 0.06, y - (b - 0.15), 0.0), (foot + 0.06, y + (b - 0.15), 0.69)
+            solids.append(box(f"{name}_leg{i}", "metal", low, high))
     places = [(4.9 + 0.8 * i, 5.0 + side * 1.15, side) for i in range(6) for side in (-1, 1)]
     places += [(2.2, 7.5, -1), (12.0, 7.4, -1)]
     for i, (x, y, side) in enumerate(places):
         x, y = x + rng.uniform(-0.1, 0.1), y + rng.uniform(-0.12, 0.12)
         turn = float(rng.uniform(-0.4, 0.4))
-        solids.append(box(f"chair{i}_seat", "plywood", np.array([x - 0.22, y - 0.22, 0.42]),
-                          np.array([x + 0.22, y + 0.22, 0.46]), turn))  # fmt: skip
+        low, high = (x - 0.22, y - 0.22, 0.42), (x + 0.22, y + 0.22, 0.46)
+        solids.append(box(f"chair{i}_seat", "plywood", low, high, turn))
         back = y + side * 0.24
-        solids.append(box(f"chair{i}_back", "plywood", np.array([x - 0.21, back - 0.02, 0.47]),
-                          np.array([x + 0.21, back + 0.02, 0.95]), turn))  # fmt: skip
+        low, high = (x - 0.21, back - 0.02, 0.47), (x + 0.21, back + 0.02, 0.95)
+        solids.append(box(f"chair{i}_back", "plywood", low, high, turn))
     return solids
 
 
@@ -109,8 +98,8 @@ def _furniture(rng: np.random.Generator) -> list[Solid]:
     """A bookcase, two cabinets, a screen."""
     shift = rng.uniform(-0.2, 0.2)
     return [
-        box("bookcase", "wood", np.array([0.15, 2.0 + shift, 0]), np.array([0.55, 4.4 + shift, 2.1])),
-        box("cabinet_a", "metal", np.array([11.0, 0.15, 0]), np.array([12.6, 0.65, 1.3])),
-        box("cabinet_b", "chipboard", np.array([6.0 + shift, 9.3, 0]), np.array([8.2 + shift, 9.85, 1.6])),
-        box("screen", "metal", np.array([0.14, 5.6, 1.1]), np.array([0.2, 7.6, 2.3])),
+        box("bookcase", "wood", (0.15, 2.0 + shift, 0), (0.55, 4.4 + shift, 2.1)),
+        box("cabinet_a", "metal", (11.0, 0.15, 0), (12.6, 0.65, 1.3)),
+        box("cabinet_b", "chipboard", (6.0 + shift, 9.3, 0), (8.2 + shift, 9.85, 1.6)),
+        box("screen", "metal", (0.14, 5.6, 1.1), (0.2, 7.6, 2.3)),
     ]

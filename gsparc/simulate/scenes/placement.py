@@ -31,8 +31,7 @@ def place(
     Raises:
         ValueError: almost nowhere is allowed.
     """
-    low = np.array([*np.asarray(area, dtype=float)[0], min(height)])
-    high = np.array([*np.asarray(area, dtype=float)[1], max(height)])
+    low, high = (np.array([*area[i], end(height)], dtype=float) for i, end in enumerate((min, max)))
     if not (np.isfinite([low, high]).all() and (high >= low).all() and (high > low)[:2].all()):
         raise ValueError(f"scene.area_m, scene.height_m: expected lower below upper, got {low} and {high}")
     rng = np.random.default_rng(seed)

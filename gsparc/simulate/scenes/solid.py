@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -26,24 +27,23 @@ class Solid:
     keep_out: np.ndarray | None = None
 
 
-def sheet(name: str, material: str, corner: np.ndarray, first: np.ndarray, second: np.ndarray) -> Solid:
+def sheet(name: str, material: str, corner: ArrayLike, first: ArrayLike, second: ArrayLike) -> Solid:
     """A parallelogram from `corner` along two sides (3,) [m]."""
-    corner, first, second = (np.asarray(v, dtype=np.float64) for v in (corner, first, second))
-    vertices = np.stack([corner, corner + first, corner + first + second, corner + second])
+    start, a, b = (np.asarray(v, dtype=np.float64) for v in (corner, first, second))
+    vertices = np.stack([start, start + a, start + a + b, start + b])
     return Solid(name, material, vertices, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def box(name: str, material: str, lower: np.ndarray, upper: np.ndarray, turn: float = 0.0) -> Solid:
+def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: float = 0.0) -> Solid:
     """A box between corners (3,) [m], turned about its upright axis by `turn` [rad]; faces look outwards."""
-    lower, upper = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     unit = np.array([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)], dtype=np.float64)
-    middle = (lower + upper) / 2
-    offset = (unit - 0.5) * (upper - lower)
+    offset = (unit - 0.5) * (high - low)
     cosine, sine = np.cos(turn), np.sin(turn)
     offset[:, :2] = offset[:, :2] @ np.array([[cosine, sine], [-sine, cosine]])
     faces = np.array([
         [0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],
         [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5],
     ])  # fmt: skip
-    vertices = middle + offset
+    vertices = (low + high) / 2 + offset
     return Solid(name, material, vertices, faces, np.stack([vertices.min(0), vertices.max(0)]))
