@@ -21,14 +21,15 @@ def bad_positions(position: np.ndarray) -> np.ndarray:
     return np.flatnonzero(~good)
 
 
-def check_positions(problems: Problems, where: str, position: np.ndarray, row_names: list[str]) -> None:
-    """Note rows whose position (S, 3) [m] is not finite or not on Earth."""
+def check_positions(problems: Problems, where: str, position: np.ndarray, row_names: list[str]) -> bool:
+    """Note rows whose position (S, 3) [m] is not finite or not on Earth; returns whether there are any."""
     bad = bad_positions(position)
     problems.add_rows(
         where,
         (f"{row_names[i]} = {np.array2string(position[i], separator=', ')}" for i in bad),
         f"expected three finite coordinates in metres, none beyond {FARTHEST:.0e}",
     )
+    return len(bad) > 0
 
 
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 
 class DataError(ValueError):
@@ -30,11 +31,14 @@ class Problems(list[str]):
         super().__init__()
         self.source = source
 
-    def add(self, where: str | Path, what: str) -> None:
-        """Note that at `where` (file, array, row) something is wrong: `what`, and what was expected."""
+    def add(self, where: str | Path, what: str) -> Any:
+        """Note that at `where` (file, array, row) something is wrong: `what`, and what was expected.
+
+        Returns None, so that a reader that has nothing to return can end with it; so does `add_rows`.
+        """
         self.append(f"{where}: {what}")
 
-    def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> None:
+    def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> Any:
         """Note `what` for each of `rows` (as a user names them), at most `LIMIT` of them."""
         names = list(rows)
         for name in names[: self.LIMIT]:

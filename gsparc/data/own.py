@@ -24,6 +24,11 @@ from gsparc.data.schema import LIGHT, Kind, Measurements
 log = logging.getLogger(__name__)
 
 SSIM_WINDOW = 11  # pixels along each side; as in losses and metrics, which data do not import
+DTYPES: dict[str, tuple[str, str, tuple[tuple[None, ...], ...]]] = {  # in words, kinds of NumPy, shapes
+    "spectrum": ("uint8 or floating point", "uf", ((None, None, None),)),
+    "csi": ("complex", "c", ((None,), (None, None), (None, None, None))),
+    "rssi": ("real", "iuf", ((None,),)),
+}
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
@@ -105,23 +110,22 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     values, kind = _measured(check, measured)
     if values is None:
         for name in ("rx_position", "tx_position"):
-            check.position(name, None, [])
+            check.position(name, None)
         check.problems.raise_if_any()
     assert values is not None
     rows = len(values)
-    row_names = _row_names(check, rows)
-    ends = {end: check.position(f"{end}_position", rows, row_names) for end in ("rx", "tx")}
-    rotation = check.rotation(rows, row_names)
-    given_mask = check.mask(raw.arrays[measured].shape, row_names)
+    row_names = check.name_rows(rows)
+    ends = {end: check.position(f"{end}_position", rows) for end in ("rx", "tx")}
+    rotation = check.rotation(rows)
+    given_mask = check.mask(raw.arrays[measured].shape)
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
     grid = check.grid(*values.shape[1:]) if kind == "spectrum" else None
     array = _array(check, values.shape[1] if kind == "csi" else None)
-    noise = _noise(check, measured, rows, row_names)
+    noise = _noise(check, measured, rows)
     offsets = check.ragged(rows)
     release_split = check.release_split(rows)
-    check.finite(measured, values, mask, row_names)
-    _in_range(check, measured, values, mask, row_names)
+    _in_range(check, measured, values, mask)
     static_end = _static_end(check, ends["rx"], ends["tx"], rotation)
     check.problems.raise_if_any()
     assert static_end is not None and rotation is not None
@@ -136,7 +140,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, values, mask)
     if not (np.isfinite(scale) and scale > 0):
-        check.problems.add(check.where(measured), "every measured value is zero; expected some signal")
+        check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
     data = assemble(
         kind=kind,
@@ -165,16 +169,10 @@ def _attributes(check: Checker, stem: str) -> dict[str, Any]:
     given = check.raw.attributes
     normalisation = str(given.get("normalisation", "none"))
     if normalisation not in NORMALISATIONS:
-        check.problems.add(
-            check.where("normalisation"), f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}"
-        )
-    error = given.get("convergence_error")
+        check.refuse("normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}")
+    error, stand_in = given.get("convergence_error"), given.get("stand_in")
     if error is not None and not (isinstance(error, int | float) and np.isfinite(error) and error >= 0):
-        check.problems.add(
-            check.where("convergence_error"), f"{error!r}; expected a finite number, at least 0"
-        )
-        error = None
-    stand_in = given.get("stand_in")
+        error = check.refuse("convergence_error", f"{error!r}; expected a finite number, at least 0")
     return {
         "name": str(given.get("name") or stem),
         "normalisation": normalisation,
@@ -188,86 +186,56 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
     array = check.raw.arrays[name]
     kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    if kind == "csi":
-        if array.dtype.kind != "c":
-            check.problems.add(check.where(name), f"expected complex numbers, found dtype {array.dtype}")
-            return None, kind
-        if not check.fits(name, array, (None,), (None, None), (None, None, None)):
-            return None, kind
-        array = (
-            array.reshape(*array.shape[:1], -1, array.shape[-1] if array.ndim > 1 else 1)
-            if array.size
-            else array
-        )
-    else:
-        if array.dtype.kind not in "iuf" or (
-            kind == "spectrum" and array.dtype.kind in "iu" and array.dtype != np.uint8
-        ):
-            wanted = "uint8 or floating point" if kind == "spectrum" else "real"
-            check.problems.add(check.where(name), f"expected {wanted} numbers, found dtype {array.dtype}")
-            return None, kind
-        if not check.fits(name, array, (None, None, None) if kind == "spectrum" else (None,)):
-            return None, kind
-        if array.dtype != np.uint8 or kind == "rssi":
-            array = array.astype(np.float64)
-        array = array if kind == "spectrum" else array[:, None]
-    if len(array) < 2 or array.size == 0:
-        check.problems.add(
-            check.where(name), f"shape {array.shape} holds too little; expected two rows or more"
-        )
+    wanted, dtypes, shapes = DTYPES[kind]
+    if array.dtype.kind not in dtypes or (
+        kind == "spectrum" and array.dtype.kind == "u" and array.itemsize > 1
+    ):
+        return check.refuse(name, f"expected {wanted} numbers, found dtype {array.dtype}"), kind
+    if not check.fits(name, array, *shapes):
         return None, kind
+    if kind == "csi" and array.size:
+        array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
+    if kind == "rssi" or array.dtype.kind == "f":
+        array = array.astype(np.float64)
+    if kind == "rssi":
+        array = array[:, None]
+    if len(array) < 2 or array.size == 0:
+        fault = f"shape {array.shape} holds too little; expected two rows or more"
+        return check.refuse(name, fault), kind
     return array, kind
-
-
-def _row_names(check: Checker, rows: int) -> list[str]:
-    names = check.raw.arrays.get("row_name")
-    if names is None:
-        return [f"row {i}" for i in range(rows)]
-    if not check.fits("row_name", names, (rows,)):
-        return [f"row {i}" for i in range(rows)]
-    return [str(name) for name in names]
 
 
 def _array(check: Checker, antennas: int | None) -> np.ndarray | None:
     array = check.real("array_position", (antennas if antennas and antennas > 1 else None, 3))
     if array is not None and len(bad_positions(array)):
-        check.problems.add(
-            check.where("array_position"), "not finite, or not on Earth; expected coordinates in metres"
-        )
-        return None
+        fault = "not finite, or not on Earth; expected coordinates in metres"
+        return check.refuse("array_position", fault)
     return array
 
 
-def _noise(check: Checker, measured: str, rows: int, row_names: list[str]) -> np.ndarray | None:
+def _noise(check: Checker, measured: str, rows: int) -> np.ndarray | None:
     noise = check.real("noise_variance", (), (rows,))
     if noise is None:
         return None
     if measured == "rssi_db":
-        check.problems.add(check.where("noise_variance"), "cannot go with rssi_db; expected rssi (linear)")
-        return None
+        return check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
     noise = np.broadcast_to(noise, (rows,))
-    bad = np.flatnonzero(~(np.isfinite(noise) & (noise >= 0)))
-    check.problems.add_rows(
-        check.where("noise_variance"), (row_names[i] for i in bad), "expected a finite number, at least 0"
-    )
+    bad = ~(np.isfinite(noise) & (noise >= 0))
+    check.refuse_rows("noise_variance", bad, "expected a finite number, at least 0")
     return noise
 
 
-def _in_range(
-    check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None, row_names: list[str]
-) -> None:
-    """Powers are not negative; decibels are decibels."""
+def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
+    """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
+    measured = True if mask is None else mask
+    unmarked = "not finite; expected numbers (mark what was not measured in mask)"
+    check.refuse_rows(name, ~np.isfinite(values) & measured, unmarked)
     if name == "csi":
         return
     with np.errstate(invalid="ignore"):
         bad = np.abs(values) > 400 if name == "rssi_db" else values < 0
-    if mask is not None:
-        bad &= mask
-    rows = np.flatnonzero(bad.reshape(len(values), -1).any(axis=1))
     wanted = "dB between -400 and 400" if name == "rssi_db" else "linear power, at least 0 (is it in dB?)"
-    check.problems.add_rows(
-        check.where(name), (row_names[i] for i in rows), f"out of range; expected {wanted}"
-    )
+    check.refuse_rows(name, bad & measured, f"out of range; expected {wanted}")
 
 
 def _static_end(
@@ -276,20 +244,16 @@ def _static_end(
     """The static end; exactly one must be static."""
     if rx is None or tx is None or rotation is None:
         return None
-    still = {
-        name: bool((np.atleast_2d(p) == np.atleast_2d(p)[0]).all()) for name, p in (("rx", rx), ("tx", tx))
-    }
-    turns = not bool((rotation == rotation[0]).all())
-    if still["rx"] and still["tx"]:
+    rx_still, tx_still = (bool((p == np.atleast_2d(p)[0]).all()) for p in (rx, tx))
+    if rx_still and tx_still:
         fault = "neither end moves; expected (S, 3) positions for one of them"
-    elif not still["rx"] and not still["tx"]:
+    elif not rx_still and not tx_still:
         fault = "both ends move; expected one of rx_position and tx_position to be the same in all rows"
-    elif still["rx"] and turns:
+    elif rx_still and (rotation != rotation[0]).any():
         fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
     else:
-        return "rx" if still["rx"] else "tx"
-    check.problems.add(check.source, fault)
-    return None
+        return "rx" if rx_still else "tx"
+    return check.problems.add(check.source, fault)
 
 
 def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) -> None:
@@ -309,9 +273,10 @@ def _directions(
     check: Checker, offsets: np.ndarray | None, rx: np.ndarray, rotation: np.ndarray
 ) -> list[np.ndarray] | None:
     """Unit vectors (paths, 3) of each sample in the receiver's frame."""
-    name = next((n for n in ("path_direction", "path_last_point") if n in check.raw.arrays), None)
-    if offsets is None or name is None:
+    given = check.given("path_direction", "path_last_point")
+    if offsets is None or not given:
         return None
+    name = given[0]
     vectors = check.real(name, (int(offsets[-1]), 3))
     if vectors is None:
         return None
@@ -321,11 +286,9 @@ def _directions(
     with np.errstate(over="ignore"):
         length = np.linalg.norm(vectors, axis=-1)
     bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
-    check.problems.add_rows(
-        check.where(name), (f"path {i}" for i in bad), "expected a direction that is not zero"
-    )
     if len(bad):
-        return None
+        paths, expected = (f"path {i}" for i in bad), "expected a direction that is not zero"
+        return check.problems.add_rows(check.where(name), paths, expected)
     return np.split((vectors / length[:, None]).astype(np.float32), offsets[1:-1])
 
 

@@ -8,6 +8,16 @@ from scipy.spatial.transform import Rotation
 UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this they are refused
 
 
+def is_unit(quaternion: np.ndarray) -> np.ndarray:
+    """Whether quaternions (..., 4) are finite and of length 1 within `UNIT_TOLERANCE`: (...) bool."""
+    return np.abs(_length(quaternion) - 1) <= UNIT_TOLERANCE
+
+
+def _length(quaternion: np.ndarray) -> np.ndarray:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.linalg.norm(quaternion, axis=-1)
+
+
 def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:
     """Rotation matrices (..., 3, 3), local to world, of quaternions (..., 4).
 
@@ -15,11 +25,9 @@ def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.nd
         ValueError: a quaternion is not finite or its length differs from 1 by more than 1 %.
     """
     q = np.asarray(quaternion, dtype=np.float64)
-    with np.errstate(over="ignore", invalid="ignore"):
-        length = np.linalg.norm(q, axis=-1)
-    if not np.isfinite(length).all() or (np.abs(length - 1) > UNIT_TOLERANCE).any():
+    if not is_unit(q).all():
         order = "w, x, y, z" if scalar_first else "x, y, z, w"
-        raise ValueError(f"expected a quaternion ({order}) of length 1, got length {length!s}")
+        raise ValueError(f"expected a quaternion ({order}) of length 1, got length {_length(q)!s}")
     if scalar_first:
         q = np.roll(q, -1, axis=-1)
     return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)

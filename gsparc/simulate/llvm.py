@@ -23,7 +23,7 @@ from rich.console import Console
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 FETCHED = Path(sys.prefix) / "lib" / "llvm19" / "libLLVM.so.19.1"
 SYSTEM = ("llvm-19/lib", "*-linux-gnu", "llvm-20/lib", "llvm-18/lib")  # below /usr/lib, best first
-REMEDY = f"get one with `gsparc llvm` (Debian's libllvm19, no root needed) or name a library of LLVM 19 in {VARIABLE}"
+REMEDY = f"get one with `gsparc llvm` (Debian's, no root needed) or name a library of LLVM 19 in {VARIABLE}"
 TINY_SOLVE = """
 import sionna.rt as rt
 scene = rt.load_scene(rt.scene.floor_wall)
