@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from gsparc.data.assemble import assemble, rounded_rms
 from gsparc.data.errors import DataError
+from gsparc.data.files import read_yaml
 from gsparc.data.schema import Measurements
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,8 @@ def load_argos(
         DataError: anything is missing or wrong.
     """
     root = Path(root)
-    description = _description(root)
+    expected = "`base_station:` with a list of antenna positions [m]"
+    description = read_yaml(root / "base-station.yml", "the antennas' positions", expected)
     csi = _channels(root)
     places = _antennas(root, description, csi.shape[1])
     chosen = _chosen(antenna, csi.shape[1])
@@ -79,6 +80,7 @@ def load_argos(
     where = _positions(root, positions, encode, uplink, split)
     simulated = description.get("dataset_name") == STAND_IN
     noise = description.get("noise_power")
+    facts = {name: str(description[name]) for name in FACTS if name in description}
     base, frequency = places.mean(axis=0), carrier + tones * spacing
     data = assemble(
         name=STAND_IN if simulated else "argos",
@@ -96,12 +98,7 @@ def load_argos(
         noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
         release_split=split,
         row_names=[f"snapshot {i}" for i in range(len(csi))],
-        provenance={
-            "layout": "argos",
-            "positions": positions,
-            "aligned": str(align),
-            **{name: str(description[name]) for name in FACTS if name in description},
-        },
+        provenance={"layout": "argos", "positions": positions, "aligned": str(align), **facts},
     )
     uplink_facts = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
     return replace(data, site=replace(data.site, **uplink_facts), uplink=np.ascontiguousarray(uplink))
@@ -150,19 +147,6 @@ def published_figures(
     return figures
 
 
-def _description(root: Path) -> Mapping[str, Any]:
-    path = root / "base-station.yml"
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing; expected the antennas' positions") from None
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        raise DataError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from None
-    if not isinstance(content, Mapping):
-        raise DataError(f"{path}: expected `base_station:` with a list of antenna positions [m]")
-    return content
-
-
 def _channels(root: Path) -> np.ndarray:
     path = root / "csidata-64.npy"
     path = path if path.exists() else root / "csidata.npy"
@@ -173,15 +157,14 @@ def _channels(root: Path) -> np.ndarray:
     except (ValueError, OSError) as error:
         raise DataError(f"{path}: not readable ({' '.join(str(error).split())})") from None
     if csi.ndim != 3 or csi.shape[2] != 2 * UPLINK or csi.dtype.kind != "c":
-        raise DataError(
-            f"{path}: expected complex [N, antennas, {2 * UPLINK}], found {csi.dtype} {csi.shape}"
-        )
-    bad = np.flatnonzero(~np.isfinite(csi).all((1, 2)))
-    if len(bad):
-        raise DataError(f"{path}, snapshot {bad[0]}: NaN or Inf; expected finite channels")
-    silent = np.flatnonzero(~np.abs(csi[..., :UPLINK]).any((1, 2)))
-    if len(silent):
-        raise DataError(f"{path}, snapshot {silent[0]}: its uplink is silent; expected a received packet")
+        expected = f"complex [N, antennas, {2 * UPLINK}]"
+        raise DataError(f"{path}: expected {expected}, found {csi.dtype} {csi.shape}")
+    for good, fault in (
+        (np.isfinite(csi).all((1, 2)), "NaN or Inf; expected finite channels"),
+        (np.abs(csi[..., :UPLINK]).any((1, 2)), "its uplink is silent; expected a received packet"),
+    ):
+        if not good.all():
+            raise DataError(f"{path}, snapshot {good.argmin()}: {fault}")
     return csi
 
 

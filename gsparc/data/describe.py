@@ -51,12 +51,10 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("neighbours", _neighbours(moving, site.wavelength)),
     ]
     lines += [("units?", hint) for hint in suspicious_values(data)]
+    carrier = "unknown; give frequency_hz, and effects that need the phase become available"
     if site.carrier_hz is not None:
-        lines.append(("carrier", f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"))
-    else:
-        lines.append(
-            ("carrier", "unknown; give frequency_hz, and effects that need the phase become available")
-        )
+        carrier = f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"
+    lines.append(("carrier", carrier))
     if site.subcarriers_hz is not None and len(site.subcarriers_hz) > 1:
         span = np.ptp(site.subcarriers_hz) / 1e6
         lines.append(("band", f"{len(site.subcarriers_hz)} subcarriers over {span:.6g} MHz"))
@@ -84,13 +82,9 @@ def _targets(data: Measurements) -> str:
     if data.site.kind == "spectrum":
         return f"{count} images of {shape[0]} x {shape[1]} directions"
     if data.site.kind == "csi":
-        antennas, tones = _counted(shape[0], "antenna"), _counted(shape[1], "subcarrier")
-        return f"{count} channels of {antennas} x {tones}"
+        many = ["s" * (n != 1) for n in shape]
+        return f"{count} channels of {shape[0]} antenna{many[0]} x {shape[1]} subcarrier{many[1]}"
     return f"{count} received powers"
-
-
-def _counted(count: int, thing: str) -> str:
-    return f"{count} {thing}" if count == 1 else f"{count} {thing}s"
 
 
 def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
@@ -108,9 +102,8 @@ def suspicious_values(data: Measurements) -> list[str]:
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
-            found.append(
-                f"the antennas reach over {reach:.4g} m, {reach / site.wavelength:.3g} wavelengths: in mm?"
-            )
+            waves = f"{reach / site.wavelength:.3g} wavelengths"
+            found.append(f"the antennas reach over {reach:.4g} m, {waves}: in mm?")
     if site.grid is not None:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         if abs(turn / (2 * np.pi) - 1) < 0.02:
@@ -129,19 +122,16 @@ def _units(positions: np.ndarray) -> list[str]:
     if height > 100 or width > 1e4:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
-        return [
-            f"heights differ by {height:.4g} m; if these are {unit}, the box is {size} m: convert to metres"
-        ]
+        hint = f"if these are {unit}, the box is {size} m: convert to metres"
+        return [f"heights differ by {height:.4g} m; {hint}"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []
 
 
 def _grid(grid: SphereGrid) -> str:
-    first, step = (
-        np.degrees([grid.first_elevation, grid.first_azimuth]),
-        np.degrees([grid.elevation_step, grid.azimuth_step]),
-    )
+    first = np.degrees([grid.first_elevation, grid.first_azimuth])
+    step = np.degrees([grid.elevation_step, grid.azimuth_step])
     last = first + step * [grid.height - 1, grid.width - 1]
     closed = ", closing the circle" if grid.periodic else ""
     return (

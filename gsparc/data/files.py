@@ -1,18 +1,44 @@
-"""Files and folders that appear whole or not at all, also under a kill or on a full disk."""
+"""Files and folders that appear whole or not at all, also under a kill or on a full disk; tables in YAML."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import yaml
+
+from gsparc.data.errors import DataError
 
 
 def platform_cache() -> Path:
     """Where caches live on this machine: `$XDG_CACHE_HOME/gsparc` or `~/.cache/gsparc`."""
     root = os.environ.get("XDG_CACHE_HOME")
     return (Path(root) if root else Path.home() / ".cache") / "gsparc"
+
+
+def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
+    """A table in YAML.
+
+    Args:
+        path: of the file.
+        missing, expected: what the message says is wanted where there is no file, or no table in it.
+
+    Raises:
+        DataError: missing, not readable, or no table.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: missing; expected {missing}") from None
+    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
+        raise DataError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(content, Mapping):
+        raise DataError(f"{path}: expected {expected}")
+    return content
 
 
 @contextmanager

@@ -71,8 +71,9 @@ class Checker:
     def name_rows(self, rows: int) -> list[str]:
         """What messages call each row: `row_name`, or its number."""
         names = self.raw.arrays.get("row_name")
-        own = names is not None and self.fits("row_name", names, (rows,))
-        self.row_names = [str(name) for name in names] if own else [f"row {i}" for i in range(rows)]
+        self.row_names = [f"row {i}" for i in range(rows)]
+        if names is not None and self.fits("row_name", names, (rows,)):
+            self.row_names = [str(name) for name in names]
         return self.row_names
 
     def real(self, name: str, *shapes: tuple[int | None, ...]) -> np.ndarray | None:

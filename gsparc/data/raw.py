@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import struct
 import zipfile
@@ -17,22 +16,14 @@ import h5py
 import numpy as np
 
 from gsparc.data.errors import DataError
+from gsparc.data.files import whole_file
 from gsparc.data.hdf5_probe import read_error
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
 DAMAGED = (
-    zipfile.BadZipFile,
-    zlib.error,
-    struct.error,
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    KeyError,
-    RuntimeError,  # includes NotImplementedError
-    ArithmeticError,
-    MemoryError,
+    *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, TypeError, KeyError),
+    *(RuntimeError, ArithmeticError, MemoryError),  # the first includes NotImplementedError
 )
 
 
@@ -64,13 +55,12 @@ def read_raw(path: str | Path) -> Raw:
         return _read_npz(path)
     if path.suffix.lower() in HDF5_SUFFIXES:
         return _read_hdf5(path)
-    raise DataError(
-        f"{path}: expected a name ending in .npz, .h5 or .hdf5, found {path.suffix or 'no ending'}"
-    )
+    found = path.suffix or "no ending"
+    raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5, found {found}")
 
 
 def write_raw(path: str | Path, raw: Raw) -> None:
-    """Write `raw`, atomically: to a partial file that is renamed when complete.
+    """Write `raw`, whole or not at all.
 
     Raises:
         DataError: another ending, or there is no room; what was there is kept.
@@ -78,24 +68,23 @@ def write_raw(path: str | Path, raw: Raw) -> None:
     path = Path(path)
     if path.suffix.lower() not in (".npz", *HDF5_SUFFIXES):
         raise DataError(f"{path}: expected a name ending in .npz, .h5 or .hdf5")
-    partial = path.with_name(f".{path.name}.partial")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    write = _write_npz if path.suffix.lower() == ".npz" else _write_hdf5
     try:
-        _write(partial, raw)
-        os.replace(partial, path)
+        with whole_file(path) as partial:
+            write(partial, raw)
     except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
-        partial.unlink(missing_ok=True)
         found = re.search(r"error message = '([^']+)'", str(error))
         why = found[1] if found else getattr(error, "strerror", None) or _one_line(error)
         raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
-def _write(path: Path, raw: Raw) -> None:
-    if path.name.removesuffix(".partial").lower().endswith(".npz"):
-        about = json.dumps({**raw.attributes, "units": raw.units}, ensure_ascii=False)
-        with path.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, attributes=np.array(about), **raw.arrays)
-        return
+def _write_npz(path: Path, raw: Raw) -> None:
+    about = json.dumps({**raw.attributes, "units": raw.units}, ensure_ascii=False)
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, attributes=np.array(about), **raw.arrays)
+
+
+def _write_hdf5(path: Path, raw: Raw) -> None:
     # Checksums and text of fixed length: libhdf5 crashes or hangs on damage that it cannot see.
     with h5py.File(path, "w", libver=("v110", "v110")) as file:
         for name, array in raw.arrays.items():
@@ -120,16 +109,11 @@ def _read_npz(path: Path) -> Raw:
             for name in file.files:
                 arrays[name] = file[name]
     except DAMAGED as error:
+        fault = f"damaged or not an npz file ({_one_line(error)})"
         if "allow_pickle" in str(error):
-            raise DataError(
-                f"{path}, {name}: holds Python objects; expected plain arrays of numbers"
-            ) from None
-        raise DataError(f"{path}, {name}: damaged or not an npz file ({_one_line(error)})") from None
-    return _with_attributes(path, arrays)
-
-
-def _with_attributes(path: Path, arrays: dict[str, np.ndarray]) -> Raw:
-    """An npz has no attributes; ours keeps them as JSON text in an entry of that name."""
+            fault = "holds Python objects; expected plain arrays of numbers"
+        raise DataError(f"{path}, {name}: {fault}") from None
+    # An npz has no attributes; ours keeps them as JSON text in an entry of that name.
     text = arrays.pop("attributes", None)
     if text is None:
         return Raw(arrays)
@@ -144,9 +128,7 @@ def _with_attributes(path: Path, arrays: dict[str, np.ndarray]) -> Raw:
 
 
 def _read_hdf5(path: Path) -> Raw:
-    arrays: dict[str, np.ndarray] = {}
-    units: dict[str, str] = {}
-    name = "the file"
+    arrays, units, name = {}, {}, "the file"
     reason = read_error(path)
     if reason is not None:
         raise DataError(f"{path}: damaged ({reason}); write it again, text best with a fixed length")
@@ -155,9 +137,8 @@ def _read_hdf5(path: Path) -> Raw:
             for key, item in file.items():
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
-                    arrays[name] = np.asarray(
-                        item.asstr()[()] if h5py.check_string_dtype(item.dtype) else item[()]
-                    )
+                    text = h5py.check_string_dtype(item.dtype)
+                    arrays[name] = np.asarray(item.asstr()[()] if text else item[()])
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}

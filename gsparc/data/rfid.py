@@ -11,13 +11,14 @@ from __future__ import annotations
 import csv
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import yaml
 from PIL import Image
 
 from gsparc.data.assemble import assemble, check_positions
 from gsparc.data.errors import DataError, Problems
+from gsparc.data.files import read_yaml
 from gsparc.data.rotation import quaternion_to_matrix
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
@@ -86,11 +87,13 @@ def load_rfid(
     )
 
 
-class _Gateway:
-    """One receiver of gateway_info.yml: name, position (3,) [m], rotation (3, 3) local to world."""
+class _Gateway(NamedTuple):
+    """One receiver of gateway_info.yml: position (3,) [m], rotation (3, 3) local to world."""
 
-    def __init__(self, dataset: str, name: str, position: np.ndarray, rotation: np.ndarray) -> None:
-        self.dataset, self.name, self.position, self.rotation = dataset, name, position, rotation
+    dataset: str
+    name: str
+    position: np.ndarray
+    rotation: np.ndarray
 
 
 def _numbers(value: object, count: int) -> np.ndarray | None:
@@ -104,48 +107,32 @@ def _numbers(value: object, count: int) -> np.ndarray | None:
 
 
 def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gateway | None:
+    entry = "entries like `gateway1: {position: [x, y, z], orientation: [x, y, z, w]}`"
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except FileNotFoundError:
-        problems.add(path, "missing; expected the gateway's position and orientation")
+        content = read_yaml(path, "the gateway's position and orientation", entry)
+    except DataError as error:
+        problems.extend(error.problems)
         return None
-    except (yaml.YAMLError, UnicodeDecodeError, OSError) as error:
-        problems.add(path, f"not readable as YAML ({' '.join(str(error).split())})")
-        return None
-    if not isinstance(content, Mapping):
-        problems.add(
-            path, "expected entries like `gateway1: {position: [x, y, z], orientation: [x, y, z, w]}`"
-        )
-        return None
-    dataset = str(content.get("dataset_name", "unnamed"))
     gateways = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
     if not gateways:
-        problems.add(path, "no gateway in it; expected e.g. `gateway1:` with position and orientation")
-        return None
+        return problems.add(path, "no gateway in it; expected e.g. `gateway1:` with position and orientation")
     name = next(iter(gateways)) if wanted is None else wanted
     if name not in gateways:
-        problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
-        return None
-    position = _numbers(gateways[name].get("position"), 3)
-    orientation = _numbers(gateways[name].get("orientation"), 4)
+        return problems.add(path, f"no gateway named {name!r}; there are {', '.join(gateways)}")
+    given = [gateways[name].get(key) for key in ("position", "orientation")]
+    position, orientation = _numbers(given[0], 3), _numbers(given[1], 4)
     if position is None:
-        problems.add(
-            path, f"{name}: position is {gateways[name].get('position')}; expected three finite numbers [m]"
-        )
+        problems.add(path, f"{name}: position is {given[0]}; expected three finite numbers [m]")
     else:
         check_positions(problems, str(path), position[None], [f"{name}: position"])
     if orientation is None:
-        problems.add(
-            path,
-            f"{name}: orientation is {gateways[name].get('orientation')}; "
-            "expected a quaternion of four finite numbers (x, y, z, w)",
-        )
-        return None
+        expected = "expected a quaternion of four finite numbers (x, y, z, w)"
+        return problems.add(path, f"{name}: orientation is {given[1]}; {expected}")
     try:
         rotation = quaternion_to_matrix(orientation, scalar_first=False)
     except ValueError as error:
-        problems.add(path, f"{name}: orientation: {error}")
-        return None
+        return problems.add(path, f"{name}: orientation: {error}")
+    dataset = str(content.get("dataset_name", "unnamed"))
     return None if position is None else _Gateway(dataset, name, position, rotation)
 
 
@@ -155,20 +142,16 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows = list(csv.reader(file))
     except FileNotFoundError:
-        problems.add(path, "missing; expected a header x,y,z and one row per spectrum")
-        return None
+        return problems.add(path, "missing; expected a header x,y,z and one row per spectrum")
     except (UnicodeDecodeError, csv.Error, OSError) as error:
-        problems.add(path, f"not readable as CSV text ({error})")
-        return None
+        return problems.add(path, f"not readable as CSV text ({error})")
     while rows and not any(cell.strip() for cell in rows[-1]):
         rows.pop()
     if not rows or [cell.strip().lower() for cell in rows[0]] != ["x", "y", "z"]:
         found = ",".join(rows[0]) if rows else "an empty file"
-        problems.add(f"{path}, line 1", f"expected the header x,y,z, found {found}")
-        return None
+        return problems.add(f"{path}, line 1", f"expected the header x,y,z, found {found}")
     if len(rows) == 1:
-        problems.add(path, "no rows; expected one position per spectrum")
-        return None
+        return problems.add(path, "no rows; expected one position per spectrum")
     positions = np.full((len(rows) - 1, 3), np.nan)
     readable: list[int] = []
     for i, row in enumerate(rows[1:]):
@@ -188,15 +171,13 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
 def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.ndarray | None:
     """Images (S, 90, 360) uint8, in the order of their numbers."""
     if not folder.is_dir():
-        problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
-        return None
+        return problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
     files = {path.name for path in folder.glob("*.png")}
     if count is None:
         return None
     expected = [f"{i:05d}.png" for i in range(1, count + 1)]
     if not files:
-        problems.add(folder, f"no PNG images in it; tx_pos.csv has {count} rows")
-        return None
+        return problems.add(folder, f"no PNG images in it; tx_pos.csv has {count} rows")
     missing = [name for name in expected if name not in files]
     extra = sorted(files - set(expected))
     problems.add_rows(folder, missing, f"missing, but tx_pos.csv has {count} rows")
@@ -234,8 +215,7 @@ def _read_split(root: Path, count: int | None, problems: Problems) -> tuple[np.n
         return None
     if len(present) == 1:
         absent = next(path for path in paths if path not in present)
-        problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
-        return None
+        return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
     train, test = (_read_index(path, count, problems) for path in paths)
     if train is None or test is None:
         return None
@@ -248,8 +228,7 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
     try:
         lines = path.read_text(encoding="utf-8-sig").split("\n")
     except (UnicodeDecodeError, OSError) as error:
-        problems.add(path, f"not readable as text ({error})")
-        return None
+        return problems.add(path, f"not readable as text ({error})")
     rows: list[int] = []
     first_line: dict[int, int] = {}
     for number, line in enumerate(lines, start=1):
@@ -269,8 +248,7 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
             first_line[index] = number
             rows.append(index - 1)
     if not rows:
-        problems.add(path, "no usable index in it; expected one number of a spectrum per line")
-        return None
+        return problems.add(path, "no usable index in it; expected one number of a spectrum per line")
     return np.sort(np.array(rows, dtype=np.int64))
 
 

@@ -89,21 +89,20 @@ class SplitSettings:
             close = difflib.get_close_matches(self.name, [*NAMES, "file"], n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
             raise DataError(f"split: {self.name!r} is none of {', '.join(NAMES)}, file{hint}")
-        for key in ("test_fraction", "train_fraction"):
-            if not 0 < getattr(self, key) < 1:
-                raise DataError(f"split.{key}={getattr(self, key)}: expected a share between 0 and 1")
-        if not 0 <= self.val_fraction < 1:
-            raise DataError(f"split.val_fraction={self.val_fraction}: expected a share from 0 to below 1")
-        if not 0 < self.thin <= 1:
-            raise DataError(f"split.thin={self.thin}: expected a share above 0, at most 1")
-        if self.train_count is not None and self.train_count < 1:
-            raise DataError(f"split.train_count={self.train_count}: expected at least 1 row")
+        spacing, count = self.spacing_m, self.train_count
+        for key, good, expected in (
+            ("test_fraction", 0 < self.test_fraction < 1, "a share between 0 and 1"),
+            ("train_fraction", 0 < self.train_fraction < 1, "a share between 0 and 1"),
+            ("val_fraction", 0 <= self.val_fraction < 1, "a share from 0 to below 1"),
+            ("thin", 0 < self.thin <= 1, "a share above 0, at most 1"),
+            ("train_count", count is None or count >= 1, "at least 1 row"),
+            ("spacing_m", spacing is None or 0 < spacing < np.inf, "metres, above 0"),
+            ("buffer_m", 0 <= self.buffer_m < np.inf, "metres, at least 0"),
+        ):
+            if not good:
+                raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
         if self.folds < 2 or self.stretches_per_fold < 1:
             raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
-        if self.spacing_m is not None and not (np.isfinite(self.spacing_m) and self.spacing_m > 0):
-            raise DataError(f"split.spacing_m={self.spacing_m}: expected metres, above 0")
-        if not (np.isfinite(self.buffer_m) and self.buffer_m >= 0):
-            raise DataError(f"split.buffer_m={self.buffer_m}: expected metres, at least 0")
         if len(self.corner) != 2 or set(self.corner) - set("+-"):
             raise DataError(f"split.corner={self.corner!r}: expected one of --, -+, +-, ++")
 
@@ -181,21 +180,16 @@ def indices_hash(folds: tuple[Fold, ...]) -> str:
     """SHA-256 of all indices of all folds."""
     digest = hashlib.sha256()
     for fold in folds:
-        for part in (fold.train, fold.val, fold.test):
+        for part in vars(fold).values():
             digest.update(len(part).to_bytes(8, "little") + part.astype("<i8").tobytes())
     return digest.hexdigest()
 
 
 def write_split(path: str | Path, split: Split, rows: int, dataset_sha256: str = "") -> None:
     """Store a split of `rows` rows as a JSON index file (atomically)."""
-    content = {
-        "schema": 1,
-        "name": split.name,
-        "rows": rows,
-        "dataset_sha256": dataset_sha256,
-        "sha256": split.sha256,
-        "folds": [{k: getattr(f, k).tolist() for k in ("train", "val", "test")} for f in split.folds],
-    }
+    facts = {"schema": 1, "name": split.name, "rows": rows, "dataset_sha256": dataset_sha256}
+    folds = [{name: part.tolist() for name, part in vars(fold).items()} for fold in split.folds]
+    content = {**facts, "sha256": split.sha256, "folds": folds}
     with whole_file(path) as partial:
         partial.write_text(json.dumps(content) + "\n", encoding="utf-8")
 

@@ -102,19 +102,21 @@ def assemble(
     facts["silent_receivers"] = float((~reached).sum())
     facts["paths_per_receiver"] = len(paths.order) / len(receivers)
     arrays = _arrays(campaign, engine, receivers, effects, whole, paths)
-    about = _provenance(campaign, engine, effects, choice, convergence, facts)
+    about = {**_provenance(campaign, engine, effects), **facts}
+    if convergence is not None:
+        about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
+    if choice is not None:
+        about["auto"] = json.dumps(asdict(choice))
     data = write_own(out, arrays, {**about, "simulate_s": seconds})
     shards.remove()
     return Assembled(data, power, whole["delay_spread"], facts)
 
 
+Arrays = Mapping[str, np.ndarray]
+
+
 def _arrays(
-    campaign: Campaign,
-    engine: Engine,
-    receivers: np.ndarray,
-    effects: Effects,
-    whole: Mapping[str, np.ndarray],
-    paths: Paths,
+    campaign: Campaign, engine: Engine, receivers: np.ndarray, effects: Effects, whole: Arrays, paths: Paths
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, engine.wavelength
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
@@ -151,16 +153,9 @@ def _arrays(
     return arrays
 
 
-def _provenance(
-    campaign: Campaign,
-    engine: Engine,
-    effects: Effects,
-    choice: Choice | None,
-    convergence: Convergence | None,
-    facts: Mapping[str, float],
-) -> dict[str, Any]:
-    """Attributes of the file: what it is, how it was made, how far it can be trusted."""
-    about: dict[str, Any] = {
+def _provenance(campaign: Campaign, engine: Engine, effects: Effects) -> dict[str, Any]:
+    """Attributes of the file: what it is and how it was made."""
+    return {
         "name": campaign.scene.name,
         "measurement": campaign.measurement,
         "normalisation": campaign.spectrum.normalisation,
@@ -175,10 +170,4 @@ def _provenance(
         "path_mechanisms_bits": "0 sight, 1 specular, 2 diffuse, 4 refraction, 8 diffraction, 16 edge",
         "frames": "receiver axes are world axes, z up",
         **campaign.spectrum.attributes(),
-        **facts,
     }
-    if convergence is not None:
-        about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
-    if choice is not None:
-        about["auto"] = json.dumps(asdict(choice))
-    return about

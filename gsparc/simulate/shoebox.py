@@ -189,9 +189,8 @@ def trace(
     for name, position in (("tx", tx), ("rx", rx)):
         outside = np.flatnonzero(~room.contains(position))
         if len(outside):
-            raise ValueError(
-                f"{name}, row {outside[0]} = {position[outside[0]]}: outside the room or inside an occluder"
-            )
+            row = f"row {outside[0]} = {position[outside[0]]}"
+            raise ValueError(f"{name}, {row}: outside the room or inside an occluder")
     frequency = np.atleast_1d(np.asarray(frequency_hz, dtype=np.float64))
     elements = np.zeros((1, 3)) if array is None else np.asarray(array, dtype=np.float64)
     mirrored = images(room, max_order)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise, permutations
 
 import numpy as np
 
@@ -132,22 +132,18 @@ def _routes(streets: Streets, users: np.ndarray, wavelength: float) -> Iterator[
 
 def _walls(streets: Streets) -> list[tuple[int, float, float, float, float, float]]:
     """(axis, coordinate, low, high, outward sign, reflection) of every wall."""
-    found = []
-    for (low, high), reflection in zip(streets.buildings, streets.reflection, strict=True):
-        for axis in (0, 1):
-            other = 1 - axis
-            for coordinate, sign in ((low[axis], -1.0), (high[axis], 1.0)):
-                found.append((axis, coordinate, low[other], high[other], sign, reflection))
-    return found
+    return [
+        (axis, place[axis], low[1 - axis], high[1 - axis], sign, reflection)
+        for (low, high), reflection in zip(streets.buildings, streets.reflection, strict=True)
+        for axis in (0, 1)
+        for place, sign in ((low, -1.0), (high, 1.0))
+    ]
 
 
 def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[_Route]:
     """One and two reflections: the straight line to an image must cross its walls, and nothing else."""
     walls, base = _walls(streets), streets.base[:2]
-    pairs = [(i,) for i in range(len(walls))] + list(product(range(len(walls)), repeat=2))
-    for sequence in pairs:
-        if len(sequence) == 2 and sequence[0] == sequence[1]:
-            continue
+    for sequence in (*permutations(range(len(walls)), 1), *permutations(range(len(walls)), 2)):
         images = [base]
         for i in sequence:
             axis, coordinate = walls[i][:2]

@@ -53,14 +53,9 @@ class Autoencoder(nn.Module):
 
     def __init__(self, width: int, settings: EncoderSettings) -> None:
         super().__init__()
-        hidden = settings.hidden
         self.settings = settings
-        self.encoder = nn.Sequential(
-            nn.Linear(width, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, CODE)
-        )
-        self.decoder = nn.Sequential(
-            nn.Linear(CODE, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, width)
-        )
+        self.encoder = _layers(width, settings.hidden, CODE)
+        self.decoder = _layers(CODE, settings.hidden, width)
         # Stored with the encoder: new uplinks are normalised alike.
         self.register_buffer("mean", torch.zeros(width))
         self.register_buffer("scale", torch.ones(width))
@@ -72,6 +67,11 @@ class Autoencoder(nn.Module):
     def code(self, features: Tensor) -> Tensor:
         """Places (B, 3) in (-1, 1)."""
         return torch.tanh(self.encoder(self.normalised(features)) / 2)
+
+
+def _layers(width: int, hidden: int, out: int) -> nn.Sequential:
+    first, second = nn.Linear(width, hidden), nn.Linear(hidden, hidden)
+    return nn.Sequential(first, nn.GELU(), second, nn.GELU(), nn.Linear(hidden, out))
 
 
 def spread(codes: Tensor) -> Tensor:

@@ -18,14 +18,8 @@ def features(uplink: np.ndarray) -> np.ndarray:
     unit = uplink / np.sqrt(power)[:, None, None]
     first, second = _pairs(uplink.shape[1])
     across = np.einsum("spl,spl->sp", unit[:, first], unit[:, second].conj()) / uplink.shape[2]
-    tones = uplink.shape[2]
-    along = np.stack(
-        [
-            (unit[..., lag:] * unit[..., : tones - lag].conj()).mean((1, 2))
-            for lag in range(1, tones // 2 + 1)
-        ],
-        axis=1,
-    )
+    lags = range(1, uplink.shape[2] // 2 + 1)
+    along = np.stack([(unit[..., lag:] * unit[..., :-lag].conj()).mean((1, 2)) for lag in lags], axis=1)
     # A timing error turns lag l by l times one angle: relative to lag 1 the shape of the profile is left.
     turn = np.angle(along[:, :1])
     along = along * np.exp(-1j * turn * np.arange(1, along.shape[1] + 1))
