@@ -83,23 +83,14 @@ def load_argos(
     facts = {name: str(description[name]) for name in FACTS if name in description}
     base, frequency = places.mean(axis=0), carrier + tones * spacing
     data = assemble(
-        name=STAND_IN if simulated else "argos",
-        stand_in="argos" if simulated else None,
-        kind="csi",
-        grid=None,
-        static_end="tx",
-        tx=np.tile(base, (len(csi), 1)),
-        rx=where,
-        rx_rotation=np.tile(np.eye(3), (len(csi), 1, 1)),
-        target=target,
-        target_scale=scale,
-        carrier_hz=carrier,
-        subcarriers_hz=frequency[UPLINK:],
+        name=STAND_IN if simulated else "argos", stand_in="argos" if simulated else None,
+        kind="csi", grid=None, static_end="tx", tx=np.tile(base, (len(csi), 1)), rx=where,
+        rx_rotation=np.tile(np.eye(3), (len(csi), 1, 1)), target=target, target_scale=scale,
+        carrier_hz=carrier, subcarriers_hz=frequency[UPLINK:], release_split=split,
         noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
-        release_split=split,
         row_names=[f"snapshot {i}" for i in range(len(csi))],
         provenance={"layout": "argos", "positions": positions, "aligned": str(align), **facts},
-    )
+    )  # fmt: skip
     uplink_facts = {"uplink_array": places - base, "uplink_hz": frequency[:UPLINK], "antennas": chosen}
     return replace(data, site=replace(data.site, **uplink_facts), uplink=np.ascontiguousarray(uplink))
 

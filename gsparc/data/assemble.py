@@ -100,18 +100,11 @@ def assemble(
         "carrier_hz": None if carrier_hz is None else np.array(carrier_hz), "noise_variance": noise_variance,
     }  # fmt: skip
     site = Site(
-        static_end=static_end,
-        array=array,
-        carrier_hz=carrier_hz,
-        subcarriers_hz=subcarriers_hz,
-        origin=origin,
-        box=np.stack([lower - origin, upper - origin]),
-        sha256=content_hash(hashed),
-        target_scale=target_scale,
-        static_position=(rx if static_end == "rx" else tx)[0] - origin,
-        rx_rotation=np.array(rx_rotation[0], dtype=np.float64),
-        **facts,
-    )
+        static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,
+        origin=origin, box=np.stack([lower - origin, upper - origin]), sha256=content_hash(hashed),
+        target_scale=target_scale, static_position=(rx if static_end == "rx" else tx)[0] - origin,
+        rx_rotation=np.array(rx_rotation[0], dtype=np.float64), **facts,
+    )  # fmt: skip
     names = row_names or [f"row {i}" for i in range(len(target))]
     return Measurements(
         site, tx - origin, rx - origin, rx_rotation, target, mask, noise_variance, directions, names,

@@ -30,12 +30,8 @@ def read_error(path: Path, seconds: float = SECONDS) -> str | None:
     if not _has_heap(path):
         return None
     try:
-        done = subprocess.run(
-            [sys.executable, "-I", "-c", READ, str(path.absolute())],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=seconds,
-        )
+        read, nothing = [sys.executable, "-I", "-c", READ, str(path.absolute())], subprocess.DEVNULL
+        done = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
     except subprocess.TimeoutExpired:
         return f"its text cannot be read in {seconds:g} s"
     if done.returncode < 0:

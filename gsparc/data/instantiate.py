@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import fields
 from importlib import import_module
 from typing import Any
+
+from gsparc.data.errors import DataError
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -13,6 +16,15 @@ def suggest(name: str, known: Iterable[str]) -> str:
     known = list(known)
     close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"; did you mean {close[0]!r}?" if close else f"; there are {', '.join(sorted(known))}"
+
+
+def known_keys(config: Mapping[str, Any], kind: type, group: str, noun: str) -> Mapping[str, Any]:
+    """`config` when all its keys are fields of the dataclass `kind`; else a `DataError` names one `noun`."""
+    known = {field.name for field in fields(kind)}
+    for key in config:
+        if key not in known:
+            raise DataError(f"{group}.{key}: no such {noun}; there are {', '.join(sorted(known))}")
+    return config
 
 
 def targets(node: Any) -> Iterator[Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import inspect
 from collections.abc import Mapping
-from dataclasses import fields
 from importlib.resources import files
 from typing import Any
 
@@ -16,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import find, refuse_foreign, suggest, targets
+from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, SplitSettings, make_split, read_split
 
@@ -80,11 +79,8 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     """
     if config.get("name") == "file":
         return read_split(config["path"], len(data), data.site.sha256)
-    known = {field.name for field in fields(SplitSettings)}
-    unknown = [key for key in config if key not in known]
-    if unknown:
-        raise DataError(f"split.{unknown[0]}: no such setting; there are {', '.join(sorted(known))}")
-    return make_split(data.moving, SplitSettings(**dict(config)), data.release_split)
+    settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
+    return make_split(data.moving, settings, data.release_split)
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:

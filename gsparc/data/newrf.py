@@ -42,9 +42,7 @@ def read_newrf(raw: Raw, path: str | Path) -> Reading:
     """
     missing = [name for name in (*NAMES, "csi", "frequency_hz") if name not in raw.arrays]
     if missing:
-        raise DataError(
-            [f"{path}, {name}: missing; expected in the layout of NeWRF" for name in missing], path
-        )
+        raise DataError([f"{path}, {n}: missing; expected in the layout of NeWRF" for n in missing], path)
     reading = interpret(renamed(raw, NAMES), path)
     if reading.data.site.static_end != "tx":
         raise DataError(f"{path}: rx_pos does not move; expected one transmitter and many receivers", path)

@@ -142,25 +142,13 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
+    noise = None if noise is None else (noise / scale**2).astype(np.float32)
     data = assemble(
-        kind=kind,
-        static_end=static_end,
-        tx=tx,
-        rx=rx,
-        rx_rotation=rotation,
-        target=target,
-        target_scale=scale,
-        grid=grid,
-        array=array,
-        carrier_hz=carrier,
-        subcarriers_hz=frequency if kind == "csi" else None,
-        mask=mask,
-        noise_variance=None if noise is None else (noise / scale**2).astype(np.float32),
-        directions=directions,
-        row_names=row_names,
-        release_split=release_split,
-        **about,
-    )
+        kind=kind, static_end=static_end, tx=tx, rx=rx, rx_rotation=rotation, target=target, mask=mask,
+        target_scale=scale, noise_variance=noise, directions=directions, grid=grid, array=array,
+        carrier_hz=carrier, subcarriers_hz=frequency if kind == "csi" else None,
+        row_names=row_names, release_split=release_split, **about,
+    )  # fmt: skip
     return Reading(data, tuple(check.notes))
 
 

@@ -69,22 +69,15 @@ def load_rfid(
     count = len(positions)
     simulated = info.dataset == STAND_IN
     return assemble(
-        name=STAND_IN if simulated else "rfid",
-        stand_in="rfid" if simulated else None,
-        kind="spectrum",
-        static_end="rx",
-        tx=positions,
-        rx=np.repeat(info.position[None], count, axis=0),
-        rx_rotation=np.repeat(info.rotation[None], count, axis=0),
-        target=spectra,
-        grid=SphereGrid.hemisphere(HEIGHT, WIDTH),
+        name=STAND_IN if simulated else "rfid", stand_in="rfid" if simulated else None,
+        kind="spectrum", static_end="rx", tx=positions, rx=np.repeat(info.position[None], count, axis=0),
+        rx_rotation=np.repeat(info.rotation[None], count, axis=0), target=spectra,
+        grid=SphereGrid.hemisphere(HEIGHT, WIDTH), normalisation=normalisation,
         array=planar_array() if array is None else np.asarray(array, dtype=np.float64),
-        normalisation=normalisation,
-        carrier_hz=LIGHT / wavelength_m,
+        carrier_hz=LIGHT / wavelength_m, release_split=release_split,
         row_names=[f"spectrum/{i:05d}.png" for i in range(1, count + 1)],
-        release_split=release_split,
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
-    )
+    )  # fmt: skip
 
 
 class _Gateway(NamedTuple):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -132,10 +132,7 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Batch:
         """The same samples on another device."""
-        moved: dict[str, Any] = {
-            name: value.to(device) if isinstance(value, (Tensor, Pose)) else value
-            for name, value in vars(self).items()
-        }
+        moved = {k: v.to(device) for k, v in vars(self).items() if v is not None}
         return Batch(**moved)
 
 

@@ -61,10 +61,9 @@ def _load(path: str | Path, target: str | None) -> Measurements:
     if "simulator" not in raw.attributes:
         raise DataError(f"{path}: not written by gsparc simulate; read it with dataset=own")
     target = str(target or raw.attributes.get("measurement"))
-    if target not in TARGETS or target not in raw.arrays:
-        raise DataError(
-            f"dataset.target={target}: {path} holds {' and '.join(t for t in TARGETS if t in raw.arrays)}"
-        )
+    held = [name for name in TARGETS if name in raw.arrays]
+    if target not in held:
+        raise DataError(f"dataset.target={target}: {path} holds {' and '.join(held)}")
     reading = interpret(read_as(raw, target), path)
     for note in reading.notes:
         log.warning("%s: %s", path, note)

@@ -12,7 +12,6 @@ import numpy as np
 
 from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
-from gsparc.simulate import priors
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.effects import Effects
@@ -34,7 +33,9 @@ class Assembled:
         data: as `load_own` reads the file.
         power: (S,) sum of path powers.
         delay_spread: (S,) [s].
-        facts: numbers about the scene (`priors.scene_facts`), and how many paths and silent receivers.
+        facts: numbers that decide what the data can be used for: `below_horizon`, the share of power that
+            an upper hemisphere cannot show; `bandwidth_times_delay_spread`, far below 1 where a channel is
+            flat over the band; `share_in_near_field`, where waves over the spectrum's array are not plane.
     """
 
     data: Measurements
@@ -92,15 +93,17 @@ def assemble(
     reached = power > 0
     if not reached.any():
         raise ValueError("nothing reaches any receiver; is the transmitter inside a building?")
-    facts = priors.scene_facts(
-        whole["delay_spread"][reached],
-        float((whole["power_below"][reached] / power[reached]).mean()),
-        campaign.scene.bandwidth_hz,
-        np.linalg.norm(receivers - engine.transmitter, axis=1),
-        campaign.spectrum.near_field(engine.wavelength),
-    )
-    facts["silent_receivers"] = float((~reached).sum())
-    facts["paths_per_receiver"] = len(paths.order) / len(receivers)
+    spread_s = float(np.median(whole["delay_spread"][reached]))
+    near = campaign.spectrum.near_field(engine.wavelength)
+    facts = {
+        "below_horizon": float((whole["power_below"][reached] / power[reached]).mean()),
+        "delay_spread_ns": spread_s * 1e9,
+        "bandwidth_times_delay_spread": spread_s * campaign.scene.bandwidth_hz,
+        "near_field_m": near,
+        "share_in_near_field": float((np.linalg.norm(receivers - engine.transmitter, axis=1) < near).mean()),
+        "silent_receivers": float((~reached).sum()),
+        "paths_per_receiver": len(paths.order) / len(receivers),
+    }
     arrays = _arrays(campaign, engine, receivers, effects, whole, paths)
     about = {**_provenance(campaign, engine, effects), **facts}
     if convergence is not None:

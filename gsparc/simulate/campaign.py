@@ -135,15 +135,9 @@ def _probe(
     settings, nearest = campaign.effects, None
     if isinstance(settings, AutoSettings) and Deliverable.parse(settings.deliverable).kind == "spectrum":
         nearest = engine.trace(receivers[neighbours(receivers, rows)], effects)
-    return Probe(
-        engine.trace(receivers[rows], effects),
-        effects,
-        campaign.scene.frequency_hz,
-        engine.wavelength,
-        campaign.csi.elements(engine.wavelength),
-        campaign.spectrum,
-        nearest,
-    )
+    paths, wavelength = engine.trace(receivers[rows], effects), engine.wavelength
+    elements, frequency = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
+    return Probe(paths, effects, frequency, wavelength, elements, campaign.spectrum, nearest)
 
 
 def _converge(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+
+from gsparc.data.instantiate import known_keys
 
 # Bits of one interaction; the first four are Sionna's, an edge is a wedge with one face.
 SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION, EDGE = 1, 2, 4, 8, 16
@@ -93,12 +95,3 @@ def from_config(config: Mapping[str, Any]) -> Effects:
         ValueError: a switch that does not exist, or a contradiction.
     """
     return Effects(**known_keys(config, Effects, "effects", "effect"))
-
-
-def known_keys(config: Mapping[str, Any], kind: type, group: str, noun: str) -> Mapping[str, Any]:
-    """`config` when all its keys are fields of the dataclass `kind`; else a ValueError names one `noun`."""
-    known = {field.name for field in fields(kind)}
-    for key in config:
-        if key not in known:
-            raise ValueError(f"{group}.{key}: no such {noun}; there are {', '.join(sorted(known))}")
-    return config

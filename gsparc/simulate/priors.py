@@ -42,32 +42,6 @@ def reasons(
     return found
 
 
-def scene_facts(
-    delay_spread_s: np.ndarray,
-    below_horizon: float,
-    bandwidth_hz: float,
-    distance: np.ndarray,
-    near_field_m: float,
-) -> dict[str, float]:
-    """Numbers about the scene that decide what a dataset can be used for.
-
-    Args:
-        delay_spread_s: (R,) of the receivers that any path reaches [s].
-        below_horizon: share of their power that an upper hemisphere cannot show.
-        bandwidth_hz: times the delay spread far below 1, the channel is flat over the band [Hz].
-        distance: (R,) from the transmitter [m].
-        near_field_m: Fraunhofer distance of the spectrum's array; nearer, waves over it are not plane.
-    """
-    spread = float(np.median(delay_spread_s))
-    return {
-        "below_horizon": below_horizon,
-        "delay_spread_ns": spread * 1e9,
-        "bandwidth_times_delay_spread": spread * bandwidth_hz,
-        "near_field_m": near_field_m,
-        "share_in_near_field": float((distance < near_field_m).mean()),
-    }
-
-
 def _slab(material: Mapping[str, Any]) -> bool:
     # A conductor's permittivity is 1: its loss is not in this number.
     return float(material.get("permittivity", 0.0)) > 1.01 and float(material.get("thickness_m", 0.0)) > 0

@@ -6,7 +6,7 @@ import hashlib
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,18 +21,6 @@ from gsparc.data.position_encoder.features import features
 log = logging.getLogger(__name__)
 
 FORMAT = "gsparc-encoder-1"
-
-
-def save(path: Path, model: Autoencoder) -> None:
-    """Write an encoder atomically."""
-    content = {
-        "format": FORMAT,
-        "settings": asdict(model.settings),
-        "width": len(model.mean),
-        "model": model.state_dict(),
-    }
-    with whole_file(path) as partial:
-        torch.save(content, partial)
 
 
 def load(path: str | Path) -> Autoencoder:
@@ -64,9 +52,8 @@ def places(model: Autoencoder, uplink: np.ndarray) -> np.ndarray:
     """
     seen = torch.from_numpy(features(uplink))
     if seen.shape[1] != len(model.mean):
-        raise DataError(
-            f"the encoder was trained on {len(model.mean)} features, these uplinks have {seen.shape[1]}"
-        )
+        trained = f"the encoder was trained on {len(model.mean)} features"
+        raise DataError(f"{trained}, these uplinks have {seen.shape[1]}")
     with torch.no_grad():
         return model.code(seen).double().numpy() * model.settings.size_m / 2
 
@@ -83,13 +70,15 @@ def encoder_for(
     def encode(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
         if file is not None:
             return places(load(file), uplink)
-        known = {f.name: np.array(getattr(settings, f.name)) for f in fields(settings)}
+        known = {name: np.array(value) for name, value in asdict(settings).items()}
         content = content_hash({"uplink": uplink[rows], **known})
         path = folder / f"{hashlib.sha256(content.encode()).hexdigest()[:24]}.pt"
         if not path.exists():
             started = time.perf_counter()
             model = train(torch.from_numpy(features(uplink[rows])), settings)
-            save(path, model)
+            stored = {"format": FORMAT, "settings": asdict(settings), "width": len(model.mean)}
+            with whole_file(path) as partial:
+                torch.save({**stored, "model": model.state_dict()}, partial)
             log.info("encoder trained in %.1f s: %s", time.perf_counter() - started, path)
         return places(load(path), uplink)
 

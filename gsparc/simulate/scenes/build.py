@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.simulate.effects import known_keys
+from gsparc.data.instantiate import known_keys
 from gsparc.simulate.engine import Engine
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
@@ -62,9 +62,8 @@ class SceneSettings:
     def __post_init__(self) -> None:
         named = [k for k in ("builder", "builtin", "xml", "room") if getattr(self, k) is not None]
         if len(named) != 1:
-            raise ValueError(
-                f"scene: give exactly one of builder, builtin, xml, room; got {', '.join(named) or 'none'}"
-            )
+            found = ", ".join(named) or "none"
+            raise ValueError(f"scene: give exactly one of builder, builtin, xml, room; got {found}")
         if self.num_receivers < 20:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least 20")
         if not (self.carrier_hz > 0 and self.bandwidth_hz >= 0 and self.subcarriers >= 1):

@@ -22,7 +22,7 @@ WALLS = (  # material along the four walls, in panels from corner to corner
 def conference_room(seed: int = 0) -> list[Solid]:
     """All objects of the room; the seed moves furniture and wall panels by decimetres."""
     rng = np.random.default_rng(seed)
-    return [*_shell(rng), *_partitions(), *_pillars(), *_tables(rng), *_furniture(rng)]
+    return [*_shell(rng), *_partitions(), *_tables(rng), *_furniture(rng)]
 
 
 def _shell(rng: np.random.Generator) -> list[Solid]:
@@ -52,16 +52,11 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
 
 
 def _partitions() -> list[Solid]:
-    """Two glass partitions that cut a corner office off, and a free-standing one; sheets, open at a door."""
+    """Glass: two sheets that cut a corner office off, open at a door, and a free-standing one; pillars."""
     return [
         sheet("glass_office_a", "glass", (9.6, 6.4, 0), (4.3, 0, 0), (0, 0, 2.8)),
         sheet("glass_office_b", "glass", (9.6, 7.5, 0), (0, 2.4, 0), (0, 0, 2.8)),
         sheet("glass_free", "glass", (3.2, 2.0, 0), (2.6, 0.5, 0), (0, 0, 2.2)),
-    ]
-
-
-def _pillars() -> list[Solid]:
-    return [
         box("pillar_a", "concrete", (4.7, 6.6, 0), (5.2, 7.1, 4.0)),
         box("pillar_b", "concrete", (9.1, 3.0, 0), (9.6, 3.5, 4.0)),
     ]

@@ -41,9 +41,8 @@ def place(
         found = np.concatenate([found, drawn[allowed(drawn)]])
         if len(found) >= count:
             return found[:count]
-    raise ValueError(
-        f"scene: only {len(found)} of {count} receivers fit into scene.area_m; is it inside a building?"
-    )
+    fit = f"only {len(found)} of {count} receivers fit into scene.area_m"
+    raise ValueError(f"scene: {fit}; is it inside a building?")
 
 
 def clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
