@@ -62,8 +62,10 @@ class Checker:
     def measurement(self) -> str | None:
         """Which of spectrum, csi, rssi, rssi_db to read: the only one, or the one that an attribute names."""
         present, named = self.given(*MEASUREMENTS), self.raw.attributes.get("measurement")
-        if len(present) == 1 or named in present:
-            return str(named) if named in present else present[0]
+        if len(present) == 1:
+            return present[0]
+        if named in present:
+            return str(named)
         found = " and ".join(present) or "none of them"
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
         return self.problems.add(self.source, f"{wanted}; found {found}")
@@ -106,9 +108,8 @@ class Checker:
         array = self.real(name, (3,), (rows, 3))
         if array is None:
             return None
-        names = (
-            (self.row_names or [f"row {i}" for i in range(len(array))]) if array.ndim == 2 else ["its value"]
-        )
+        rows_named = self.row_names or [f"row {i}" for i in range(len(array))]
+        names = rows_named if array.ndim == 2 else ["its value"]
         if check_positions(self.problems, self.where(name), np.atleast_2d(array), names):
             return None
         stored = self.raw.arrays[name]

@@ -48,9 +48,7 @@ class Deliverable:
             expected = "'coverage +-1 dB', 'csi -20 dB' or 'spectrum skill 0.9'"
             raise ValueError(f"effects.deliverable={text!r}: expected {expected}")
         kind = found[1].lower()
-        number = (
-            {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}[kind] if found[2] is None else float(found[2])
-        )
+        number = float(found[2] or {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}[kind])
         if kind == "coverage":
             return Deliverable("coverage", abs(number), quantile)
         if kind == "csi":

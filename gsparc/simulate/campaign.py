@@ -110,11 +110,8 @@ def _choose(
     probes, held = chosen[taken], chosen[~taken]
     full = engine.supported(settings.full)
     log.info("auto: %d probes with %s", len(probes), full)
-    probe, places, materials = (
-        _probe(campaign, engine, receivers, probes, full),
-        receivers[probes],
-        engine.materials(),
-    )
+    probe, places = _probe(campaign, engine, receivers, probes, full), receivers[probes]
+    materials = engine.materials()
     choice = auto.decide(
         engine, places, settings, probe, lambda p: priors.reasons(p, engine.transmitter, places, materials)
     )
