@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.multipath import refine_phase
 from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.multipath.refine_phase import fit_phases
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.search import Search, SearchSettings
 from gsparc.multipath.search_cache import SearchCache
@@ -97,9 +97,9 @@ def search_many(
         rows = row_sets[number]
         deadline = budget.started + ROUNDS_END * budget.seconds
         scene = Search(rows, transmitter, settings, seed + number, deadline).run()
-        phased = fit_phases(
-            rows, PhasedScene.of(rows, scene, QUADRATURE), settings.visibility, noise_floor=noise_floor
-        )
+        phased = PhasedScene.of(rows, scene, QUADRATURE)
+        phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor)
+        phased = refine_phase.refine(rows, phased, 20, noise_floor)
         if clutter and phased.quadrature < 1:
             generator = torch.Generator().manual_seed(seed + number)
             latest = budget.started + budget.seconds

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import View
 
 
 @dataclass(frozen=True)
@@ -133,9 +132,9 @@ class PhasedPosterior:
         n, scene = len(self.rows), self.scene
         covariance = torch.zeros(2, n, 2, n)
         for k, source in enumerate(scene.sources):
-            view = View.of(self.rows.position, source)
             scaled = self.waves[:, k] * scene.log_amplitude[k].exp()
-            add_source(covariance, scaled, self.phased.quadrature, scene.visibility.correlation(view, view))
+            correlation = scene.visibility.correlation(self.rows.position, source)
+            add_source(covariance, scaled, self.phased.quadrature, correlation)
         noise = math.exp(scene.log_noise) + self.noise_floor
         covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)
         return RealFactor.of(covariance, self.rows.target)
@@ -157,18 +156,6 @@ class PhasedPosterior:
             * self.dual_weights.sum(1)
             * torch.polar(torch.ones(()), self.phased.phase)[:, None]
         )
-
-    def gains(self, places: Tensor) -> Tensor:
-        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], attenuated by clutter."""
-        dual_weights, per_source = self.dual_weights, []
-        for k, source in enumerate(self.scene.sources):
-            here, there = View.of(places, source), View.of(self.rows.position, source)
-            correlation = self.scene.visibility.correlation(here, there)
-            per_source.append(
-                torch.complex(correlation @ dual_weights[k].real, correlation @ dual_weights[k].imag)
-            )
-        turn = torch.polar(self.scene.visible_share(places), self.phased.phase.expand(1, -1))
-        return torch.stack(per_source, 1) * turn[:, :, None]
 
     def left_out(self) -> Tensor:
         """Leave-one-receiver-out predictions (n, R) complex64.

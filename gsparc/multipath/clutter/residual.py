@@ -16,7 +16,6 @@ from torch import Tensor
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import View
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
@@ -47,16 +46,10 @@ class Residual:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         n, scene = len(self.rows), phased.scene
         scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
-        kernel = phased.scene.visibility
-        varying = torch.zeros(2, n, 2, n)
+        varying, kernel = torch.zeros(2, n, 2, n), replace(scene.visibility, constant=0.0)
         for k, source in enumerate(scene.sources):
-            view = View.of(self.rows.position, source)
-            add_source(
-                varying,
-                scaled[:, k],
-                phased.quadrature,
-                replace(kernel, constant=0.0).correlation(view, view),
-            )
+            correlation = kernel.correlation(self.rows.position, source)
+            add_source(varying, scaled[:, k], phased.quadrature, correlation)
         across = stacked(scaled)[1]
         return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
 
