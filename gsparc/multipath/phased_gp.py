@@ -16,12 +16,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsparc.multipath.clutter.blocking import Clutter
 from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.visibility_kernel import KernelVisibility
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,32 @@ class PhasedScene:
         posterior = Posterior(rows, scene)
         gain = (posterior.waves.mH @ posterior.factor.alpha).sum(1)
         return PhasedScene(scene, gain.angle(), quadrature if rows.target.shape[1] == 1 else 1.0)
+
+    def state(self) -> dict[str, Any]:
+        """Plain tensors and numbers."""
+        scene, kernel = self.scene, self.scene.visibility
+        return {
+            "transmitter": scene.transmitter,
+            "planes": scene.planes,
+            "words": [list(word) for word in scene.words],
+            "log_amplitude": scene.log_amplitude,
+            "log_noise": scene.log_noise,
+            "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
+            "phase": self.phase,
+            "turning": self.quadrature,
+            "boxes": scene.clutter.boxes,
+            "patches": scene.clutter.patches,
+            "patched": list(scene.clutter.plane),
+        }
+
+    @staticmethod
+    def from_state(state: dict[str, Any]) -> PhasedScene:
+        """Inverse of `state`."""
+        words, kernel = tuple(tuple(word) for word in state["words"]), KernelVisibility(*state["visibility"])
+        clutter = Clutter(state["boxes"], state["patches"], tuple(state["patched"]))
+        sources = (words, state["log_amplitude"], float(state["log_noise"]))
+        scene = Scene(state["transmitter"], state["planes"], *sources, kernel, clutter)
+        return PhasedScene(scene, state["phase"], float(state["turning"]))
 
     def waves(self, rows: Rows) -> Tensor:
         """w_k at the rows, (n, K) complex64."""

@@ -27,7 +27,7 @@ REFRESH = 16
 BETA1, BETA2 = 0.8, 0.95  # decay rates of Adam's moments, for tens of steps
 DECAY_AFTER, DECAY = 0.6, 0.3  # smaller steps for the last 40 %
 TRANSMITTER_STEP = 0.0004  # [m]; small, its position is measured
-NORMAL_STEP, OFFSET_STEP = 0.0012, 0.004  # of a plane's unit normal, and along it [m]
+PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and along it [m]
 STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
@@ -48,9 +48,7 @@ def descend(
         more: start of parameters beside the scene's.
     """
     values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), *more]
-    rates = [
-        torch.tensor(v, dtype=torch.float64) for v in (TRANSMITTER_STEP, [*[NORMAL_STEP] * 3, OFFSET_STEP])
-    ]
+    rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
     rates += [torch.tensor(STEP)] * (len(values) - 2)
     first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
     best, lowest, correlation = values, math.inf, torch.empty(0)
@@ -71,15 +69,10 @@ def descend(
             size = (second[i] / (1 - BETA2 ** (step + 1))).sqrt() + 1e-9
             moved.append(values[i] - decay * rates[i] * mean / size)
         values = moved
-    transmitter, planes, log_amplitude, log_noise, *rest = best
     found = replace(
-        scene,
-        transmitter=transmitter,
-        planes=planes,
-        log_amplitude=log_amplitude,
-        log_noise=float(log_noise),
+        scene, transmitter=best[0], planes=best[1], log_amplitude=best[2], log_noise=float(best[3])
     )
-    return found, rest
+    return found, best[4:]
 
 
 def refine(rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER) -> Scene:
