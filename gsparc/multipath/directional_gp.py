@@ -26,13 +26,11 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse
 from gsparc.multipath.gp_likelihood import Factor, steering
-from gsparc.multipath.position_refine import PositionRefinement
-from gsparc.multipath.position_uncertainty import UncertainPositions, coherence
+from gsparc.multipath.position_refine import PositionRefinement, UncertainPositions, coherence
 from gsparc.multipath.rows import Rows, gather
 from gsparc.multipath.triangulation import Rays, triangulate
-from gsparc.multipath.visibility_gp import VisibilityGP
+from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.multipath.visibility_kernel import matern32
-from gsparc.multipath.visibility_update import RayErrorRates, flips
 from gsparc.ops import Pose
 from gsparc.physics.waves import ranges, wave, wave_over_band
 
@@ -169,10 +167,6 @@ class DirectionalGP(FramedMethod):
         ).run()
 
     def _refit(self) -> None:
-        self._learn()
-        self._prepare()
-
-    def _learn(self) -> None:
         """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
         some, rows = self._few(SELECTION_ROWS)
         waves = self._visible_waves(rows, self.observer[some])
@@ -194,6 +188,7 @@ class DirectionalGP(FramedMethod):
             mean = prior[:, None] * (waves.mH @ factor.alpha)
             known = (factor.root @ waves).abs().square().sum(0)
             self.power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
+        self._prepare()
 
     def _prepare(self) -> None:
         """Quantities derived from the state that queries need."""
@@ -211,7 +206,7 @@ class DirectionalGP(FramedMethod):
         self.dual_weights = [part.contiguous() for part in (dual_weights.real, dual_weights.imag)]
 
     def _update_visibility(self) -> int:
-        """Update visibility by the channels (`visibility_update.py`); returns how many entries changed.
+        """Update visibility by the channels (see `flips`); returns how many entries changed.
 
         Only with one row per receiver: more of them determine the gains of their own receiver.
         """

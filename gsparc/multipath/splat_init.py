@@ -22,6 +22,7 @@ from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import PathResponse
 from gsparc.methods.method import FitContext
+from gsparc.multipath.directional_gp import GainKernel
 from gsparc.multipath.gp_likelihood import Factor, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.rows import Rows, gather
@@ -101,15 +102,6 @@ def assumed_sources(data: Measurements, known: np.ndarray, means: Tensor, seed: 
     return Sources(means.double(), 1 / (len(means) * power), rows, scale)
 
 
-@dataclass(frozen=True)
-class GainKernel:
-    """Kernel of the gains over places: correlation length [m], constant share, noise."""
-
-    length: float
-    constant: float
-    noise: float
-
-
 UNIFORM_GAINS = GainKernel(length=2.0, constant=0.8, noise=0.1)  # without a search
 
 
@@ -122,7 +114,7 @@ def fit_gain_kernel(sources: Sources) -> GainKernel:
         for constant, noise in product(CONSTANTS, NOISES):
             matrix = covariance * (constant + (1 - constant) * varying)
             matrix.diagonal().add_(noise)
-            found[GainKernel(length, constant, noise)] = Factor.of(matrix, sources.rows.target).nll
+            found[GainKernel(constant, length, noise)] = Factor.of(matrix, sources.rows.target).nll
     return min(found, key=found.__getitem__)
 
 
