@@ -33,7 +33,7 @@ class Frame:
     def inside(self, rows: Rows) -> Rows:
         """Rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
-        return replace(rows.moved(-self.middle), target=flat)
+        return replace(rows, position=rows.position - self.middle, target=flat)
 
 
 class FramedMethod(PredictsVariance):

@@ -82,13 +82,9 @@ def search_sources(data: Measurements, known: np.ndarray, offsets: str, seed: in
     )  # fmt: skip
     method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
     member, frame = method.members[0], method.frame
-    scene = member.scene
-    return Sources(
-        scene.sources + frame.middle,
-        scene.log_amplitude.double().exp().square(),
-        member.rows.moved(frame.middle),
-        frame.scale,
-    )
+    power = member.scene.log_amplitude.double().exp().square()
+    rows = replace(member.rows, position=member.rows.position + frame.middle)
+    return Sources(member.scene.sources + frame.middle, power, rows, frame.scale)
 
 
 def assumed_sources(data: Measurements, known: np.ndarray, means: Tensor, seed: int) -> Sources:

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -168,9 +169,11 @@ class _ClutterSearcher:
                 self._drop()
                 self._refactor(self.phased)
                 self._drop_words()
-                self._refactor(
-                    refine_phase.refine(self.rows, self.phased, s.steps, self.noise_floor, self._phase_cost)
+                words, prior = self.scene.words, self.phase_prior
+                found = refine_phase.refine(
+                    self.rows, self.phased, s.steps, self.noise_floor, partial(prior.cost, words=words)
                 )
+                self._refactor(found)
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
@@ -180,10 +183,6 @@ class _ClutterSearcher:
             if time.monotonic() > deadline or self.nll > before - s.progress:
                 break
         return best[1]
-
-    def _phase_cost(self, phase: Tensor) -> Tensor:
-        """Negative log prior of phases (K,)."""
-        return self.phase_prior.cost(phase, self.scene.words)
 
     def _descend_soft(self, soft: float) -> None:
         """Descend with softer edges, whose gradients reach farther, then with sharp ones."""
@@ -251,23 +250,14 @@ class _ClutterSearcher:
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))
 
-    def _with_mirror(self, mirror: SmallMirror) -> tuple[Scene, list[Word]]:
-        scene = self.scene
-        number, known = len(scene.planes), walls(scene.planes, scene.words)
-        trial = replace(
-            scene,
-            planes=torch.cat([scene.planes, mirror.plane[None]]),
-            clutter=scene.clutter.with_patch(mirror.patch, number),
-        )
-        return trial, _words_over(number, known)
-
     def _add_mirror(self, mirror: SmallMirror) -> bool:
-        """Try a small mirror with its best words."""
-        trial, words = self._with_mirror(mirror)
-        if self._wide(mirror):  # try an infinite wall first
-            endless = replace(trial, clutter=self.scene.clutter)
-            if self._add(endless, words, 1.5, WALL * self.parameter_cost, len(words)):
-                return True
+        """Try a small mirror with its best words; a wide one as an infinite wall first."""
+        scene, number = self.scene, len(self.scene.planes)
+        words = _words_over(number, walls(scene.planes, scene.words))
+        endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
+        trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
+        if self._wide(mirror) and self._add(endless, words, 1.5, WALL * self.parameter_cost, len(words)):
+            return True
         return self._add(trial, words, 1.5, MIRROR * self.parameter_cost, len(words))
 
     def _wide(self, mirror: SmallMirror) -> bool:
