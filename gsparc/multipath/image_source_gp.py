@@ -152,9 +152,12 @@ class ImageSourceGP(FramedMethod):
             return self.budget_s
         return min(max(SECONDS_PER_ROW * measurements**1.5, MIN_BUDGET_S), MAX_BUDGET_S)
 
-    def _search(self, row_sets: list[Rows], settings: SearchSettings, *more: Any) -> list[Member]:
-        """See `search_many` for `more`, from the budget on."""
-        return search_many(row_sets, self._transmitter(), settings, self.seed, self.noise_floor, *more)
+    def _search(
+        self, row_sets: list[Rows], settings: SearchSettings, budget: Budget, clutter: bool,
+        cache: SearchCache, stage: str = "search",
+    ) -> list[Member]:  # fmt: skip
+        transmitter, floor = self._transmitter(), self.noise_floor
+        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, stage)
 
     def _search_with_edges(
         self, row_sets: list[Rows], found: list[Member], held: Rows, cache: SearchCache, budget: Budget
