@@ -14,12 +14,14 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from gsparc.array.vector_gp import Kernel, align, refine_alignment
+from gsparc.methods.gp import choose_kernel
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
 PIXELS = 600  # drawn from the grid: the score needs no more
 ROWS = 384  # neighbouring samples used: the inverse costs their cube
 CENTRES = 160  # of them predicted
 STEPS = 36  # evaluations of Nelder-Mead
+WEIGHTS = np.linspace(0, 1, 21)  # candidates of the ensemble weight of a process on images
 MIN_VARIANCE = 1e-3  # of the variance is always unknown: quantisation, recovery
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
 
@@ -150,7 +152,6 @@ def tune(
         vectors, positions, images = vectors[rows], positions[rows], images[rows]
     pixels = rng.choice(images.shape[1], min(PIXELS, images.shape[1]), replace=False)
     samples = _Samples(
-        positions=positions,
         images=images[:, pixels].astype(np.float64),
         matrix=matrix[:, pixels].conj(),
         background=background[pixels] ** 2,
@@ -191,7 +192,6 @@ def tune(
 
 @dataclass(frozen=True)
 class _Samples:
-    positions: np.ndarray
     images: np.ndarray
     matrix: np.ndarray
     background: np.ndarray
@@ -215,3 +215,18 @@ class _Samples:
     def score(self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray) -> float:
         """Mean over gaps and centres of the log of the squared error: up to a factor, minus the PSNR."""
         return _mean_log_error(self.error(self.predictions(kernel, inverse, vectors)[1]))
+
+
+def compared(left: LeftOut) -> tuple[float, float]:
+    """Loss in PSNR [dB] of a Gaussian process on images to the array model, and its best ensemble weight.
+
+    On the same samples, gaps and pixels; the kernel is chosen on all samples.
+    """
+    mean = left.images.mean(0)
+    vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
+    kernel = choose_kernel(left.positions, vectors * lengths, len(mean))
+    inverse = np.linalg.inv(kernel.gram(left.positions))
+    distance = np.linalg.norm(left.positions[:, None] - left.positions[None], axis=-1)
+    predicted = mean + predict_left_out(inverse, left.images - mean, distance, left.centres, left.gaps)[0]
+    error = [left.mismatch_db((1 - w) * left.predicted + w * predicted) for w in WEIGHTS]
+    return error[-1] - error[0], float(WEIGHTS[int(np.argmin(error))])

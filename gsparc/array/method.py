@@ -10,8 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.cross_validation import MIN_VARIANCE, LeftOut, tune
-from gsparc.array.image_gp import compared
+from gsparc.array.cross_validation import MIN_VARIANCE, LeftOut, compared, tune
 from gsparc.array.phase_retrieval import recover
 from gsparc.array.reduce import reduced
 from gsparc.array.vector_cache import recovered, report

@@ -79,7 +79,6 @@ def recover(
         state[rows[better]], cost[rows[better]] = found[0][better], found[1][better]
 
     every = torch.arange(n)
-    tree = cKDTree(positions)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(n))
     for turn, starts in enumerate(STARTS):
         unsolved = order[cost[order] > enough[order]]
@@ -92,7 +91,7 @@ def recover(
             keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
         while len(rows := every[cost > enough]):
             solved = (cost <= enough).numpy()
-            near = _solved_neighbours(tree, positions, rows.numpy(), solved)
+            near = _solved_neighbours(positions, rows.numpy(), solved)
             if near is None:
                 break
             before = int(solved.sum())
@@ -106,9 +105,7 @@ def recover(
     return problem.result(state, cost)
 
 
-def _solved_neighbours(
-    tree: cKDTree, positions: np.ndarray, rows: np.ndarray, solved: np.ndarray
-) -> Tensor | None:
+def _solved_neighbours(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
     """Rows (len(rows), <= NEIGHBOURS) of the nearest solved spectra; None when there is none."""
     known = np.flatnonzero(solved)
     if not len(known):
@@ -184,14 +181,9 @@ class _Problem:
 
     def result(self, state: Tensor, cost: Tensor) -> Recovered:
         m = len(self.forms) // 2
+        vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
-        return Recovered(
-            vectors=torch.complex(state[:, :m], state[:, m : 2 * m]).numpy(),
-            offset=offset,
-            residual=cost.sqrt().numpy(),
-            floor=self.floor.numpy(),
-            expected=self.expected.numpy(),
-        )
+        return Recovered(vectors, offset, *(v.numpy() for v in (cost.sqrt(), self.floor, self.expected)))
 
 
 def _search(
@@ -203,10 +195,8 @@ def _search(
     continues, and rows at the quantisation floor end.
     """
     n, starts = len(rows), len(start) // len(rows)
-    best, best_cost = (
-        torch.zeros(n, problem.unknowns, dtype=torch.float64),
-        torch.full((n,), torch.inf).double(),
-    )
+    best = torch.zeros(n, problem.unknowns, dtype=torch.float64)
+    best_cost = torch.full((n,), torch.inf).double()
     owner = torch.arange(n).repeat_interleave(starts)
     state, damping = start.clone(), torch.full((len(start),), 1e-2, dtype=torch.float64)
     error, slope = problem.residual(state, rows[owner])
@@ -229,9 +219,8 @@ def _search(
         stuck = damping >= 1e2
         lowest = torch.full((n,), torch.inf).double().scatter_reduce(0, owner, cost, "amin")
         improved = lowest < best_cost
-        first = torch.zeros(n, dtype=torch.int64).scatter_(
-            0, owner[cost <= lowest[owner]], torch.nonzero(cost <= lowest[owner]).squeeze(1)
-        )
+        least = torch.nonzero(cost <= lowest[owner]).squeeze(1)
+        first = torch.zeros(n, dtype=torch.int64).scatter_(0, owner[least], least)
         best[improved], best_cost[improved] = state[first[improved]], lowest[improved]
         done = best_cost <= enough[rows]
         going = ~done[owner] & ~stuck

@@ -10,6 +10,7 @@ summed over outputs; K is the covariance of the sources found so far, so that th
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -33,7 +34,11 @@ class Detections:
 
 def score(rows: Rows, candidates: Tensor, factor: Factor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have."""
-    waves = steering(rows, candidates)
+    return score_waves(steering(rows, candidates), factor)
+
+
+def score_waves(waves: Tensor, factor: Factor) -> tuple[Tensor, Tensor]:
+    """The same of any waves (n, m) complex64."""
     matched = (waves.mH @ factor.alpha).abs().square().sum(1)
     power = (factor.root @ waves).abs().square().sum(0)
     gained = matched / power
@@ -94,22 +99,24 @@ def search_box(
     rough = quick_score(rows, candidates, factor.alpha)
     candidates = candidates[rough.topk(min(effort.exact, len(rough))).indices]
     exact = torch.cat([score(rows, part, factor)[0] for part in candidates.split(512)])
-    polished = polish(rows, candidates[exact.topk(min(effort.polished, len(exact))).indices], factor, effort)
+    best = candidates[exact.topk(min(effort.polished, len(exact))).indices]
+    rates = [effort.step_m * (1 - 0.8 * step / effort.steps) for step in range(effort.steps)]
+    (polished,) = ascend([best], lambda position: score(rows, position, factor)[0], rates)
     scores, amplitude = score(rows, polished, factor)
     chosen = pick_apart(polished, scores, min_distance, limit)
     return Detections(polished[chosen], scores[chosen], amplitude[chosen])
 
 
-def polish(rows: Rows, candidates: Tensor, factor: Factor, effort: Effort) -> Tensor:
-    """Candidates (m, 3) after gradient ascent on the sum of log scores, each to its own maximum."""
-    position = candidates.clone().requires_grad_()
-    optimizer = torch.optim.Adam([position], lr=effort.step_m, betas=(0.8, 0.95))
-    for step in range(effort.steps):
-        optimizer.param_groups[0]["lr"] = effort.step_m * (1 - 0.8 * step / effort.steps)
+def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[float]) -> list[Tensor]:
+    """Values (m, ...) after steps of Adam of `rates` on the sum of log scores, each to its own maximum."""
+    leaves = [value.clone().requires_grad_() for value in values]
+    optimizer = torch.optim.Adam(leaves, betas=(0.8, 0.95))
+    for rate in rates:
+        optimizer.param_groups[0]["lr"] = rate
         optimizer.zero_grad()
-        (-score(rows, position, factor)[0].log().sum()).backward()
+        (-scores(*leaves).log().sum()).backward()
         optimizer.step()
-    return position.detach()
+    return [leaf.detach() for leaf in leaves]
 
 
 def pick_apart(

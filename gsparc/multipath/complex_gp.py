@@ -45,19 +45,17 @@ class ComplexGP(PredictsVariance):
         self.places = torch.from_numpy(data.moving[known])
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
         self.power = max(float(target.abs().square().mean()), 1e-30)
+        lengths = [length * data.site.wavelength for length in LENGTHS]
         tried = [
-            (*self._solve(target, length, noise), length, noise) for length in LENGTHS for noise in NOISES
+            (*self._solve(target, length, noise), length, noise) for length in lengths for noise in NOISES
         ]
-        _, self.factor, self.weights, length, self.noise = min(tried, key=lambda t: t[0])
-        self.length = length * data.site.wavelength
+        _, self.factor, self.weights, self.length, self.noise = min(tried, key=lambda t: t[0])
         note = f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
         return FitReport(time.monotonic() - started, (note,))
 
     def _solve(self, target: Tensor, length: float, noise: float) -> tuple[float, Tensor, Tensor]:
-        """Negative log likelihood with the best power, Cholesky factor, weights."""
-        assert self.site is not None
-        assert self.site.wavelength is not None
-        gram = self._kernel(self.places, self.places, length * self.site.wavelength)
+        """Negative log likelihood with the best power, Cholesky factor, weights; of a length [m]."""
+        gram = self._kernel(self.places, self.places, length)
         gram.diagonal().add_(noise)
         lower = torch.linalg.cholesky(gram)
         parts = torch.cat([target.real, target.imag], 1)
@@ -69,12 +67,10 @@ class ComplexGP(PredictsVariance):
         return nll, lower, torch.complex(weights[:, :half], weights[:, half:])
 
     def _kernel(self, a: Tensor, b: Tensor, length: float) -> Tensor:
-        assert self.site is not None
-        assert self.site.carrier_hz is not None
+        assert self.site is not None and self.site.carrier_hz is not None
         distance = torch.cdist(a, b)
-        return torch.sinc(2 * distance * self.site.carrier_hz / LIGHT) * matern32(
-            (distance / length).square()
-        )
+        envelope = matern32((distance / length).square())
+        return torch.sinc(2 * distance * self.site.carrier_hz / LIGHT) * envelope
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""

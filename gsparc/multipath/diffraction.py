@@ -13,37 +13,20 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from gsparc.multipath.gp_likelihood import JITTER, Factor, Posterior, Scene
+from gsparc.multipath.backprojection import ascend, score_waves
+from gsparc.multipath.gp_likelihood import Factor, Posterior, Scene
 from gsparc.multipath.refine import refine
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import NEAR_M, reduced_phase
 
-BLOCK = 512  # candidates at a time
+MOST = 4  # edges
+LEAST_NATS = 20.0  # gain of log likelihood: an edge has four parameters and a gain
+CANDIDATES, BLOCK = 40_000, 512  # drawn in the box, and how many are scored at a time
+TILT = 0.03  # [rad], standard deviation of a candidate's axis about x, y or z
+POLISHED, STEPS, STEP_M = 48, 60, 0.02  # best candidates; steps of ascent, and their size [m, rad]
 REFINE_STEPS = 12  # of the sources after each edge
-
-
-@dataclass(frozen=True)
-class EdgeSearch:
-    """Acceptance threshold and effort of the edge search.
-
-    Attributes:
-        most: edges in total.
-        least_nats: least gain of log likelihood: an edge has four parameters and a gain.
-        candidates: drawn in the box; axes along x, y or z, tilted a little.
-        polished: best of them, refined by gradient ascent.
-        steps: of the ascent.
-        step_m: its step size [m]; axes turn by as many radians.
-        tilt: standard deviation of an axis' departure from x, y or z [rad].
-    """
-
-    most: int = 4
-    least_nats: float = 20.0
-    candidates: int = 40_000
-    polished: int = 48
-    steps: int = 60
-    step_m: float = 0.02
-    tilt: float = 0.03
 
 
 @dataclass(frozen=True)
@@ -122,12 +105,7 @@ def edge_wave(
 
 
 def propose(
-    rows: Rows,
-    factor: Factor,
-    transmitter: Tensor,
-    box: Tensor,
-    generator: torch.Generator,
-    search: EdgeSearch,
+    rows: Rows, factor: Factor, transmitter: Tensor, box: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, Tensor] | None:
     """Point and axis (3,) of the edge of largest gain given the sources of `factor`, or None.
 
@@ -137,33 +115,36 @@ def propose(
         transmitter: (3,) float64 [m].
         box: (2, 3) float64 [m] where edges may pass.
         generator: of the candidates.
-        search: effort and threshold.
     """
-    drawn = torch.rand(search.candidates, 3, generator=generator, dtype=torch.float64)
+
+    def waves(point: Tensor, axis: Tensor) -> Tensor:
+        return edge_wave(rows.position, point, axis, transmitter, rows.frequency)
+
+    def scores(point: Tensor, axis: Tensor) -> Tensor:
+        return score_waves(waves(point, normalize(axis, dim=1)), factor)[0]
+
+    drawn = torch.rand(CANDIDATES, 3, generator=generator, dtype=torch.float64)
     point = box[0] + (box[1] - box[0]) * drawn
     axis = torch.eye(3, dtype=torch.float64)[torch.arange(len(point)) % 3]
-    axis = axis + search.tilt * torch.randn(axis.shape, generator=generator, dtype=torch.float64)
-    axis = torch.nn.functional.normalize(axis, dim=1)
-    rough = torch.cat(
-        [_matched(rows, p, a, transmitter, factor) for p, a in zip(*_blocks(point, axis), strict=True)]
-    )
-    top = rough.topk(min(search.polished, len(rough))).indices
-    point, axis = _polished(rows, point[top], axis[top], transmitter, factor, search)
-    gained = _score(rows, point, axis, transmitter, factor)
+    axis = axis + TILT * torch.randn(axis.shape, generator=generator, dtype=torch.float64)
+    axis = normalize(axis, dim=1)
+    arriving = (waves(*part) for part in zip(point.split(BLOCK), axis.split(BLOCK), strict=True))
+    # `|a^H K^-1 y|^2 / |a|^2`
+    rough = [(a.mH @ factor.alpha).abs().square().sum(1) / a.abs().square().sum(0) for a in arriving]
+    top = torch.cat(rough).topk(POLISHED).indices
+    rates = [STEP_M * 0.5 * (1 + math.cos(math.pi * step / STEPS)) for step in range(STEPS)]
+    point, axis = ascend([point[top], axis[top]], scores, rates)
+    axis = normalize(axis, dim=1)
+    gained = score_waves(waves(point, axis), factor)[0]
     best = int(gained.argmax())
     # A free complex gain on pure noise gains one nat.
-    if float(gained[best] - gained[best].log() - 1) < search.least_nats:
+    if float(gained[best] - gained[best].log() - 1) < LEAST_NATS:
         return None
     return point[best], axis[best]
 
 
 def find_edges(
-    rows: Rows,
-    scene: Scene,
-    box: Tensor,
-    generator: torch.Generator,
-    noise_floor: float = JITTER,
-    search: EdgeSearch = EdgeSearch(),
+    rows: Rows, scene: Scene, box: Tensor, generator: torch.Generator, noise_floor: float
 ) -> Edges:
     """Edges one by one, as long as the marginal likelihood accepts another; sources are refined in between.
 
@@ -173,12 +154,11 @@ def find_edges(
         box: (2, 3) float64 [m] where edges may pass.
         generator: of the candidates.
         noise_floor: known variance of the noise, in units of the rows' power.
-        search: effort and threshold.
     """
     edges, residual = Edges.none(), rows
-    while len(edges) < search.most:
+    while len(edges) < MOST:
         factor = Posterior(residual, scene, noise_floor).factor
-        found = propose(residual, factor, scene.transmitter, box, generator, search)
+        found = propose(residual, factor, scene.transmitter, box, generator)
         if found is None:
             break
         point, axis = (torch.cat([a, b[None]]) for a, b in zip((edges.point, edges.axis), found, strict=True))
@@ -193,47 +173,11 @@ def subtract_edges(rows: Rows, edges: Edges, transmitter: Tensor) -> Rows:
     return replace(rows, target=rows.target - edges.field(rows.position, rows.frequency, transmitter))
 
 
-def fit_edge_gains(
-    rows: Rows, point: Tensor, axis: Tensor, scene: Scene, noise_floor: float = JITTER
-) -> Edges:
+def fit_edge_gains(rows: Rows, point: Tensor, axis: Tensor, scene: Scene, noise_floor: float) -> Edges:
     """Gains by generalised least squares beside the scene's sources: `(W^H K^-1 W)^-1 W^H K^-1 y`."""
-    if not len(point):
-        return Edges.none()
     factor = Posterior(rows, scene, noise_floor).factor
     waves = edge_wave(rows.position, point, axis, scene.transmitter, rows.frequency)
     white = factor.root @ waves
     gram = white.mH @ white
     gram.diagonal().add_(1e-6 * gram.diagonal().real.mean())
     return Edges(point, axis, torch.linalg.solve(gram, waves.mH @ factor.alpha))
-
-
-def _blocks(*parts: Tensor) -> list[tuple[Tensor, ...]]:
-    return [part.split(BLOCK) for part in parts]
-
-
-def _matched(rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor) -> Tensor:
-    """`|a^H K^-1 y|^2 / |a|^2` (m,)."""
-    waves = edge_wave(rows.position, point, axis, transmitter, rows.frequency)
-    return (waves.mH @ factor.alpha).abs().square().sum(1) / waves.abs().square().sum(0)
-
-
-def _score(rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor) -> Tensor:
-    """`|a^H K^-1 y|^2 / (a^H K^-1 a)` (m,), in nats per output."""
-    waves = edge_wave(rows.position, point, axis, transmitter, rows.frequency)
-    matched = (waves.mH @ factor.alpha).abs().square().sum(1)
-    return matched / (factor.root @ waves).abs().square().sum(0) / factor.alpha.shape[1]
-
-
-def _polished(
-    rows: Rows, point: Tensor, axis: Tensor, transmitter: Tensor, factor: Factor, search: EdgeSearch
-) -> tuple[Tensor, Tensor]:
-    """Points and axes after gradient ascent on the sum of log scores."""
-    point, axis = point.clone().requires_grad_(), axis.clone().requires_grad_()
-    optimizer = torch.optim.Adam([point, axis], lr=search.step_m, betas=(0.8, 0.95))
-    for step in range(search.steps):
-        optimizer.param_groups[0]["lr"] = search.step_m * 0.5 * (1 + math.cos(math.pi * step / search.steps))
-        optimizer.zero_grad()
-        unit = torch.nn.functional.normalize(axis, dim=1)
-        (-_score(rows, point, unit, transmitter, factor).log().sum()).backward()
-        optimizer.step()
-    return point.detach(), torch.nn.functional.normalize(axis.detach(), dim=1)

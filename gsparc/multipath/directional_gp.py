@@ -23,18 +23,16 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
-from gsparc.multipath.frame import Frame, frame_of, refuse
+from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction
+from gsparc.multipath.frame import FramedMethod, frame_of, refuse
 from gsparc.multipath.gp_likelihood import Factor, steering
-from gsparc.multipath.position_refine import PositionRefinement
-from gsparc.multipath.position_uncertainty import UncertainPositions, coherence
-from gsparc.multipath.rows import Rows, gather, query_elements
+from gsparc.multipath.position_refine import PositionRefinement, UncertainPositions, coherence
+from gsparc.multipath.rows import Rows, gather
 from gsparc.multipath.triangulation import Rays, triangulate
-from gsparc.multipath.visibility_gp import VisibilityGP
+from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
 from gsparc.multipath.visibility_kernel import matern32
-from gsparc.multipath.visibility_update import RayErrorRates, flips
 from gsparc.ops import Pose
-from gsparc.physics.waves import LIGHT, ranges, wave, wave_over_band
+from gsparc.physics.waves import ranges, wave, wave_over_band
 
 # Receivers with a ray to a source; of more sources those seen by most are kept.
 MIN_SEEN, MAX_SOURCES = 2, 60
@@ -93,7 +91,7 @@ KERNELS = tuple(GainKernel(c, length, noise) for c in CONSTANTS for length in LE
 REFINEMENT_KERNEL = GainKernel(0.97, 2.0, 0.01)  # during position refinement
 
 
-class DirectionalGP(PredictsVariance):
+class DirectionalGP(FramedMethod):
     """Gaussian process on channels of a moving receiver with measured directions; queries need none.
 
     Args:
@@ -107,7 +105,6 @@ class DirectionalGP(PredictsVariance):
         if rows < 8:
             raise ValueError(f"directional_gp: rows must be at least 8, got {rows}")
         self.row_limit, self.seed = rows, seed
-        self.site: Site | None = None
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -120,7 +117,9 @@ class DirectionalGP(PredictsVariance):
         refuse(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
-        known = _subsample(np.concatenate([fold.train, fold.val]), self.seed)
+        known = np.concatenate([fold.train, fold.val])
+        if len(known) > MAX_RECEIVERS:
+            known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
         places = data.rx_position[known].astype(np.float64)
         rays = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
         found = Rays.of(places, rays)
@@ -154,26 +153,23 @@ class DirectionalGP(PredictsVariance):
         """Places (K, 3) float64 [m] in the regression's frame."""
         return self.positions.points
 
+    def _few(self, limit: int) -> tuple[Tensor, Rows]:
+        """Every so many-th row, at most `limit`: indices and rows."""
+        some = torch.arange(0, len(self.rows), max(1, -(-len(self.rows) // limit)))
+        return some, self.rows.take(some)
+
     def _refine_positions(self) -> None:
         """Refine positions by the phases of the channels, where directions leave them uncertain."""
-        step = max(1, -(-len(self.rows) // REFINEMENT_ROWS))
-        some = torch.arange(0, len(self.rows), step)
-        rows = self.rows.take(some)
+        some, rows = self._few(REFINEMENT_ROWS)
         correlation = REFINEMENT_KERNEL.correlation(rows.position, rows.position)
         self.positions = PositionRefinement(
             rows, self.visibility.seen[self.observer[some]].float(), self.positions, correlation
         ).run()
 
     def _refit(self) -> None:
-        self._learn()
-        self._prepare()
-
-    def _learn(self) -> None:
         """Powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
-        step = max(1, -(-len(self.rows) // SELECTION_ROWS))
-        some = torch.arange(0, len(self.rows), step)
-        rows, observer = self.rows.take(some), self.observer[some]
-        waves = self._visible_waves(rows, observer)
+        some, rows = self._few(SELECTION_ROWS)
+        waves = self._visible_waves(rows, self.observer[some])
         uncertain = self.positions.uncertain(rows.position, rows.frequency)
         mean_power = float(waves.abs().square().sum(1).mean())
         self.power = torch.full((len(self.sources),), 1 / max(mean_power, 1e-30))
@@ -192,6 +188,7 @@ class DirectionalGP(PredictsVariance):
             mean = prior[:, None] * (waves.mH @ factor.alpha)
             known = (factor.root @ waves).abs().square().sum(0)
             self.power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(1e-12)
+        self._prepare()
 
     def _prepare(self) -> None:
         """Quantities derived from the state that queries need."""
@@ -200,13 +197,8 @@ class DirectionalGP(PredictsVariance):
         self.uncertain = self.positions.uncertain(rows.position, rows.frequency)
         self.phase_vectors = self.positions.only(self.uncertain).phase_vectors(rows.position, rows.frequency)
         correlation = self.kernel.correlation(rows.position, rows.position)
-        covariance = _covariance(
-            self.waves,
-            self.waves,
-            self.power,
-            self.uncertain,
-            coherence(self.phase_vectors, self.phase_vectors),
-        )
+        retained = coherence(self.phase_vectors, self.phase_vectors)
+        covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
         self.factor = Factor.with_noise(covariance * correlation, self.kernel.noise, rows.target)
 
         # (n, K, R), real and imaginary: what each row adds to each source's gain
@@ -214,7 +206,7 @@ class DirectionalGP(PredictsVariance):
         self.dual_weights = [part.contiguous() for part in (dual_weights.real, dual_weights.imag)]
 
     def _update_visibility(self) -> int:
-        """Update visibility by the channels (`visibility_update.py`); returns how many entries changed.
+        """Update visibility by the channels (see `flips`); returns how many entries changed.
 
         Only with one row per receiver: more of them determine the gains of their own receiver.
         """
@@ -259,13 +251,7 @@ class DirectionalGP(PredictsVariance):
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; the variance includes gains, noise and visibility."""
         query = self._query(tx, rx)
-        variance, prior = self._variance(query)
-        variance, prior = (v.reshape(query.count, -1).mean(1) for v in (variance, prior))
-        return Prediction(
-            self._sum(query),
-            confidence=(1 - variance / prior).clamp(0, 1),
-            variance=variance * self.frame.scale**2,
-        )
+        return self._prediction(self._sum(query), *self._variance(query))
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64."""
@@ -276,31 +262,25 @@ class DirectionalGP(PredictsVariance):
         tones = torch.from_numpy(self._fitted().tones())
         gains = query.probability[:, :, None] * self._gains(query)
         mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(query.away, tones))
-        tone_scale = (self.frame.carrier_hz / tones).float()
-        return (mean * (tone_scale * self.frame.scale)).reshape(query.count, self.antennas, len(tones))
+        return self._stored(mean, tones)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
         query = self._query(tx, rx)
         gain = query.probability * wave(query.away, self.frame.carrier_hz)
         gain = self._gains(query) * gain[:, :, None]
-        gain = (gain * self.frame.scale).movedim(1, -1).reshape(query.count, self.antennas, -1)
-        away = query.away.view(query.count, -1, len(self.sources))
-        delay = (away / LIGHT).expand(-1, self.antennas, -1)
         towards = self.sources - query.places.view(query.count, -1, 3).mean(1)[:, None]
-        towards = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
-        return gain, delay, towards, self.frame.carrier_hz
+        return self._stored_paths(gain.movedim(1, -1), query.away, towards)
 
     def _query(self, tx: Tensor, rx: Pose) -> QueryGeometry:
         """Query geometry of receivers, their antennas in the regression's frame."""
-        places = query_elements(self._fitted(), rx, len(tx), self.antennas)
-        flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
+        flat, count = self._places(tx, rx)
         phase_vectors = self.positions.only(self.uncertain).phase_vectors(
             flat, torch.tensor(self.frame.carrier_hz)
         )
         return QueryGeometry(
             flat,
-            len(places),
+            count,
             ranges(flat, self.sources),
             self.visibility.probability(flat).float(),
             self.kernel.correlation(flat, self.rows.position),
@@ -345,30 +325,25 @@ class DirectionalGP(PredictsVariance):
             group = torch.nonzero(self.observer == one).flatten()
             own = torch.linalg.solve(self.factor.inverse[group[:, None], group], self.factor.alpha[group])
             predicted[group] -= cross[group] @ (self.factor.inverse[:, group] @ own)
-        scale = (self.frame.carrier_hz / self.rows.frequency).float()[:, None] * self.frame.scale
-        return LeftOut(self.rows.receiver.numpy(), (self.rows.target - predicted) * scale)
+        return self._left_out(self.rows, predicted)
 
     # ---- state ----
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         self._fitted()
-        rows, seen = self.rows, self.visibility
         return {
-            "antennas": self.antennas,
-            "frame": [self.frame.middle, self.frame.scale, self.frame.carrier_hz],
-            "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
+            **self._frame_state(self.rows),
             "observer": self.observer,
             "sources": self.sources,
             "open": self.positions.covariance,
             "power": self.power,
-            "law": [self.kernel.constant, self.kernel.length, self.kernel.noise],
-            "sightings": [seen.places, seen.seen, seen.length, seen.weights, seen.left_out],
+            "law": [*vars(self.kernel).values()],
+            "sightings": [*vars(self.visibility).values()],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.antennas = site, int(state["antennas"])
-        self.frame, self.rows = Frame(*state["frame"]), Rows(*state["rows"])
+        self.rows = self._restore_frame(site, state)
         self.observer, self.power, points = state["observer"], state["power"], state["sources"]
         # older checkpoints have exact directions and no covariances
         self.positions = UncertainPositions(
@@ -380,18 +355,6 @@ class DirectionalGP(PredictsVariance):
     def size(self) -> int:
         """Sources."""
         return len(self.sources) if self.site is not None else 0
-
-    def _fitted(self) -> Site:
-        if self.site is None:
-            raise ValueError("directional_gp: not fitted yet; call fit or restore first")
-        return self.site
-
-
-def _subsample(known: np.ndarray, seed: int) -> np.ndarray:
-    """At most `MAX_RECEIVERS` rows."""
-    if len(known) <= MAX_RECEIVERS:
-        return known
-    return np.sort(np.random.default_rng(seed).choice(known, MAX_RECEIVERS, replace=False))
 
 
 def _covariance(first: Tensor, second: Tensor, power: Tensor, uncertain: Tensor, retained: Tensor) -> Tensor:

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc.multipath import refine_phase
 from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.multipath.refine_phase import fit_phases
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.search import Search, SearchSettings
-from gsparc.multipath.search_cache import SearchCache
+from gsparc.multipath.search_cache import Member, SearchCache
 
 log = logging.getLogger(__name__)
 
@@ -44,19 +44,6 @@ class Budget:
         return time.monotonic() - self.started
 
 
-@dataclass(frozen=True)
-class Member:
-    """Result of one search.
-
-    Attributes:
-        phased: the scene.
-        left_out: NMSE of its own rows, each receiver predicted from the others.
-    """
-
-    phased: PhasedScene
-    left_out: float
-
-
 def search_many(
     row_sets: list[Rows],
     transmitter: Tensor,
@@ -64,8 +51,8 @@ def search_many(
     seed: int,
     noise_floor: float,
     budget: Budget,
-    clutter: bool = False,
-    cache: SearchCache | None = None,
+    clutter: bool,
+    cache: SearchCache,
     stage: str = "search",
 ) -> list[Member]:
     """One search per set of rows, best first; at least one, others while the budget lasts.
@@ -80,26 +67,24 @@ def search_many(
         noise_floor: known variance of the noise, in units of the rows' power.
         budget: of all together.
         clutter: search for occluding boxes and finite mirrors, too.
-        cache: of finished searches, under the name of `stage`; None for no cache.
+        cache: of finished searches, under the name of `stage`.
         stage: distinguishes searches of one fit.
     """
     threads = torch.get_num_threads()
     errors: list[float] = []
 
     def search(number: int) -> Member | None:
-        done = None if cache is None else cache.find(f"{stage} {number}")
-        if done is not None:
+        if done := cache.find(f"{stage} {number}"):
             return done
-        if number > 0 and budget.spent > LAST_START * budget.seconds:
-            return None
-        if at_noise_floor(errors, noise_floor):
+        late = number > 0 and budget.spent > LAST_START * budget.seconds
+        if late or at_noise_floor(errors, noise_floor):
             return None
         rows = row_sets[number]
         deadline = budget.started + ROUNDS_END * budget.seconds
         scene = Search(rows, transmitter, settings, seed + number, deadline).run()
-        phased = fit_phases(
-            rows, PhasedScene.of(rows, scene, QUADRATURE), settings.visibility, noise_floor=noise_floor
-        )
+        phased = PhasedScene.of(rows, scene, QUADRATURE)
+        phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor)
+        phased = refine_phase.refine(rows, phased, 20, noise_floor)
         if clutter and phased.quadrature < 1:
             generator = torch.Generator().manual_seed(seed + number)
             latest = budget.started + budget.seconds
@@ -113,8 +98,7 @@ def search_many(
         )  # fmt: skip
         member = Member(phased, left_out)
         errors.append(left_out)
-        if cache is not None:
-            cache.put(f"{stage} {number}", member)
+        cache.put(f"{stage} {number}", member)
         return member
 
     # Parallel searches scale better than threaded factorisations of a few hundred rows.

@@ -1,14 +1,19 @@
-"""Normalisation of positions and targets for fitting, and back."""
+"""Normalisation of positions and targets for fitting, and back; what methods fitted in a frame share."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
+import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.multipath.rows import Rows
+from gsparc.methods.method import LeftOut, Prediction, PredictsVariance
+from gsparc.multipath.rows import Rows, query_elements
+from gsparc.ops import Pose
+from gsparc.physics.waves import LIGHT
 
 
 @dataclass(frozen=True)
@@ -28,7 +33,70 @@ class Frame:
     def inside(self, rows: Rows) -> Rows:
         """Rows in local metres and stored units, normalised."""
         flat = rows.target * (rows.frequency / self.carrier_hz)[:, None].float() / self.scale
-        return replace(rows.moved(-self.middle), target=flat)
+        return replace(rows, position=rows.position - self.middle, target=flat)
+
+
+class FramedMethod(PredictsVariance):
+    """A process on channels that is fitted in a frame.
+
+    Attributes:
+        site: None before `fit` and `restore`.
+        antennas: A, outputs of a measurement.
+        frame: of the fit.
+    """
+
+    site: Site | None = None
+    antennas: int
+    frame: Frame
+
+    def _fitted(self) -> Site:
+        if self.site is None or not self.size():
+            raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
+        return self.site
+
+    def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
+        """Antennas of the moving end (B E, 3) float64 in the frame, and B."""
+        site = self._fitted()
+        if site.moving_end == "rx":
+            places = query_elements(site, rx, len(tx), self.antennas)
+        else:
+            places = tx.detach().cpu().double().numpy()[:, None]
+        return torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle, len(places)
+
+    def _stored(self, mean: Tensor, tones: Tensor) -> Tensor:
+        """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
+        tone_scale = (self.frame.carrier_hz / tones).float()
+        return (mean * (tone_scale * self.frame.scale)).reshape(-1, self.antennas, len(tones))
+
+    def _prediction(self, mean: Tensor, variance: Tensor, prior: Tensor) -> Prediction:
+        """From the mean (B, A, K), and expected squared error and power (B E,), normalised."""
+        variance, prior = (v.reshape(len(mean), -1).mean(1) for v in (variance, prior))
+        confidence = (1 - variance / prior).clamp(0, 1)
+        return Prediction(mean, confidence=confidence, variance=variance * self.frame.scale**2)
+
+    def _stored_paths(
+        self, gain: Tensor, away: Tensor, towards: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, float]:
+        """See `ImageSourceGP.paths`; of gains (B E, R, N), ranges (B E, N) [m], offsets (B, N, 3) [m]."""
+        count = len(towards)
+        gain = (gain * self.frame.scale).reshape(count, self.antennas, -1)
+        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
+        unit = towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True)
+        return gain, delay, unit, self.frame.carrier_hz
+
+    def _left_out(self, rows: Rows, predicted: Tensor, constant: bool = False) -> LeftOut:
+        """See `LeaveOneOut`; of normalised predictions (n, R) of the rows."""
+        scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
+        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale, constant)
+
+    def _frame_state(self, rows: Rows) -> dict[str, Any]:
+        """Antennas, frame and rows."""
+        frame, columns = ([*vars(each).values()] for each in (self.frame, rows))
+        return {"antennas": self.antennas, "frame": frame, "rows": columns}
+
+    def _restore_frame(self, site: Site, state: dict[str, Any]) -> Rows:
+        self.site, self.antennas, self.frame = site, int(state["antennas"]), Frame(*state["frame"])
+        return Rows(*state["rows"])
 
 
 def frame_of(site: Site, rows: Rows) -> Frame:

@@ -17,7 +17,7 @@ from torch import Tensor
 from gsparc.multipath.clutter.blocking import Clutter, visible_share
 from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, View
+from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Word, images
 from gsparc.physics.waves import ranges, wave
 
@@ -93,12 +93,7 @@ def steering(rows: Rows, sources: Tensor) -> Tensor:
 
 def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
     """Visibility correlations (K, n, n) float32."""
-    return torch.stack([_correlation(rows, source, kernel) for source in sources])
-
-
-def _correlation(rows: Rows, source: Tensor, kernel: KernelVisibility) -> Tensor:
-    view = View.of(rows.position, source)
-    return kernel.correlation(view, view)
+    return torch.stack([kernel.correlation(rows.position, source) for source in sources])
 
 
 def add_covariance(real: Tensor, imag: Tensor, scaled: Tensor, correlation: Tensor) -> None:
@@ -150,6 +145,11 @@ class Factor:
         """K^-1 (n, n)."""
         return torch.cholesky_inverse(self.lower)
 
+    @cached_property
+    def slope(self) -> Tensor:
+        """G = R K^-1 - alpha alpha^H (n, n): d nll = trace(G dK)."""
+        return self.alpha.shape[1] * self.inverse - self.alpha @ self.alpha.mH
+
 
 class Posterior:
     """Posterior of a scene's gains given rows."""
@@ -169,13 +169,10 @@ class Posterior:
         real, imag = torch.zeros(n, n), torch.zeros(n, n)
         scaled = self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
-            add_covariance(real, imag, scaled[:, k], self.correlation(source))
+            correlation = self.scene.visibility.correlation(self.rows.position, source)
+            add_covariance(real, imag, scaled[:, k], correlation)
         real.diagonal().add_(torch.tensor(self.scene.log_noise).exp() + self.noise_floor)
         return torch.complex(real, imag)
-
-    def correlation(self, source: Tensor) -> Tensor:
-        """Visibility correlation (n, n) of one source (3,)."""
-        return _correlation(self.rows, source, self.scene.visibility)
 
     @cached_property
     def factor(self) -> Factor:
@@ -192,5 +189,6 @@ class Posterior:
         scaled = self.waves[:, k] * self.scene.log_amplitude[k].exp()
         n = len(self.rows)
         real, imag = torch.zeros(n, n), torch.zeros(n, n)
-        add_covariance(real, imag, scaled, self.correlation(self.scene.sources[k]))
+        correlation = self.scene.visibility.correlation(self.rows.position, self.scene.sources[k])
+        add_covariance(real, imag, scaled, correlation)
         return Factor.of(self.covariance - torch.complex(real, imag), self.rows.target).nll

@@ -15,9 +15,8 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction, PredictsVariance
+from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.pareto import Settings
-from gsparc.multipath.clutter.blocking import Clutter
 from gsparc.multipath.diffraction import (
     Edges,
     diffracted,
@@ -26,20 +25,18 @@ from gsparc.multipath.diffraction import (
     fit_edge_gains,
     subtract_edges,
 )
-from gsparc.multipath.ensemble import Budget, Member, at_noise_floor, ensemble_weights, search_many
-from gsparc.multipath.frame import Frame, frame_of, refuse
-from gsparc.multipath.gp_likelihood import Scene
+from gsparc.multipath.ensemble import Budget, at_noise_floor, ensemble_weights, search_many
+from gsparc.multipath.frame import FramedMethod, frame_of, refuse
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import Query
 from gsparc.multipath.reduce import reduced
-from gsparc.multipath.rows import Rows, elements, gather, query_elements
+from gsparc.multipath.rows import Rows, elements, gather
 from gsparc.multipath.search import SearchSettings
-from gsparc.multipath.search_cache import SearchCache
+from gsparc.multipath.search_cache import Member, SearchCache
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
-from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.ops import Pose
-from gsparc.physics.waves import LIGHT, ranges, wave, wave_over_band
+from gsparc.physics.waves import ranges, wave, wave_over_band
 
 log = logging.getLogger(__name__)
 
@@ -51,7 +48,7 @@ ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are es
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
 
 
-class ImageSourceGP(PredictsVariance):
+class ImageSourceGP(FramedMethod):
     """Image-source Gaussian process for a moving receiver, or a moving transmitter and one antenna.
 
     Args:
@@ -96,7 +93,6 @@ class ImageSourceGP(PredictsVariance):
         self.edges = Edges.none()
         self.search_rows, self.row_limit = search_rows, rows
         self.settings = SearchSettings(margin=margin, max_sources=max_sources, order=order)
-        self.site: Site | None = None
         self.members: list[PhasedPosterior] = []
 
     # ---- fitting ----
@@ -118,12 +114,13 @@ class ImageSourceGP(PredictsVariance):
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
-        cache = SearchCache(context.run_dir, context.resume, self._key(data, known), _scene_state, _scene)
+        cache = SearchCache(context.run_dir, context.resume, self._key(data, known))
         started -= cache.spent_s
         budget = Budget(started, self._budget(len(known), context.budget_s))
-        found = self._search(data, known, self.settings, self.searches, budget, self.clutter, cache)
+        row_sets = self._row_sets(data, known, self.searches)
+        found = self._search(row_sets, self.settings, budget, self.clutter, cache)
         if self.look_for_edges:
-            found, held = self._search_with_edges(data, known, found, held, cache, budget)
+            found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
@@ -156,32 +153,17 @@ class ImageSourceGP(PredictsVariance):
         return min(max(SECONDS_PER_ROW * measurements**1.5, MIN_BUDGET_S), MAX_BUDGET_S)
 
     def _search(
-        self,
-        data: Measurements,
-        known: np.ndarray,
-        settings: SearchSettings,
-        count: int,
-        budget: Budget,
-        clutter: bool = False,
-        cache: SearchCache | None = None,
-    ) -> list[Member]:
-        row_sets = [self._rows(data, known, self.search_rows, self.seed + i) for i in range(count)]
-        transmitter = self._transmitter(data.site)
-        return search_many(
-            row_sets, transmitter, settings, self.seed, self.noise_floor, budget, clutter, cache
-        )
+        self, row_sets: list[Rows], settings: SearchSettings, budget: Budget, clutter: bool,
+        cache: SearchCache, stage: str = "search",
+    ) -> list[Member]:  # fmt: skip
+        transmitter, floor = self._transmitter(), self.noise_floor
+        return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, stage)
 
     def _search_with_edges(
-        self,
-        data: Measurements,
-        known: np.ndarray,
-        found: list[Member],
-        held: Rows,
-        cache: SearchCache,
-        budget: Budget,
+        self, row_sets: list[Rows], found: list[Member], held: Rows, cache: SearchCache, budget: Budget
     ) -> tuple[list[Member], Rows]:
         """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
-        scene, rows = found[0].phased.scene, self._rows(data, known, self.search_rows, self.seed)
+        scene, rows = found[0].phased.scene, row_sets[0]
         transmitter, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
         edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor)
         if not len(edges):
@@ -189,12 +171,8 @@ class ImageSourceGP(PredictsVariance):
         log.info("%d edges; searching again on the residual", len(edges))
         remaining = max(budget.seconds - budget.spent, EDGE_BUDGET * budget.seconds)
         budget = Budget(time.monotonic(), remaining)
-        row_sets = [self._rows(data, known, self.search_rows, self.seed + i) for i in range(self.searches)]
         row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
-        with_edges = search_many(
-            row_sets, self._transmitter(data.site), self.settings, self.seed, self.noise_floor, budget,
-            self.clutter, cache, "beside edges",
-        )  # fmt: skip
+        with_edges = self._search(row_sets, self.settings, budget, self.clutter, cache, "beside edges")
         power = float(row_sets[0].target.abs().square().mean())  # leave-one-out errors are relative to it
         # the edges' gains were fitted to every row: ask for a clear margin
         if with_edges[0].left_out * power > MAX_EDGE_ERROR * found[0].left_out:
@@ -203,24 +181,24 @@ class ImageSourceGP(PredictsVariance):
         self.edges = fit_edge_gains(held, edges.point, edges.axis, scene, self.noise_floor)
         return with_edges, subtract_edges(held, self.edges, scene.transmitter)
 
-    def _rows(self, data: Measurements, known: np.ndarray, limit: int, seed: int) -> Rows:
-        return self.frame.inside(gather(data, known, limit, seed))
+    def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
+        seeds = range(self.seed, self.seed + count)
+        return [self.frame.inside(gather(data, known, self.search_rows, seed)) for seed in seeds]
 
-    def _transmitter(self, site: Site) -> Tensor:
-        assert site.static_position is not None
-        return torch.from_numpy(np.asarray(site.static_position, np.float64)) - self.frame.middle
+    def _transmitter(self) -> Tensor:
+        assert self.site is not None and self.site.static_position is not None
+        return torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
 
     def _without_offsets(self, data: Measurements, known: np.ndarray) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        transmitter = self._transmitter(data.site)
-        aligned = self._remove_offsets(data, known, transmitter[None], torch.ones(1, self.antennas))
+        aligned = self._remove_offsets(data, known, self._transmitter()[None], torch.ones(1, self.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
-            now = Budget(time.monotonic(), MIN_BUDGET_S)
-            phased = self._search(aligned, known, few, 1, now)[0].phased
+            now, rows = Budget(time.monotonic(), MIN_BUDGET_S), self._row_sets(aligned, known, 1)
+            phased = self._search(rows, few, now, False, SearchCache())[0].phased
             for _ in range(ALIGNMENT_ROUNDS):
-                rows = self._rows(aligned, known, self.search_rows, self.seed)
-                gains = PhasedPosterior(rows, phased, self.noise_floor).mean_gains
+                rows = self._row_sets(aligned, known, 1)
+                gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains
                 aligned = self._remove_offsets(data, known, phased.scene.sources, gains)
         return aligned
 
@@ -252,24 +230,15 @@ class ImageSourceGP(PredictsVariance):
         The variance is the posterior's plus that of the ensemble; the confidence is the explained share of
         the expected power.
         """
-        site = self._fitted()
-        flat, count = self._places(tx, rx)
-        per = len(flat) // count
-        tones = torch.from_numpy(site.tones())
+        flat, _ = self._places(tx, rx)
+        tones = torch.from_numpy(self._fitted().tones())
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         if len(self.edges):
             stack = stack + self.edges.over_band(flat, tones, self.members[0].scene.transmitter)
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        tone_scale = (self.frame.carrier_hz / tones).float()
-        mean = (mean * (tone_scale * self.frame.scale)).reshape(count, self.antennas, len(tones))
-        variance, prior = (v.reshape(count, per).mean(1) for v in (variance, prior))
-        return Prediction(
-            mean,
-            confidence=(1 - variance / prior).clamp(0, 1),
-            variance=variance * self.frame.scale**2,
-        )
+        return self._prediction(self._stored(mean, tones), variance, prior)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums: one per source of every search, with the search's weight, and edges.
@@ -295,26 +264,14 @@ class ImageSourceGP(PredictsVariance):
             # elements differ in diffraction points: their mean
             met = met.view(count, -1, len(self.edges), 3).mean(1)
             towards = torch.cat([towards, met - middle[:, None]], 1)
-        gain = (gain * self.frame.scale).movedim(0, -1).reshape(count, self.antennas, -1)
-        delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, self.antennas, -1)
-        return gain, delay, towards / torch.linalg.vector_norm(towards, dim=-1, keepdim=True), carrier
-
-    def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
-        """Antennas of the moving end (B E, 3) float64 in the normalised frame, and B."""
-        site = self._fitted()
-        if site.moving_end == "rx":
-            places = query_elements(site, rx, len(tx), self.antennas)
-        else:
-            places = tx.detach().cpu().double().numpy()[:, None]
-        return torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle, len(places)
+        return self._stored_paths(gain.movedim(0, -1), away, towards)
 
     def leave_one_out(self) -> LeftOut:
         """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
         self._fitted()
-        rows, weight = self.members[0].rows, self.weights[:, None, None]
-        predicted = (weight * torch.stack([member.left_out() for member in self.members])).sum(0)
-        scale = (self.frame.carrier_hz / rows.frequency).float()[:, None] * self.frame.scale
-        return LeftOut(rows.receiver.numpy(), (rows.target - predicted) * scale, self.offsets != "none")
+        each = torch.stack([member.left_out() for member in self.members])
+        predicted = (self.weights[:, None, None] * each).sum(0)
+        return self._left_out(self.members[0].rows, predicted, self.offsets != "none")
 
     # ---- resume and reductions ----
     def resume_problem(self) -> str | None:
@@ -340,64 +297,23 @@ class ImageSourceGP(PredictsVariance):
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         self._fitted()
-        rows = self.members[0].rows
         return {
-            "antennas": self.antennas,
+            **self._frame_state(self.members[0].rows),
             "weights": self.weights,
             "noise_floor": self.noise_floor,
-            "frame": [self.frame.middle, self.frame.scale, self.frame.carrier_hz],
-            "rows": [rows.position, rows.frequency, rows.target, rows.receiver],
-            "edges": [self.edges.point, self.edges.axis, self.edges.gain],
-            "scenes": [_scene_state(member.phased) for member in self.members],
+            "edges": [*vars(self.edges).values()],
+            "scenes": [member.phased.state() for member in self.members],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.antennas = site, int(state["antennas"])
-        self.noise_floor = float(state["noise_floor"])
-        self.weights = state["weights"]
-        self.frame = Frame(*state["frame"])
-        rows = Rows(*state["rows"])
+        rows = self._restore_frame(site, state)
+        self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
         self.edges = Edges(*state["edges"]) if "edges" in state else Edges.none()
-        self.members = [PhasedPosterior(rows, _scene(stored), self.noise_floor) for stored in state["scenes"]]
+        scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
+        self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]
         self.query = Query(self.members)
 
     def size(self) -> int:
         """Sources of the largest scene."""
         return max((len(member.scene.words) for member in self.members), default=0) + len(self.edges)
-
-    def _fitted(self) -> Site:
-        if self.site is None or not self.members:
-            raise ValueError("image_source_gp: not fitted yet; call fit or restore first")
-        return self.site
-
-
-def _scene_state(phased: PhasedScene) -> dict[str, Any]:
-    scene = phased.scene
-    kernel = scene.visibility
-    return {
-        "transmitter": scene.transmitter,
-        "planes": scene.planes,
-        "words": [list(word) for word in scene.words],
-        "log_amplitude": scene.log_amplitude,
-        "log_noise": scene.log_noise,
-        "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
-        "phase": phased.phase,
-        "turning": phased.quadrature,
-        "boxes": scene.clutter.boxes,
-        "patches": scene.clutter.patches,
-        "patched": list(scene.clutter.plane),
-    }
-
-
-def _scene(state: dict[str, Any]) -> PhasedScene:
-    scene = Scene(
-        state["transmitter"],
-        state["planes"],
-        tuple(tuple(word) for word in state["words"]),
-        state["log_amplitude"],
-        float(state["log_noise"]),
-        KernelVisibility(*state["visibility"]),
-        Clutter(state["boxes"], state["patches"], tuple(state["patched"])),
-    )
-    return PhasedScene(scene, state["phase"], float(state["turning"]))

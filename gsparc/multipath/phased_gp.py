@@ -16,13 +16,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from gsparc.multipath.clutter.blocking import Clutter
 from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import View
+from gsparc.multipath.visibility_kernel import KernelVisibility
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,32 @@ class PhasedScene:
         posterior = Posterior(rows, scene)
         gain = (posterior.waves.mH @ posterior.factor.alpha).sum(1)
         return PhasedScene(scene, gain.angle(), quadrature if rows.target.shape[1] == 1 else 1.0)
+
+    def state(self) -> dict[str, Any]:
+        """Plain tensors and numbers."""
+        scene, kernel = self.scene, self.scene.visibility
+        return {
+            "transmitter": scene.transmitter,
+            "planes": scene.planes,
+            "words": [list(word) for word in scene.words],
+            "log_amplitude": scene.log_amplitude,
+            "log_noise": scene.log_noise,
+            "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
+            "phase": self.phase,
+            "turning": self.quadrature,
+            "boxes": scene.clutter.boxes,
+            "patches": scene.clutter.patches,
+            "patched": list(scene.clutter.plane),
+        }
+
+    @staticmethod
+    def from_state(state: dict[str, Any]) -> PhasedScene:
+        """Inverse of `state`."""
+        words, kernel = tuple(tuple(word) for word in state["words"]), KernelVisibility(*state["visibility"])
+        clutter = Clutter(state["boxes"], state["patches"], tuple(state["patched"]))
+        sources = (words, state["log_amplitude"], float(state["log_noise"]))
+        scene = Scene(state["transmitter"], state["planes"], *sources, kernel, clutter)
+        return PhasedScene(scene, state["phase"], float(state["turning"]))
 
     def waves(self, rows: Rows) -> Tensor:
         """w_k at the rows, (n, K) complex64."""
@@ -133,9 +161,9 @@ class PhasedPosterior:
         n, scene = len(self.rows), self.scene
         covariance = torch.zeros(2, n, 2, n)
         for k, source in enumerate(scene.sources):
-            view = View.of(self.rows.position, source)
             scaled = self.waves[:, k] * scene.log_amplitude[k].exp()
-            add_source(covariance, scaled, self.phased.quadrature, scene.visibility.correlation(view, view))
+            correlation = scene.visibility.correlation(self.rows.position, source)
+            add_source(covariance, scaled, self.phased.quadrature, correlation)
         noise = math.exp(scene.log_noise) + self.noise_floor
         covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)
         return RealFactor.of(covariance, self.rows.target)
@@ -157,18 +185,6 @@ class PhasedPosterior:
             * self.dual_weights.sum(1)
             * torch.polar(torch.ones(()), self.phased.phase)[:, None]
         )
-
-    def gains(self, places: Tensor) -> Tensor:
-        """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], attenuated by clutter."""
-        dual_weights, per_source = self.dual_weights, []
-        for k, source in enumerate(self.scene.sources):
-            here, there = View.of(places, source), View.of(self.rows.position, source)
-            correlation = self.scene.visibility.correlation(here, there)
-            per_source.append(
-                torch.complex(correlation @ dual_weights[k].real, correlation @ dual_weights[k].imag)
-            )
-        turn = torch.polar(self.scene.visible_share(places), self.phased.phase.expand(1, -1))
-        return torch.stack(per_source, 1) * turn[:, :, None]
 
     def left_out(self) -> Tensor:
         """Leave-one-receiver-out predictions (n, R) complex64.

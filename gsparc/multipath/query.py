@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,7 +13,7 @@ from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, shares, stacked
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import matern32
+from gsparc.multipath.visibility_kernel import directions, matern32
 from gsparc.physics.waves import ranges, wave_over_band
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
@@ -42,15 +42,16 @@ class PackedSources:
     def of(scenes: list[Scene], places: Tensor) -> PackedSources:
         """All sources of the scenes, in order."""
         sources = torch.cat([scene.sources for scene in scenes])
-        kernels, directions = torch.cat([_kernel_parameters(s) for s in scenes]), _directions(sources, places)
+        kernels = torch.cat([_kernel_parameters(scene) for scene in scenes])
+        packed = PackedSources(sources, kernels, places, directions(places, sources), None, None)
         if not any(len(scene.clutter) for scene in scenes):
-            return PackedSources(sources, kernels, places, directions, None, None)
+            return packed
         first = torch.tensor([0] + [len(scene.planes) for scene in scenes]).cumsum(0).tolist()
         unfolding = Unfolding.concatenate(
             [scene.unfolding.with_offset(start) for scene, start in zip(scenes, first, strict=False)]
         )
         obstacles = Obstacles.concatenate([Obstacles.of(s.clutter, s.planes, len(s.words)) for s in scenes])
-        return PackedSources(sources, kernels, places, directions, unfolding, obstacles)
+        return replace(packed, unfolding=unfolding, obstacles=obstacles)
 
     def visible_share(self, queries: Tensor) -> Tensor:
         """Visible share of each source from queries (m, 3) [m]: (K, m), or (1, 1) for all."""
@@ -60,7 +61,7 @@ class PackedSources:
 
     def correlation(self, queries: Tensor) -> Tensor:
         """Visibility correlations (K, m, n) between queries (m, 3) float64 [m] and the places."""
-        cosine = torch.bmm(_directions(self.sources, queries), self.directions.mT)
+        cosine = torch.bmm(directions(queries, self.sources), self.directions.mT)
         constant, by_angle, by_length = (self.kernel[:, i, None, None] for i in range(3))
         apart = torch.cdist(queries, self.places).square().float()
         squared = (2 - 2 * cosine).clamp_min(0) * by_angle + apart * by_length
@@ -144,8 +145,3 @@ def _kernel_parameters(scene: Scene) -> Tensor:
     kernel = scene.visibility
     numbers = [float(kernel.constant), float(kernel.angle) ** -2, float(kernel.length) ** -2]
     return torch.tensor(numbers).expand(len(scene.words), 3)
-
-
-def _directions(sources: Tensor, places: Tensor) -> Tensor:
-    offset = places[None] - sources[:, None]
-    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).float()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gsparc.multipath.adam import descend
 from gsparc.multipath.gp_likelihood import (
     JITTER,
     Factor,
@@ -19,57 +19,69 @@ from gsparc.multipath.gp_likelihood import (
     steering,
 )
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, View
+from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
 
 # Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
 REFRESH = 16
+BETA1, BETA2 = 0.8, 0.95  # decay rates of Adam's moments, for tens of steps
+DECAY_AFTER, DECAY = 0.6, 0.3  # smaller steps for the last 40 %
+TRANSMITTER_STEP = 0.0004  # [m]; small, its position is measured
+PLANE_STEP = (0.0012, 0.0012, 0.0012, 0.004)  # of a plane's unit normal, and along it [m]
+STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
+SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
+
+Objective = Callable[[list[Tensor], Tensor], tuple[float, list[Tensor]]]
 
 
-@dataclass(frozen=True)
-class StepSizes:
-    """Step sizes of Adam.
+def descend(
+    rows: Rows, scene: Scene, steps: int, objective: Objective, *more: Tensor
+) -> tuple[Scene, list[Tensor]]:
+    """The best scene, and the best of `more` parameters [rad], by Adam (D. P. Kingma and J. Ba, ICLR 2015).
 
-    Attributes:
-        offset: of a plane along its normal [m].
-        normal: of a plane's unit normal.
-        transmitter: [m]; small, its position is measured.
-        logarithm: of amplitudes and noise.
+    Args:
+        rows: measurements.
+        scene: start.
+        steps: at least 0.
+        objective: transmitter, planes, log amplitudes, log noise and `more`, and visibility correlations
+            (K, n, n), to the objective and its derivatives.
+        more: start of parameters beside the scene's.
     """
-
-    offset: float = 0.004
-    normal: float = 0.0012
-    transmitter: float = 0.0004
-    logarithm: float = 0.05
-
-
-def rates(step_sizes: StepSizes) -> list[Tensor]:
-    """Step sizes of transmitter, planes, log amplitudes and log noise."""
-    return [
-        torch.tensor(step_sizes.transmitter, dtype=torch.float64),
-        torch.tensor([*[step_sizes.normal] * 3, step_sizes.offset], dtype=torch.float64),
-        torch.tensor(step_sizes.logarithm),
-        torch.tensor(step_sizes.logarithm),
-    ]
-
-
-def refine(
-    rows: Rows, scene: Scene, steps: int, step_sizes: StepSizes = StepSizes(), noise_floor: float = JITTER
-) -> Scene:
-    """The best scene of `steps` steps."""
-    correlation = torch.empty(0)
-
-    def objective(step: int, values: list[Tensor]) -> tuple[float, list[Tensor]]:
-        nonlocal correlation
+    values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), *more]
+    rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
+    rates += [torch.tensor(STEP)] * (len(values) - 2)
+    first, second = [torch.zeros_like(v) for v in values], [torch.zeros_like(v) for v in values]
+    best, lowest, correlation = values, math.inf, torch.empty(0)
+    for step in range(steps + 1):
         if step % REFRESH == 0:
             correlation = correlations(rows, images(values[0], values[1], scene.words), scene.visibility)
-        return _likelihood(rows, scene, values, correlation, noise_floor)
-
-    start = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise)]
-    best = descend(start, rates(step_sizes), steps, objective)
-    return replace(
+        value, gradient = objective(values, correlation)
+        if value < lowest:
+            lowest, best = value, values
+        if step == steps:
+            break
+        decay = 1.0 if step < DECAY_AFTER * steps else DECAY
+        moved = []
+        for i, g in enumerate(gradient):
+            first[i] = BETA1 * first[i] + (1 - BETA1) * g
+            second[i] = BETA2 * second[i] + (1 - BETA2) * g * g
+            mean = first[i] / (1 - BETA1 ** (step + 1))
+            size = (second[i] / (1 - BETA2 ** (step + 1))).sqrt() + 1e-9
+            moved.append(values[i] - decay * rates[i] * mean / size)
+        values = moved
+    found = replace(
         scene, transmitter=best[0], planes=best[1], log_amplitude=best[2], log_noise=float(best[3])
     )
+    return found, best[4:]
+
+
+def refine(rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER) -> Scene:
+    """The best scene of `steps` steps."""
+
+    def objective(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
+        return _likelihood(rows, scene, values, correlation, noise_floor)
+
+    return descend(rows, scene, steps, objective)[0]
 
 
 def _likelihood(
@@ -86,8 +98,7 @@ def _likelihood(
         add_covariance(real, imag, scaled[:, k], correlation[k])
     real.diagonal().add_(noise + noise_floor)
     factor = Factor.of(torch.complex(real, imag), rows.target)
-    slope = rows.target.shape[1] * factor.inverse - factor.alpha @ factor.alpha.mH
-    slope_re, slope_im = slope.real.contiguous(), slope.imag.contiguous()
+    slope_re, slope_im = factor.slope.real.contiguous(), factor.slope.imag.contiguous()
     weighted = torch.empty_like(scaled)  # (G * C_k) s_k a_k
     for k in range(len(scene.words)):
         pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
@@ -97,15 +108,11 @@ def _likelihood(
     by_amplitude = 2 * (scaled.conj() * weighted).sum(0).real
     by_noise = noise * slope_re.diagonal().sum()
     by_wave = 2 * weighted * values[2].exp()
-    by_place = torch.autograd.grad(waves, [transmitter, planes], by_wave, allow_unused=True)
-    zeros = [torch.zeros_like(transmitter), torch.zeros_like(planes)]
-    places = [z if g is None else g for g, z in zip(by_place, zeros, strict=True)]
+    places = torch.autograd.grad(waves, [transmitter, planes], by_wave, materialize_grads=True)
     return factor.nll, [*places, by_amplitude, by_noise]
 
 
-def learn_visibility(
-    rows: Rows, scene: Scene, steps: int, start: KernelVisibility, spread: float = 0.5
-) -> Scene:
+def learn_visibility(rows: Rows, scene: Scene, steps: int, start: KernelVisibility) -> Scene:
     """Parameters of the visibility kernel by likelihood, with a log-normal prior about `start`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet.
@@ -114,37 +121,17 @@ def learn_visibility(
         rows: a few hundred are enough.
         steps: of Adam.
         start: centre of the prior.
-        spread: standard deviation of the prior in logarithms (and the logit of `constant`).
     """
-    kernel = scene.visibility
-    centre, value = _logarithms(start), _logarithms(kernel).requires_grad_()
+    centre, value = start.parameters(0.02), scene.visibility.parameters(0.02).requires_grad_()
     optimizer = torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.95))
     for _ in range(steps):
-        current = replace(scene, visibility=_kernel(value.detach()))
-        posterior = Posterior(rows, current)
-        factor = posterior.factor
-        slope = rows.target.shape[1] * factor.inverse - factor.alpha @ factor.alpha.mH
+        posterior = Posterior(rows, replace(scene, visibility=KernelVisibility.of(value.detach())))
+        slope = posterior.factor.slope
         scaled = posterior.waves * scene.log_amplitude.exp()
         optimizer.zero_grad()
-        for k, source in enumerate(current.sources):
-            view = View.of(rows.position, source)
+        for k, source in enumerate(scene.sources):
             weight = (slope.conj() * scaled[:, k, None] * scaled[:, k].conj()).real
-            (weight * _kernel(value).correlation(view, view)).sum().backward()
-        ((value - centre).square().sum() / spread**2).backward()
+            (weight * KernelVisibility.of(value).correlation(rows.position, source)).sum().backward()
+        ((value - centre).square().sum() / SPREAD**2).backward()
         optimizer.step()
-    return replace(scene, visibility=KernelVisibility(*(float(v) for v in _parameters(value.detach()))))
-
-
-def _logarithms(kernel: KernelVisibility) -> Tensor:
-    constant = min(max(float(kernel.constant), 0.02), 0.995)
-    return torch.tensor(
-        [math.log(constant / (1 - constant)), math.log(kernel.angle), math.log(kernel.length)]
-    )
-
-
-def _parameters(value: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    return torch.sigmoid(value[0]), value[1].exp(), value[2].exp()
-
-
-def _kernel(value: Tensor) -> KernelVisibility:
-    return KernelVisibility(*_parameters(value))
+    return replace(scene, visibility=KernelVisibility.of(value.detach()).plain())

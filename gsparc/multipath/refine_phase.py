@@ -2,46 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from gsparc.multipath.adam import descend
-from gsparc.multipath.gp_likelihood import JITTER, correlations, steering
+from gsparc.multipath.gp_likelihood import JITTER, steering
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene, RealFactor, add_source, shares, stacked
-from gsparc.multipath.refine import REFRESH, StepSizes, rates
+from gsparc.multipath.refine import SPREAD, descend
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import KernelVisibility, View
+from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
-
-PHASE_STEP = 0.05  # [rad]
-
-
-def fit_phases(
-    rows: Rows,
-    phased: PhasedScene,
-    start: KernelVisibility,
-    rounds: int = 1,
-    steps: int = 20,
-    noise_floor: float = JITTER,
-) -> PhasedScene:
-    """Alternate between the visibility kernel's parameters and all others.
-
-    Args:
-        rows: of a search.
-        phased: from the search.
-        start: centre of the prior on the visibility.
-        rounds, steps: rounds of `steps` steps each.
-        noise_floor: known variance of the noise, in units of the rows' power.
-    """
-    centre = phased.quadrature
-    for _ in range(rounds):
-        phased = learn_visibility(rows, phased, steps // 2, start, centre, noise_floor=noise_floor)
-        phased = refine(rows, phased, steps, noise_floor)
-    return phased
 
 
 def refine(
@@ -52,13 +24,9 @@ def refine(
     prior: Callable[[Tensor], Tensor] | None = None,
 ) -> PhasedScene:
     """The best phased scene of `steps` steps; `prior` is a negative log prior of phases (K,)."""
-    scene, correlations_of = phased.scene, torch.empty(0)
 
-    def objective(step: int, values: list[Tensor]) -> tuple[float, list[Tensor]]:
-        nonlocal correlations_of
-        if step % REFRESH == 0:
-            correlations_of = correlations(rows, images(values[0], values[1], scene.words), scene.visibility)
-        nll, gradient = _likelihood(rows, phased, values, correlations_of, noise_floor)
+    def objective(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
+        nll, gradient = _likelihood(rows, phased, values, correlation, noise_floor)
         if prior is not None:
             with torch.enable_grad():
                 phase = values[4].detach().requires_grad_()
@@ -67,18 +35,12 @@ def refine(
             nll += cost.item()
         return nll, gradient
 
-    start = [
-        scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), phased.phase,
-    ]  # fmt: skip
-    best = descend(start, [*rates(StepSizes()), torch.tensor(PHASE_STEP)], steps, objective)
-    moved = replace(
-        scene, transmitter=best[0], planes=best[1], log_amplitude=best[2], log_noise=float(best[3])
-    )
-    return replace(phased, scene=moved, phase=best[4])
+    scene, (phase,) = descend(rows, phased.scene, steps, objective, phased.phase)
+    return replace(phased, scene=scene, phase=phase)
 
 
 def _likelihood(
-    rows: Rows, phased: PhasedScene, values: list[Tensor], correlations_of: Tensor, noise_floor: float
+    rows: Rows, phased: PhasedScene, values: list[Tensor], correlation: Tensor, noise_floor: float
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its derivatives by transmitter, planes, amplitudes, noise, phases."""
     words, n = phased.scene.words, len(rows)
@@ -89,7 +51,7 @@ def _likelihood(
     noise = values[3].exp()
     covariance = torch.zeros(2, n, 2, n)
     for k in range(len(words)):
-        add_source(covariance, scaled[:, k], phased.quadrature, correlations_of[k])
+        add_source(covariance, scaled[:, k], phased.quadrature, correlation[k])
     covariance.view(2 * n, 2 * n).diagonal().add_((noise + noise_floor) / 2)
     factor = RealFactor.of(covariance, rows.target)
     slope = factor.slope
@@ -97,83 +59,59 @@ def _likelihood(
     weighted = torch.empty_like(scaled)
     for k in range(len(words)):
         pair = torch.stack(stacked(scaled[:, k]), 1) * shares(phased.quadrature)
-        by = (blocks * correlations_of[k][None, :, None, :]).view(2 * n, 2 * n) @ pair
+        by = (blocks * correlation[k][None, :, None, :]).view(2 * n, 2 * n) @ pair
         # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
         weighted[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
     by_amplitude = (scaled.conj() * weighted).sum(0).real
     by_noise = noise * slope.diagonal().sum() / 4
     leaves = [transmitter, planes, phase]
-    objective = torch.autograd.grad(waves, leaves, weighted * values[2].exp(), allow_unused=True)
-    places = [torch.zeros_like(v) if g is None else g for g, v in zip(objective, leaves, strict=True)]
-    return factor.nll, [places[0], places[1], by_amplitude, by_noise, places[2]]
+    *places, by_phase = torch.autograd.grad(waves, leaves, weighted * values[2].exp(), materialize_grads=True)
+    return factor.nll, [*places, by_amplitude, by_noise, by_phase]
 
 
 def learn_visibility(
-    rows: Rows,
-    phased: PhasedScene,
-    steps: int,
-    start: KernelVisibility,
-    quadrature: float,
-    spread: float = 0.5,
-    noise_floor: float = JITTER,
+    rows: Rows, phased: PhasedScene, steps: int, start: KernelVisibility, noise_floor: float = JITTER
 ) -> PhasedScene:
-    """Parameters of the visibility kernel and `quadrature` by likelihood, with a prior about `start`.
+    """Parameters of the visibility kernel and `quadrature` by likelihood.
+
+    The prior is about `start` and the present `quadrature` (which stays at 1) in logarithms and logits.
 
     Args:
         rows: a few hundred are enough.
         phased: start.
         steps: of Adam.
-        start, quadrature: centre of the prior; turning = 1 stays.
-        spread: standard deviation of the prior in logarithms and logits (twice that for `quadrature`).
-        noise_floor: as in `fit_phases`.
+        start: centre of the prior.
+        noise_floor: known variance of the noise, in units of the rows' power.
     """
-    kernel, n = phased.scene.visibility, len(rows)
-    centre = _parameters_of(start, quadrature)
-    value = _parameters_of(kernel, phased.quadrature).requires_grad_()
-    width = torch.tensor([spread, spread, spread, 2 * spread])
+    n, scene, free = len(rows), phased.scene, phased.quadrature < 1
+    centre = start.parameters(0.005, phased.quadrature)
+    value = scene.visibility.parameters(0.005, phased.quadrature).requires_grad_()
+    width = torch.tensor([SPREAD, SPREAD, SPREAD, 2 * SPREAD])
     optimizer = torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.95))
+
+    def current() -> PhasedScene:
+        kernel = KernelVisibility.of(value.detach()).plain()
+        kept = float(torch.sigmoid(value.detach()[3])) if free else 1.0
+        return replace(phased, scene=replace(scene, visibility=kernel), quadrature=kept)
+
     for _ in range(steps):
-        current = _with_parameters(phased, value.detach(), quadrature)
-        posterior = PhasedPosterior(rows, current, noise_floor)
+        posterior = PhasedPosterior(rows, current(), noise_floor)
         slope = posterior.factor.slope
-        scaled = posterior.waves * current.scene.log_amplitude.exp()
-        share = (torch.sigmoid(value[3]) if quadrature < 1 else torch.ones(())) / 2
+        scaled = posterior.waves * scene.log_amplitude.exp()
+        share = (torch.sigmoid(value[3]) if free else torch.ones(())) / 2
         loss = ((value - centre) / width).square().sum() / 2
-        for k, source in enumerate(current.scene.sources):
-            view = View.of(rows.position, source)
-            p, q = stacked(scaled[:, k])
-            along, across = (_folded(slope, z, n) for z in (p, q))
-            correlation = _kernel(value).correlation(view, view)
-            loss = (
-                loss + ((1 - share) * (along * correlation).sum() + share * (across * correlation).sum()) / 2
-            )
+        for k, source in enumerate(scene.sources):
+            along, across = (_folded(slope, z, n) for z in stacked(scaled[:, k]))
+            correlation = KernelVisibility.of(value).correlation(rows.position, source)
+            gain = (1 - share) * (along * correlation).sum() + share * (across * correlation).sum()
+            loss = loss + gain / 2
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    return _with_parameters(phased, value.detach(), quadrature)
+    return current()
 
 
 def _folded(slope: Tensor, z: Tensor, n: int) -> Tensor:
     """`sum_ab G_ab z_a z_b` over the real and imaginary halves, (n, n)."""
     weighted = slope * z[:, None] * z
     return weighted[:n, :n] + weighted[:n, n:] + weighted[n:, :n] + weighted[n:, n:]
-
-
-def _with_parameters(phased: PhasedScene, value: Tensor, quadrature: float) -> PhasedScene:
-    kernel = KernelVisibility(*(float(v) for v in (torch.sigmoid(value[0]), value[1].exp(), value[2].exp())))
-    kept = float(torch.sigmoid(value[3])) if quadrature < 1 else 1.0
-    return PhasedScene(replace(phased.scene, visibility=kernel), phased.phase, kept)
-
-
-def _parameters_of(kernel: KernelVisibility, quadrature: float) -> Tensor:
-    logs = [math.log(kernel.angle), math.log(kernel.length)]
-    return torch.tensor([_logit(float(kernel.constant)), *logs, _logit(quadrature)])
-
-
-def _logit(share: float) -> float:
-    share = min(max(share, 0.005), 0.995)
-    return math.log(share / (1 - share))
-
-
-def _kernel(value: Tensor) -> KernelVisibility:
-    return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())

@@ -35,10 +35,6 @@ class Rows:
         """The rows with these numbers."""
         return Rows(self.position[index], self.frequency[index], self.target[index], self.receiver[index])
 
-    def moved(self, shift: Tensor) -> Rows:
-        """The same rows with (3,) [m] added to every place."""
-        return Rows(self.position + shift, self.frequency, self.target, self.receiver)
-
 
 def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
     """Places (S, E, 3) float64 [m] of the antennas; E = 1 when the array's geometry is not known."""

@@ -15,6 +15,7 @@ from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
 from gsparc.multipath.refine import learn_visibility, refine
 from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogonal_walls, prune, reassign
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.source_types import box_of
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
 from gsparc.physics.waves import LIGHT
@@ -79,8 +80,7 @@ class Search:
         self.rows, self.settings, self.deadline = rows, settings, deadline
         self.generator = torch.Generator().manual_seed(seed)
         self.wavelength = LIGHT / float(rows.frequency.mean())
-        everything = torch.cat([rows.position, transmitter[None]])
-        self.box = torch.stack([everything.amin(0) - settings.margin, everything.amax(0) + settings.margin])
+        self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
         waves = steering(rows, transmitter[None])
         gain = (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
         self.scene = Scene(

@@ -5,22 +5,32 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from gsparc.data.files import whole_file
 from gsparc.methods.checkpoint import SEARCHES
-
-if TYPE_CHECKING:
-    from gsparc.multipath.ensemble import Member
-    from gsparc.multipath.phased_gp import PhasedScene
+from gsparc.multipath.phased_gp import PhasedScene
 
 log = logging.getLogger(__name__)
 
 FILE = "last.ckpt"
+
+
+@dataclass(frozen=True)
+class Member:
+    """Result of one search.
+
+    Attributes:
+        phased: the scene.
+        left_out: NMSE of its own rows, each receiver predicted from the others.
+    """
+
+    phased: PhasedScene
+    left_out: float
 
 
 class SearchCache:
@@ -30,7 +40,6 @@ class SearchCache:
         folder: of the run; None or an empty path for no cache.
         resume: file of an interrupted run, or None.
         key: hash of what searches depend on; a file of another key is refused.
-        pack, unpack: convert a scene to plain containers, and back.
 
     Attributes:
         spent_s: training time of the interrupted run up to its last finished search [s].
@@ -39,16 +48,9 @@ class SearchCache:
         ValueError: `resume` holds no searches, or those of other data or settings.
     """
 
-    def __init__(
-        self,
-        folder: Path | None,
-        resume: Path | None,
-        key: str,
-        pack: Callable[[PhasedScene], dict[str, Any]],
-        unpack: Callable[[dict[str, Any]], PhasedScene],
-    ) -> None:
+    def __init__(self, folder: Path | None = None, resume: Path | None = None, key: str = "") -> None:
         self._path = None if folder is None or folder == Path() else folder / FILE
-        self._key, self._pack, self._unpack = key, pack, unpack
+        self._key = key
         self._kept: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
         self.spent_s = 0.0
@@ -71,16 +73,14 @@ class SearchCache:
 
     def find(self, name: str) -> Member | None:
         """The finished search of this name, or None."""
-        from gsparc.multipath.ensemble import Member
-
         with self._lock:
             kept = self._kept.get(name)
-        return None if kept is None else Member(self._unpack(kept["scene"]), float(kept["left_out"]))
+        return None if kept is None else Member(PhasedScene.from_state(kept["scene"]), kept["left_out"])
 
     def put(self, name: str, member: Member) -> None:
         """Store a finished search; the file is written atomically."""
         with self._lock:
-            self._kept[name] = {"scene": self._pack(member.phased), "left_out": member.left_out}
+            self._kept[name] = {"scene": member.phased.state(), "left_out": member.left_out}
             if self._path is None:
                 return
             spent = time.monotonic() - self._started

@@ -22,6 +22,7 @@ from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import PathResponse
 from gsparc.methods.method import FitContext
+from gsparc.multipath.directional_gp import GainKernel
 from gsparc.multipath.gp_likelihood import Factor, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.rows import Rows, gather
@@ -81,13 +82,9 @@ def search_sources(data: Measurements, known: np.ndarray, offsets: str, seed: in
     )  # fmt: skip
     method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
     member, frame = method.members[0], method.frame
-    scene = member.scene
-    return Sources(
-        scene.sources + frame.middle,
-        scene.log_amplitude.double().exp().square(),
-        member.rows.moved(frame.middle),
-        frame.scale,
-    )
+    power = member.scene.log_amplitude.double().exp().square()
+    rows = replace(member.rows, position=member.rows.position + frame.middle)
+    return Sources(member.scene.sources + frame.middle, power, rows, frame.scale)
 
 
 def assumed_sources(data: Measurements, known: np.ndarray, means: Tensor, seed: int) -> Sources:
@@ -99,15 +96,6 @@ def assumed_sources(data: Measurements, known: np.ndarray, means: Tensor, seed: 
     rows = replace(rows, target=target / scale)
     power = steering(rows, means.double()).abs().square().mean(0).double()
     return Sources(means.double(), 1 / (len(means) * power), rows, scale)
-
-
-@dataclass(frozen=True)
-class GainKernel:
-    """Kernel of the gains over places: correlation length [m], constant share, noise."""
-
-    length: float
-    constant: float
-    noise: float
 
 
 UNIFORM_GAINS = GainKernel(length=2.0, constant=0.8, noise=0.1)  # without a search
@@ -122,7 +110,7 @@ def fit_gain_kernel(sources: Sources) -> GainKernel:
         for constant, noise in product(CONSTANTS, NOISES):
             matrix = covariance * (constant + (1 - constant) * varying)
             matrix.diagonal().add_(noise)
-            found[GainKernel(length, constant, noise)] = Factor.of(matrix, sources.rows.target).nll
+            found[GainKernel(constant, length, noise)] = Factor.of(matrix, sources.rows.target).nll
     return min(found, key=found.__getitem__)
 
 

@@ -1,7 +1,14 @@
-"""Visibility of sources, known at receivers by their directions of arrival and predicted elsewhere."""
+"""Visibility of sources, known at receivers by their directions of arrival and predicted elsewhere.
+
+Rays may be missing or spurious: each receiver's leave-one-out residual of the channels is compared with one
+source more or less. The prior odds that it sees a source come from its own ray, the rates of missed and
+spurious rays, and the leave-one-out visibility of its neighbours; the rates are estimated anew from the
+result.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +18,10 @@ from gsparc.multipath.visibility_kernel import matern32
 
 LENGTHS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)  # candidates for every source
 NOISES = (0.03, 0.1, 0.3, 1.0)  # candidates, in units of the process's variance
+SPURIOUS = 0.003  # initial share of the pairs without a path that have a ray
+MIN_RATE = 1e-3  # lower bound of either rate
+MAX_MISSED = 0.2  # upper bound of the initial share of paths without a ray
+MIN_PROBABILITY = 0.02  # bound of the neighbours' probabilities
 
 
 @dataclass(frozen=True)
@@ -64,3 +75,53 @@ class VisibilityGP:
             of = self.length == length
             predicted[:, of] += matern32((apart / length).square()) @ self.weights[:, of]
         return predicted.clamp(0, 1)
+
+
+@dataclass(frozen=True)
+class RayErrorRates:
+    """Error rates of measured rays.
+
+    Attributes:
+        missed: share of the paths that have no ray.
+        spurious: share of the pairs without a path that have one.
+    """
+
+    missed: float
+    spurious: float
+
+    @staticmethod
+    def first(rays: Tensor) -> RayErrorRates:
+        """Initial rates from rays (n, K), as if all receivers saw the source with most rays."""
+        return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
+
+    @staticmethod
+    def of(rays: Tensor, seen: Tensor) -> RayErrorRates:
+        """From rays and visibility, both (n, K) of zeros and ones."""
+        missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
+        spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
+        return RayErrorRates(max(missed, MIN_RATE), max(spurious, MIN_RATE))
+
+    def odds(self, rays: Tensor, probability: Tensor) -> Tensor:
+        """Log odds (n, K) that a source is seen, by rays and the neighbours' probability (n, K)."""
+        probability = (probability / (1 - self.missed)).clamp(MIN_PROBABILITY, 1 - MIN_PROBABILITY)
+        detected = math.log((1 - self.missed) / self.spurious)
+        undetected = math.log(self.missed / (1 - self.spurious))
+        return torch.where(rays > 0, detected, undetected) + probability.log() - (1 - probability).log()
+
+
+def flips(seen: Tensor, odds: Tensor, residual: Tensor, variance: Tensor, contribution: Tensor) -> Tensor:
+    """(n, K) bool, at most one visibility entry to change per receiver.
+
+    Args:
+        seen: (n, K) of zeros and ones.
+        odds: (n, K), prior log odds that it is seen.
+        residual: (n, R), leave-one-out residual of the channels.
+        variance: (n,), expected |left|^2.
+        contribution: (n, K, R), what each source adds where it is seen.
+    """
+    sign = (1 - 2 * seen).to(contribution.real.dtype)
+    after = (residual[:, None] - sign[:, :, None] * contribution).abs().square().sum(2)
+    before = residual.abs().square().sum(1)[:, None]
+    gain = (before - after) / variance[:, None] + sign * odds
+    best = gain.argmax(1, keepdim=True)
+    return torch.zeros_like(seen, dtype=torch.bool).scatter(1, best, gain.gather(1, best) > 0)

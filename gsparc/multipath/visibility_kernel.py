@@ -5,31 +5,11 @@ Sources do not occlude each other: each has its own gain process, and all share 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-
-
-@dataclass(frozen=True)
-class View:
-    """Places and their directions from one source.
-
-    Attributes:
-        place: (n, 3) float64 [m], relative to the middle of the scene.
-        direction: (n, 3) float32, unit vectors from the source to the places.
-    """
-
-    place: Tensor
-    direction: Tensor
-
-    @staticmethod
-    def of(places: Tensor, source: Tensor) -> View:
-        """From float64 places (n, 3) and a source (3,) [m]."""
-        offset = places - source
-        length = torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)
-        return View(places, (offset / length).float())
-
 
 ROUNDED = 1e-3  # of a squared length, largest rounding error of a squared distance
 
@@ -48,14 +28,34 @@ class KernelVisibility:
     angle: float | Tensor = 0.5
     length: float | Tensor = 2.0
 
-    def correlation(self, first: View, second: View) -> Tensor:
-        """(n, m) float32 in [0, 1], one where both places are the same."""
-        squared = _squared(first.direction, second.direction) / self.angle**2
-        places = (first.place, second.place)
-        if not _is_wide(*places, float(torch.as_tensor(self.length).detach())):
-            places = (first.place.float(), second.place.float())
-        squared = squared + _squared(*places).float() / self.length**2
+    def correlation(self, places: Tensor, source: Tensor) -> Tensor:
+        """(n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m]."""
+        squared = _squared(directions(places, source)) / self.angle**2
+        if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
+            places = places.float()
+        squared = squared + _squared(places).float() / self.length**2
         return self.constant + (1 - self.constant) * matern32(squared)
+
+    @staticmethod
+    def of(value: Tensor) -> KernelVisibility:
+        """From the logit of `constant` and the logarithms of both lengths; differentiable."""
+        return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
+
+    def parameters(self, least: float, *shares: float) -> Tensor:
+        """Inverse of `of`, then the logits of more `shares`; all shares are at least `least`."""
+        clipped = [min(max(float(share), least), 0.995) for share in (self.constant, *shares)]
+        first, *rest = (math.log(share / (1 - share)) for share in clipped)
+        return torch.tensor([first, math.log(self.angle), math.log(self.length), *rest])
+
+    def plain(self) -> KernelVisibility:
+        """With numbers instead of tensors."""
+        return KernelVisibility(float(self.constant), float(self.angle), float(self.length))
+
+
+def directions(places: Tensor, sources: Tensor) -> Tensor:
+    """Unit vectors (..., n, 3) float32 from sources (..., 3) to places (n, 3) float64 [m]."""
+    offset = places - sources[..., None, :]
+    return (offset / torch.linalg.vector_norm(offset, dim=-1, keepdim=True).clamp_min(1e-6)).float()
 
 
 def matern32(squared: Tensor) -> Tensor:
@@ -64,14 +64,15 @@ def matern32(squared: Tensor) -> Tensor:
     return (1 + root) * torch.exp(-root)
 
 
-def _is_wide(first: Tensor, second: Tensor, length: float) -> bool:
+def _is_wide(places: Tensor, length: float) -> bool:
     """Whether squared distances need float64: of 5 km those in float32 are off by a square metre.
 
     Elsewhere float64 would only double the time of a search.
     """
-    reach = max(float(places.abs().max()) if places.numel() else 0.0 for places in (first, second))
+    reach = float(places.abs().max()) if places.numel() else 0.0
     return torch.finfo(torch.float32).eps * reach**2 > ROUNDED * length**2
 
 
-def _squared(a: Tensor, b: Tensor) -> Tensor:
-    return (a.square().sum(-1)[:, None] + b.square().sum(-1)[None] - 2 * a @ b.T).clamp_min(0)
+def _squared(a: Tensor) -> Tensor:
+    length = a.square().sum(-1)
+    return (length[:, None] + length[None] - 2 * a @ a.T).clamp_min(0)

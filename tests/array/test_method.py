@@ -136,7 +136,7 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
     distance = np.linalg.norm(x[:, None] - x[None], axis=-1)
     matrix = steering(data.site.array, data.site.grid, data.site.wavelength).numpy()[:, :50]
     samples = cross_validation._Samples(
-        x, np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
+        np.zeros((30, 50)), matrix.conj(), np.zeros(50), np.array([7]), np.array([0.03]), distance
     )
     unknown, predicted = samples.predictions(kernel, np.linalg.inv(kernel.gram(x)), v)
     error = samples.error(predicted)

@@ -11,8 +11,7 @@ from campaigns import compose
 from invented import invent
 from rooms import directed, nmse, rough, shoebox
 
-from gsparc.array.cross_validation import LeftOut
-from gsparc.array.image_gp import compared
+from gsparc.array.cross_validation import LeftOut, compared
 from gsparc.auto.combine import (
     DirectionalEnsemble,
     ImageEnsemble,

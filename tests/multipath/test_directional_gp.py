@@ -18,8 +18,7 @@ from gsparc.methods.method import FitContext
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.multipath.visibility_gp import VisibilityGP
-from gsparc.multipath.visibility_update import RayErrorRates, flips
+from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from gains import gains
 from invented import invent
 from rooms import WAVELENGTH, furnished, nmse, shoebox
 from shoeboxes import as_arrays
@@ -243,7 +244,7 @@ def learned_and_true_visibility(method, told, data, index, most=6):
     """Of the strongest true sources that were found: (n, K) learned, (n, K) true."""
     member = method.members[0]
     places = torch.from_numpy(data.moving[index]) - method.frame.middle
-    gains = member.gains(places).abs()[:, :, 0].numpy() * method.frame.scale * data.site.target_scale
+    learned_gains = gains(member, places).abs()[:, :, 0].numpy() * method.frame.scale * data.site.target_scale
     sources = (member.scene.sources + method.frame.middle).numpy() + data.site.origin
     true = told.images.of(told.tx[0])
     learned, seen = [], []
@@ -251,7 +252,7 @@ def learned_and_true_visibility(method, told, data, index, most=6):
         distance = np.linalg.norm(sources - true[i], axis=-1)
         if distance.min() < 0.5 * WAVELENGTH and len(learned) < most:
             full = abs(told.images.gain[i]) * WAVELENGTH / (4 * np.pi)
-            learned.append(gains[:, distance.argmin()] / full)
+            learned.append(learned_gains[:, distance.argmin()] / full)
             seen.append(told.visible[index, i])
     return np.stack(learned, 1), np.stack(seen, 1)
 

@@ -24,26 +24,17 @@ ARRAYS = ("places", "errors", "centre", "scale", "slope", "low", "high")
 RIDGES = np.logspace(-2, 4, 13)  # chosen by leave-one-out
 
 
-@dataclass(frozen=True)
-class ImageFeatures:
-    """Features of predicted images, (n,) each.
+def image_features(variance: np.ndarray, image: torch.Tensor, added: torch.Tensor) -> np.ndarray:
+    """Features (n, 4) of predicted images (n, P).
 
-    Attributes:
-        variance: of the residual process, relative to its prior.
-        mean: brightness of the image.
-        peak: its largest pixel.
-        added: mean square of what the process adds to the sources' image.
+    Args:
+        variance: (n,) of the residual process, relative to its prior.
+        image: the prediction; its brightness and its largest pixel.
+        added: what the process adds to the sources' image; its mean square.
     """
-
-    variance: np.ndarray
-    mean: np.ndarray
-    peak: np.ndarray
-    added: np.ndarray
-
-    def columns(self) -> np.ndarray:
-        """(n, 4) for a linear model."""
-        logs = (np.log(np.maximum(x, 1e-9)) for x in (self.variance, self.mean, self.added))
-        return np.column_stack([*logs, self.peak])
+    power = (variance, *(part.mean(1).double().numpy() for part in (image, added.square())))
+    logs = (np.log(np.maximum(x, 1e-9)) for x in power)
+    return np.column_stack([*logs, image.amax(1).double().numpy()])
 
 
 @dataclass(frozen=True)
@@ -69,13 +60,13 @@ class ErrorModel:
     level: float
     farthest: float
 
-    def relative_error(self, places: np.ndarray, features: ImageFeatures) -> np.ndarray:
-        """Expected |e|^2 / |h|^2 (m,) at places (m, 3) [m].
+    def relative_error(self, places: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Expected |e|^2 / |h|^2 (m,) at places (m, 3) [m], of `image_features` (m, 4).
 
         Beyond the largest distance between training places it grows with the distance squared.
         """
         distance, row = self._tree.query(places, k=np.arange(1, min(NEIGHBOURS, len(self.places)) + 1))
-        columns = np.column_stack([_average(distance, self.errors[row]), features.columns()])
+        columns = np.column_stack([_average(distance, self.errors[row]), features])
         columns = np.clip(columns, self.low, self.high)
         predicted = self.level + ((columns - self.centre) / self.scale) @ self.slope
         beyond = np.maximum(distance[:, 0] / self.farthest, 1.0) ** 2
@@ -97,11 +88,11 @@ class ErrorModel:
         return ErrorModel(**arrays, level=float(state["level"]), farthest=float(state["farthest"]))
 
 
-def fit_error_model(places: np.ndarray, relative_error: np.ndarray, features: ImageFeatures) -> ErrorModel:
-    """From leave-one-out errors |e|^2 / |h|^2 (n,) and features at places (n, 3) [m]; n at least 2."""
+def fit_error_model(places: np.ndarray, relative_error: np.ndarray, features: np.ndarray) -> ErrorModel:
+    """From leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 4) at places (n, 3) [m]; n at least 2."""
     errors = np.log(np.clip(relative_error, MIN_ERROR, MAX_ERROR))
     distance, row = cKDTree(places).query(places, k=np.arange(2, min(NEIGHBOURS + 1, len(places)) + 1))
-    columns = np.column_stack([_average(distance, errors[row]), features.columns()])
+    columns = np.column_stack([_average(distance, errors[row]), features])
     centre, scale = columns.mean(0), np.maximum(columns.std(0), 1e-9)
     model = RidgeCV(RIDGES).fit((columns - centre) / scale, errors)
     residual = errors - model.predict((columns - centre) / scale)

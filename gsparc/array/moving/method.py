@@ -17,7 +17,7 @@ from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from gsparc.array.moving.compress import components
-from gsparc.array.moving.error_model import ErrorModel, ImageFeatures, fit_error_model
+from gsparc.array.moving.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.array.moving.power_gp import Trend, TrendSettings, fit_trend
 from gsparc.array.moving.reduce import reduced
 from gsparc.array.moving.triangulate import SearchSettings, bearings, find_sources, mixture, powers
@@ -90,7 +90,13 @@ class MovingArrayField(Interpolator, PredictsVariance):
 
     def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
         """See `Explains`."""
-        return explained_by_lags(data, rows)
+        problem, site = site_problem(data), data.site
+        if problem is not None:
+            return False, problem
+        images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
+        _, residual = unexplained_energy(Lags(*site.array_geometry()), images)
+        share = f"{residual:.1%} of the energy of {len(rows)} probed images"
+        return residual <= MAX_UNEXPLAINED, f"{share} is outside the moving array's lags"
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`; searches where there are several."""
@@ -117,7 +123,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         while True:
             start = time.perf_counter()
             trend, left_out = self._search(space, lags, positions, targets)
-            self._add_images(space, trend.sources, left_out, modelled)
+            self._add_images(space, trend.sources, left_out, modelled, positions)
             self.trends.append(trend)
             errors.append(self._left_out_error(positions, targets, modelled))
             now = time.perf_counter()
@@ -126,11 +132,12 @@ class MovingArrayField(Interpolator, PredictsVariance):
                 "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
                 self.name, len(errors), len(trend.sources), trend.kernel.length, errors[-1], now - begin,
             )  # fmt: skip
-            if budget_s is None and len(errors) == self.searches:
-                break
-            if budget_s is not None and now - begin + longest > BUDGET_SHARE * budget_s:
-                break
-            if budget_s is not None and _converged(errors):
+            if budget_s is None:
+                done = len(errors) == self.searches
+            else:
+                late = now - begin + longest > BUDGET_SHARE * budget_s
+                done = late or (len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2])
+            if done:
                 break
         modelled /= -len(self.trends)
         residual = self._add_targets(targets, modelled)
@@ -202,15 +209,9 @@ class MovingArrayField(Interpolator, PredictsVariance):
         return _residual_error(positions[rows], residual)[0]
 
     def _add_images(
-        self,
-        space: Lags,
-        sources: Tensor,
-        power: np.ndarray,
-        modelled: np.ndarray,
-        places: np.ndarray | None = None,
+        self, space: Lags, sources: Tensor, power: np.ndarray, modelled: np.ndarray, places: np.ndarray
     ) -> None:
-        """Add to images (n, H, W) those of sources of powers (n, K) at places (n, 3), all rows by default."""
-        places = self.positions if places is None else places
+        """Add to images (n, H, W) those of sources of powers (n, K) at places (n, 3)."""
         for start in range(0, len(modelled), BLOCK):
             rows = slice(start, start + BLOCK)
             receivers = torch.from_numpy(places[rows]).float()
@@ -231,11 +232,8 @@ class MovingArrayField(Interpolator, PredictsVariance):
             self.axes, scores = torch.zeros(0, len(self.mean)), np.zeros((len(residual), 0))
         else:
             parts = components(residual, self.components)
-            self.axes, self.mean, scores = (
-                torch.from_numpy(parts.axes),
-                torch.from_numpy(parts.mean),
-                parts.scores,
-            )
+            self.axes, self.mean = torch.from_numpy(parts.axes), torch.from_numpy(parts.mean)
+            scores = parts.scores
         weights = cho_solve(self._factor, scores)
         self.weights = torch.from_numpy(weights)
         # leave-one-out variance, over the amplitude
@@ -248,8 +246,8 @@ class MovingArrayField(Interpolator, PredictsVariance):
             added = torch.addmm(self.mean, predicted[rows], self.axes)
             found = (image - torch.from_numpy(residual[rows]).flatten(1) + added).clamp_(0, 1)
             error[rows] = ((found - image).square().sum(1) / image.square().sum(1).clamp_min(1e-12)).numpy()
-            features.append(_features(spread[rows], found, added))
-        self.error_model = fit_error_model(self.positions, error, _joined(features))
+            features.append(image_features(spread[rows], found, added))
+        self.error_model = fit_error_model(self.positions, error, np.concatenate(features))
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         space, receivers = self.lags(), torch.from_numpy(queries).float()
@@ -262,14 +260,9 @@ class MovingArrayField(Interpolator, PredictsVariance):
         mean = self._decode(modelled.div_(len(self.trends)).add_(added))
         prior = 1 + self.residual_kernel.noise
         variance = np.clip(prior - (cross * cho_solve(self._factor, cross.T).T).sum(1), 1e-9, prior)
-        relative = torch.from_numpy(
-            self.error_model.relative_error(queries, _features(variance, mean.flatten(1), added))
-        ).float()
-        return Prediction(
-            mean,
-            confidence=1 / (1 + relative),
-            variance=relative * mean.square().flatten(1).mean(1),
-        )
+        features = image_features(variance, mean.flatten(1), added)
+        relative = torch.from_numpy(self.error_model.relative_error(queries, features)).float()
+        return Prediction(mean, 1 / (1 + relative), relative * mean.square().flatten(1).mean(1))
 
     def size(self) -> int:
         """Number of sources of all searches."""
@@ -294,11 +287,9 @@ class MovingArrayField(Interpolator, PredictsVariance):
 
     def lags(self) -> Lags:
         """The array's, computed once."""
-        site = self.site
-        assert site is not None and site.array is not None and site.grid is not None
-        assert site.wavelength is not None
+        assert self.site is not None
         if self._prepared is None:
-            self._prepared = Lags(site.array, site.grid, site.wavelength)
+            self._prepared = Lags(*self.site.array_geometry())
         return self._prepared
 
     _prepared: Lags | None = None
@@ -307,7 +298,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         return {
             "trends": [trend.state() for trend in self.trends],
             "exponent": self.exponent,
-            "rest": [self.residual_kernel.length, self.residual_kernel.noise, self.residual_kernel.amplitude],
+            "rest": [*vars(self.residual_kernel).values()],
             "positions": torch.from_numpy(self.positions),
             "mean": self.mean,
             "axes": self.axes,
@@ -322,18 +313,6 @@ class MovingArrayField(Interpolator, PredictsVariance):
         self.positions, self.error_model = state["positions"].numpy(), ErrorModel.from_state(state["doubt"])
         self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
         self._factor = cho_factor(self.residual_kernel.gram(self.positions), lower=True)
-
-
-def explained_by_lags(data: Measurements, rows: np.ndarray) -> tuple[bool, str]:
-    """Whether the moving array can have measured the images of rows (n,), by the energy outside its lags."""
-    problem, site = site_problem(data), data.site
-    if problem is not None:
-        return False, problem
-    assert site.array is not None and site.grid is not None and site.wavelength is not None
-    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
-    _, residual = unexplained_energy(Lags(site.array, site.grid, site.wavelength), images)
-    reason = f"{residual:.1%} of the energy of {len(rows)} probed images is outside the moving array's lags"
-    return residual <= MAX_UNEXPLAINED, reason
 
 
 def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
@@ -372,26 +351,6 @@ def _residual_error(positions: np.ndarray, residual: np.ndarray) -> tuple[float,
     inverse = cho_solve(factor, np.eye(len(positions)))
     missed = (cho_solve(factor, parts.scores) / np.diag(inverse)[:, None]) ** 2
     return float(missed.sum(1).mean()) / len(parts.mean) + parts.lost, kernel
-
-
-def _converged(errors: list[float]) -> bool:
-    """Whether the last search gained less than `MIN_GAIN`."""
-    return len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2]
-
-
-def _features(variance: np.ndarray, image: Tensor, added: Tensor) -> ImageFeatures:
-    """Of images (n, P) and the residual process's part (n, P), with its relative variance (n,)."""
-    return ImageFeatures(
-        variance,
-        image.mean(1).double().numpy(),
-        image.amax(1).double().numpy(),
-        added.square().mean(1).double().numpy(),
-    )
-
-
-def _joined(parts: list[ImageFeatures]) -> ImageFeatures:
-    names = ("variance", "mean", "peak", "added")
-    return ImageFeatures(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _spread(count: int, limit: int) -> np.ndarray:

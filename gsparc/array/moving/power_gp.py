@@ -53,7 +53,7 @@ class Trend:
         """Plain tensors and numbers."""
         return {
             "sources": self.sources,
-            "kernel": [self.kernel.length, self.kernel.noise, self.kernel.amplitude],
+            "kernel": [*vars(self.kernel).values()],
             "level": torch.from_numpy(self.level),
             "weights": torch.from_numpy(self.weights),
         }

@@ -70,19 +70,22 @@ class ReducedMean(View):
         stride: int,
     ) -> None:
         super().__init__(inner)
-        site = inner.site
-        assert site is not None and site.grid is not None and site.array is not None
-        assert site.wavelength is not None
-        grid = coarser(site.grid, stride) if stride > 1 else site.grid
-        self._space = Lags(site.array, grid, site.wavelength) if stride > 1 else inner.lags()
+        assert inner.site is not None
+        array, grid, wavelength = inner.site.array_geometry()
+        self._space = Lags(array, coarser(grid, stride), wavelength) if stride > 1 else inner.lags()
         self._rotation, self._exponent = inner.rotation(), inner.exponent
-        self._sources = [trend.sources for trend in trends]
-        self._levels = [torch.from_numpy(trend.level).float() for trend in trends]
-        self._trends = [torch.from_numpy(trend.weights).float().contiguous() for trend in trends]
+        self._trends = [
+            (
+                trend.sources,
+                torch.from_numpy(trend.level).float(),
+                torch.from_numpy(trend.weights).float().contiguous(),
+                math.sqrt(3) / trend.kernel.length,
+            )
+            for trend in trends
+        ]
         self._mean, self._axes, self._weights = mean, axes, weights.float().contiguous()
         self._middle = torch.from_numpy(inner.positions.mean(0)).float()
         self._places = torch.from_numpy(inner.positions).float() - self._middle
-        self._scales = [math.sqrt(3) / trend.kernel.length for trend in trends]
         self._residual_scale = math.sqrt(3) / inner.residual_kernel.length
 
     @torch.no_grad()
@@ -90,22 +93,16 @@ class ReducedMean(View):
         """See `Method.predict`; Matern-3/2 as in `gsparc.methods.gp.Kernel`."""
         where = rx.position.reshape(-1, 3).expand(len(tx), 3)
         far = torch.linalg.vector_norm((where - self._middle)[:, None] - self._places, dim=-1)
-        images = [
-            self._image(sources, where, torch.addmm(level, _matern(far * scale), trend))
-            for sources, level, trend, scale in zip(
-                self._sources, self._levels, self._trends, self._scales, strict=True
-            )
-        ]
+        images = []
+        for sources, level, trend, scale in self._trends:
+            power = torch.addmm(level, _matern(far * scale), trend)
+            atoms = self._space.atoms(bearings(sources, where, self._rotation))
+            image = self._space.spectrum(mixture(power, atoms))
+            images.append((image.sqrt_() if self._exponent == 2 else image).flatten(1))
         image = images[0] if len(images) == 1 else torch.stack(images).mean(0)
         scores = _matern(far * self._residual_scale) @ self._weights
         found = image.add_(torch.addmm(self._mean, scores, self._axes))
         return Prediction(from_real(found, "spectrum", self._space.image))
-
-    def _image(self, sources: Tensor, where: Tensor, power: Tensor) -> Tensor:
-        """Image (n, P) of one search's sources."""
-        atoms = self._space.atoms(bearings(sources, where, self._rotation))
-        image = self._space.spectrum(mixture(power, atoms))
-        return (image.sqrt_() if self._exponent == 2 else image).flatten(1)
 
     def size(self) -> int:
         """Components kept."""

@@ -102,43 +102,53 @@ def find_sources(
     far = settings.reach * float((high - low).norm())
     low, high = low - far, high + far
     known = torch.empty(0, 3) if first is None else first.reshape(1, 3).float()
-    residual, found = lags, known
-    if len(known):
-        found, residual = known, _residual(lags, receivers, known, rotation, space, settings.ridge)
+
+    def left(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
+        """Residual lags (n, Q) of sources of the best powers."""
+        atoms = space.atoms(bearings(sources, receivers, rotation))
+        return lags - mixture(powers(lags, atoms, settings.ridge), atoms)
+
+    found, residual = known, left(lags, receivers, known) if len(known) else lags
     energy = float(residual.square().sum())
     while len(found) < settings.sources:
         candidates = low + (high - low) * torch.rand(settings.candidates, 3, generator=generator)
-        new = _best(candidates, residual, receivers, rotation, space, grid, settings)
+        amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
+        new = _best(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
             break
         found = torch.cat([found, new])
-        residual = _residual(lags, receivers, found, rotation, space, settings.ridge)
+        residual = left(lags, receivers, found)
         before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before:
             break
-    return _refined(found, len(known), lags, receivers, rotation, space, settings, generator)
-
-
-def _residual(
-    lags: Tensor, receivers: Tensor, sources: Tensor, rotation: Tensor, space: Lags, ridge: float
-) -> Tensor:
-    atoms = space.atoms(bearings(sources, receivers, rotation))
-    return lags - mixture(powers(lags, atoms, ridge), atoms)
+    if settings.steps == 0 or len(found) == len(known):
+        return found
+    # Powers are optimal at every step, so that their derivative does not enter the gradient.
+    free = found[len(known) :].clone().requires_grad_(True)
+    optimiser = torch.optim.Adam([free], lr=settings.rate)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps)
+    for _ in range(settings.steps):
+        some = torch.randperm(len(receivers), generator=generator)[:64]
+        residual = left(lags[some], receivers[some], torch.cat([known, free]))
+        loss = residual.square().sum() / lags[some].square().sum()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return torch.cat([known, free.detach()])
 
 
 def _best(
     candidates: Tensor,
-    residual: Tensor,
+    images: Tensor,
     receivers: Tensor,
     rotation: Tensor,
-    space: Lags,
     grid: SphereGrid,
     settings: SearchSettings,
 ) -> Tensor:
-    """Candidates with the largest residual in their direction, over all receivers, without near doubles."""
-    amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
+    """Candidates of the largest amplitude (n, P) in their direction over all receivers, no near doubles."""
     score = torch.zeros(len(candidates))
-    for image, receiver in zip(amplitude, receivers, strict=True):
+    for image, receiver in zip(images, receivers, strict=True):
         pixel, inside = _pixels(bearings(candidates, receiver[None], rotation)[0], grid)
         score += torch.where(inside, image[pixel], 0.0)
     ranked = candidates[score.argsort(descending=True)[:1500]]
@@ -159,38 +169,6 @@ def _pixels(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Tensor]:
     azimuth = torch.atan2(directions[:, 1], directions[:, 0])
     row = ((elevation - grid.first_elevation) / grid.elevation_step).round().long()
     column = ((azimuth - grid.first_azimuth) / grid.azimuth_step).round().long()
-    turn = round(2 * np.pi / grid.azimuth_step)
-    column = column % turn
+    column = column % round(2 * np.pi / grid.azimuth_step)
     inside = (row >= 0) & (row < grid.height) & (column < grid.width)
     return (row.clamp(0, grid.height - 1) * grid.width + column.clamp(0, grid.width - 1)), inside
-
-
-def _refined(
-    sources: Tensor,
-    fixed: int,
-    lags: Tensor,
-    receivers: Tensor,
-    rotation: Tensor,
-    space: Lags,
-    settings: SearchSettings,
-    generator: torch.Generator,
-) -> Tensor:
-    """Positions by gradient descent; the first `fixed` stay.
-
-    Powers are optimal at every step, so that their derivative does not enter the gradient.
-    """
-    if settings.steps == 0 or len(sources) == fixed:
-        return sources
-    free = sources[fixed:].clone().requires_grad_(True)
-    optimiser = torch.optim.Adam([free], lr=settings.rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps)
-    for _ in range(settings.steps):
-        some = torch.randperm(len(receivers), generator=generator)[:64]
-        everything = torch.cat([sources[:fixed], free])
-        residual = _residual(lags[some], receivers[some], everything, rotation, space, settings.ridge)
-        loss = residual.square().sum() / lags[some].square().sum()
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        schedule.step()
-    return torch.cat([sources[:fixed], free.detach()])

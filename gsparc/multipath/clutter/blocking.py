@@ -46,19 +46,16 @@ class Clutter:
         at = len(self.boxes) if at is None else at
         return replace(self, boxes=torch.cat([self.boxes[:at], box[None], self.boxes[at:]]))
 
-    def without_box(self, number: int) -> Clutter:
-        """One box less."""
-        return replace(self, boxes=torch.cat([self.boxes[:number], self.boxes[number + 1 :]]))
-
     def with_patch(self, patch: Tensor, plane: int) -> Clutter:
         """One more patch (4,)."""
         patches = torch.cat([self.patches, patch[None]])
         return replace(self, patches=patches, plane=(*self.plane, plane))
 
-    def without_patch(self, number: int) -> Clutter:
-        """One patch less."""
-        kept = [i for i in range(len(self.plane)) if i != number]
-        return replace(self, patches=self.patches[kept], plane=tuple(self.plane[i] for i in kept))
+    def without(self, number: int) -> Clutter:
+        """One piece less; boxes count before patches."""
+        boxes = [i for i in range(len(self.boxes)) if i != number]
+        kept = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
+        return Clutter(self.boxes[boxes], self.patches[kept], tuple(self.plane[i] for i in kept))
 
     def renamed(self, new: dict[int, int]) -> Clutter:
         """Planes of new indices; patches of planes without one are dropped."""
@@ -120,16 +117,13 @@ class Obstacles:
     def concatenate(many: list[Obstacles]) -> Obstacles:
         """Of several scenes, with consecutive indices of sources and planes."""
         planes = torch.tensor([0] + [len(s.ends) - 1 for s in many]).cumsum(0).tolist()
+        names = ("boxes", "patches", "normal", "offset", "along")
         return Obstacles(
-            torch.cat([s.boxes for s in many]),
-            _blocks([s.box_mask for s in many]),
-            torch.cat([s.patches for s in many]),
-            _blocks([s.patch_mask for s in many]),
-            torch.cat([s.letter + first for s, first in zip(many, planes, strict=False)]),
-            torch.cat([s.normal for s in many]),
-            torch.cat([s.offset for s in many]),
-            torch.cat([s.along for s in many]),
-            torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
+            **{name: torch.cat([getattr(s, name) for s in many]) for name in names},
+            box_mask=_blocks([s.box_mask for s in many]),
+            patch_mask=_blocks([s.patch_mask for s in many]),
+            letter=torch.cat([s.letter + first for s, first in zip(many, planes, strict=False)]),
+            ends=torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
         )
 
     def visible_share(self, paths: Paths, soft: float = SOFT) -> Tensor:
@@ -146,13 +140,14 @@ class Obstacles:
         shape = (-1, 1, 1, 1)
         mine = (self.patch_mask & paths.valid)[..., None]  # (Q, K, n, 1)
         offset = self.offset.view(shape)
-        above, below = (_dot(p, self.normal) - offset for p in (paths.start, paths.end))
+        above, below = ((p @ self.normal.T).movedim(-1, 0) - offset for p in (paths.start, paths.end))
         ends_here = paths.letter == self.letter.view(shape)
         crosses = (above * below < 0) & (above.abs() > NEAR_PLANE) & (below.abs() > NEAR_PLANE)
         share = above / torch.where(crosses, above - below, torch.ones_like(above))
         share = torch.where(ends_here, torch.ones_like(share), share)[..., None]
         met = paths.start + share * (paths.end - paths.start)
-        inside = _inside([_dot3(met, self.along[:, i]) for i in range(2)], self.patches, soft, each=True)
+        place = [(met * self.along[:, i, None, None, None]).sum(-1) for i in range(2)]
+        inside = _inside(place, self.patches, soft, each=True)
         inside = inside * ((crosses | ends_here) & mine)
         passed = torch.where(ends_here, 1.0, 1 - inside).prod(0).prod(-1)
         reflected = 1 - torch.where(ends_here, 1 - inside, 1.0).prod(0)
@@ -163,15 +158,25 @@ class Obstacles:
 
 
 def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
-    """Share (B, K, n) that passes each box."""
-    chord = _chords(paths.start, paths.end, boxes).amax(-1)
+    """Share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
+    along = paths.end - paths.start
+    along = torch.where(along.abs() < 1e-6, torch.full_like(along, 1e-6), along)
+    inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
+    enter, leave = torch.zeros(()), torch.ones(())
+    for axis in range(3):
+        low, high = (boxes[:, i].view(-1, 1, 1, 1) for i in (axis, axis + 3))
+        one = (low - paths.start[..., axis]) * inverse[..., axis]
+        other = (high - paths.start[..., axis]) * inverse[..., axis]
+        enter = torch.maximum(enter, torch.minimum(one, other))
+        leave = torch.minimum(leave, torch.maximum(one, other))
+    chord = ((leave - enter) * length).amax(-1)  # negative for legs that miss
     passed = torch.sigmoid((MARGIN - chord) / soft)
     return torch.where(paths.valid, passed, torch.ones_like(passed))
 
 
-def within(points: Tensor, patches: Tensor, soft: float = SOFT) -> Tensor:
+def within(points: Tensor, patches: Tensor) -> Tensor:
     """Soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
-    return _inside([points[..., 0], points[..., 1]], patches, soft)
+    return _inside([points[..., 0], points[..., 1]], patches, SOFT)
 
 
 def _inside(place: list[Tensor], patches: Tensor, soft: float, each: bool = False) -> Tensor:
@@ -181,16 +186,6 @@ def _inside(place: list[Tensor], patches: Tensor, soft: float, each: bool = Fals
     low_u, low_v, high_u, high_v = (patches[:, i].view(shape) for i in range(4))
     inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
     return torch.sigmoid(inner / soft)
-
-
-def _dot(points: Tensor, vectors: Tensor) -> Tensor:
-    """(K, n, L, 3) with each of (Q, 3): (Q, K, n, L)."""
-    return (points @ vectors.T).movedim(-1, 0)
-
-
-def _dot3(points: Tensor, vectors: Tensor) -> Tensor:
-    """(Q, K, n, L, 3) with (Q, 3), one each: (Q, K, n, L)."""
-    return (points * vectors[:, None, None, None]).sum(-1)
 
 
 def _blocks(owned: list[Tensor]) -> Tensor:
@@ -210,18 +205,3 @@ def tangents(plane: Tensor) -> Tensor:
 
 def _units(planes: Tensor) -> Tensor:
     return (planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)).float()
-
-
-def _chords(start: Tensor, end: Tensor, boxes: Tensor) -> Tensor:
-    """Length [m] of legs (...) inside each box (B, ...), negative for those that miss; slab test."""
-    along = end - start
-    along = torch.where(along.abs() < 1e-6, torch.full_like(along, 1e-6), along)
-    inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
-    enter, leave = torch.zeros(()), torch.ones(())
-    for axis in range(3):
-        low, high = (boxes[:, i].view(-1, *[1] * (start.dim() - 1)) for i in (axis, axis + 3))
-        one = (low - start[..., axis]) * inverse[..., axis]
-        other = (high - start[..., axis]) * inverse[..., axis]
-        enter = torch.maximum(enter, torch.minimum(one, other))
-        leave = torch.minimum(leave, torch.maximum(one, other))
-    return (leave - enter) * length

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -13,29 +12,13 @@ from gsparc.multipath.clutter.blocking import past_boxes
 from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 
-BLOCK = 64  # candidates at a time
 THINNEST = 0.03  # [m]
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
 TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
-
-
-@dataclass(frozen=True)
-class Evolution:
-    """A (mu, lambda) evolution strategy with falling step size.
-
-    Attributes:
-        rounds: of mutation and selection.
-        children: of each parent and round.
-        spread: first standard deviation of a mutation [m].
-        fall: factor from round to round.
-        halved: rounds after which only the better half is kept.
-    """
-
-    rounds: int = 14
-    children: int = 6
-    spread: float = 0.3
-    fall: float = 0.82
-    halved: tuple[int, ...] = (4, 8)
+CHILDREN = 6  # of each parent and round of the evolution strategy
+SPREAD, FALL = 0.3, 0.82  # first standard deviation of a mutation [m], and factor from round to round
+HALVED = (4, 8)  # rounds after which only the better half is kept
+STRONGEST = 24  # number of sources that a box is searched with
 
 
 def evolve(
@@ -43,20 +26,20 @@ def evolve(
     score: Callable[[Tensor], Tensor],
     repaired: Callable[[Tensor], Tensor],
     generator: torch.Generator,
-    evolution: Evolution = Evolution(),
+    rounds: int = 14,
 ) -> tuple[Tensor, float]:
-    """The best descendant (d,) of parents (m, d), and its score."""
-    best, spread = score(parents), evolution.spread
-    for number in range(evolution.rounds):
-        born = parents.repeat_interleave(evolution.children, 0)
+    """The best descendant (d,) of parents (m, d), and its score, by a (mu, lambda) evolution strategy."""
+    best, spread = score(parents), SPREAD
+    for number in range(rounds):
+        born = parents.repeat_interleave(CHILDREN, 0)
         which = torch.rand(born.shape, generator=generator) < 0.5
         born = repaired(born + spread * torch.randn(born.shape, generator=generator) * which)
         scores, chosen = score(born).view(len(parents), -1).max(1)
         better = scores > best
         heirs = born.view(len(parents), -1, born.shape[1])[torch.arange(len(parents)), chosen]
         parents = torch.where(better[:, None], heirs, parents)
-        best, spread = torch.maximum(best, scores), spread * evolution.fall
-        if number in evolution.halved:
+        best, spread = torch.maximum(best, scores), spread * FALL
+        if number in HALVED:
             kept = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
             parents, best = parents[kept], best[kept]
     first = int(best.argmax())
@@ -73,7 +56,6 @@ def find_box(
     draws: int = 1000,
     parents: int = 12,
     seeds: Tensor | None = None,
-    strongest: int = 24,
 ) -> tuple[Tensor, float]:
     """The box (6,) whose shadow explains most, and its gain [nats].
 
@@ -85,21 +67,13 @@ def find_box(
         generator: of the candidates.
         draws, parents: random boxes, and how many of them evolve.
         seeds: (s, 6) more parents.
-        strongest: number of sources used.
     """
     waves = visible_waves * scorer.gains
-    chosen = waves.abs().square().sum(0).topk(min(strongest, waves.shape[1])).indices
+    chosen = waves.abs().square().sum(0).topk(min(STRONGEST, waves.shape[1])).indices
     few, waves = paths.take(chosen), waves[:, chosen]
 
     def score(boxes: Tensor) -> Tensor:
-        scores = []
-        for part in boxes.split(BLOCK):
-            hidden = 1 - past_boxes(few, part)
-            lost = torch.complex(
-                torch.einsum("bkn,nk->nb", hidden, waves.real), torch.einsum("bkn,nk->nb", hidden, waves.imag)
-            )
-            scores.append(scorer.score(-lost))
-        return torch.cat(scores)
+        return scorer.score_shares(boxes, lambda part: past_boxes(few, part) - 1, waves)
 
     def repaired(boxes: Tensor) -> Tensor:
         return inside_out(boxes, room)

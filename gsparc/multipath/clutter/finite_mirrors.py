@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import tangents, within
-from gsparc.multipath.clutter.boxes import BLOCK, Evolution, evolve
+from gsparc.multipath.clutter.boxes import evolve
 from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
 from gsparc.physics.mirror_planes import Word, reflect
-from gsparc.physics.waves import LIGHT, NEAR_M
+from gsparc.physics.waves import LIGHT, NEAR_M, wave
 
 log = logging.getLogger(__name__)
 
@@ -67,19 +67,9 @@ def find_patch(
     low, high = ends.amin(0), ends.amax(0)
 
     def score(patches: Tensor) -> Tensor:
-        scores = []
-        for part in patches.split(BLOCK):
-            inside = within(met, part)
-            seen = torch.where(here, inside, torch.ones_like(inside)).prod(-1)
-            scores.append(
-                scorer.score(
-                    torch.complex(
-                        torch.einsum("bkn,nk->nb", seen, waves.real),
-                        torch.einsum("bkn,nk->nb", seen, waves.imag),
-                    )
-                )
-            )
-        return torch.cat(scores)
+        return scorer.score_shares(
+            patches, lambda part: torch.where(here, within(met, part), 1.0).prod(-1), waves
+        )
 
     def repaired(patches: Tensor) -> Tensor:
         lower = torch.minimum(patches[:, :2], patches[:, 2:] - MIN_SIDE)
@@ -89,7 +79,7 @@ def find_patch(
     side = SMALLEST * torch.exp(torch.rand(draws, 2, generator=generator) * math.log(LARGEST / SMALLEST))
     drawn = repaired(torch.cat([middle - side / 2, middle + side / 2], 1))
     drawn = drawn[score(drawn).topk(8).indices]
-    return evolve(drawn, score, repaired, generator, Evolution(rounds=10))
+    return evolve(drawn, score, repaired, generator, rounds=10)
 
 
 @dataclass(frozen=True)
@@ -110,16 +100,6 @@ class SmallMirror:
 def walls(planes: Tensor, words: tuple[Word, ...]) -> list[int]:
     """Numbers of planes that make a source of one reflection."""
     return [i for i in range(len(planes)) if (i,) in words]
-
-
-def directions(planes: Tensor, numbers: list[int]) -> Tensor:
-    """Unit normals (D, 3) float64 of the planes with these numbers, parallel ones once."""
-    found: list[Tensor] = []
-    for number in numbers:
-        normal = planes[number, :3] / planes[number, :3].norm()
-        if all((normal @ other).abs() < PARALLEL for other in found):
-            found.append(normal)
-    return torch.stack(found) if found else torch.zeros(0, 3, dtype=planes.dtype)
 
 
 def find_mirrors(
@@ -149,7 +129,12 @@ def find_mirrors(
     alpha, known = scorer.alpha, planes[numbers]
     found: list[SmallMirror] = []
     scale = scorer.root.square().sum(0).view(2, -1).mean(0)  # of rows, diagonal of K^-1
-    for normal in directions(planes, numbers):
+    normals: list[Tensor] = []
+    for plane in known:
+        normal = plane[:3] / plane[:3].norm()
+        if any((normal @ other).abs() >= PARALLEL for other in normals):
+            continue
+        normals.append(normal)
         ends = (room.double() @ normal).sort().values
         offsets = torch.arange(
             float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
@@ -157,10 +142,8 @@ def find_mirrors(
         candidates = torch.cat([normal.expand(len(offsets), 3), offsets[:, None]], 1)
         each = math.prod(_cells(room, tangents(candidates[0]))) * (1 + 2 * len(known))
         if each * len(candidates) > MAX_CELLS:
-            log.info(
-                "no search for small mirrors: %.0e raster cells at this site and wavelength",
-                each * len(candidates),
-            )
+            count = each * len(candidates)
+            log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
             continue
         parts = [
             _raster(rows, alpha, scale, transmitter, block, known, room)
@@ -200,19 +183,17 @@ def _raster(
     """Best rectangle of each candidate plane (C, 4): nats (C,) and corners (C, 4)."""
     along = tangents(candidates[0])
     low, cells = (room @ along.T).amin(0), _cells(room, along)
-    matched: list[Tensor] = []
-    power: list[Tensor] = []
-    served: list[Tensor] = []
-    for wave, met in _sources(rows, transmitter, candidates, known):
+    tables = []
+    for arriving, met in _sources(rows, transmitter, candidates, known):
         cell = ((met @ along.T - low) / CELL).floor().long()
         inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
         index = (cell[..., 0] * cells[1] + cell[..., 1]).clamp(0, cells[0] * cells[1] - 1)
-        own = wave.conj() * alpha
-        for values, into in ((own.real, matched), (own.imag, matched)):
-            into.append(_binned(values * inside, index, cells))
-        power.append(_binned(wave.abs().square() * scale * inside, index, cells))
-        served.append(_binned(inside.float(), index, cells))
-    sums = [_integral(torch.stack(t)) for t in (matched[::2], matched[1::2], power, served)]
+        own, blank = arriving.conj() * alpha, torch.zeros(len(candidates), cells[0] * cells[1])
+        values = (own.real, own.imag, arriving.abs().square() * scale, torch.ones(()))
+        binned = [blank.scatter_add(1, index, (value * inside).float()).view(-1, *cells) for value in values]
+        tables.append(binned)
+    stacked = (torch.stack(each).cumsum(-1).cumsum(-2) for each in zip(*tables, strict=True))
+    sums = [torch.nn.functional.pad(each, (1, 0, 1, 0)) for each in stacked]  # integral images
     total, best = torch.zeros(len(candidates)), torch.zeros(len(candidates), 4)
     # a few cells, or all there are: a wall that was missed
     sizes = [sorted({*range(1, min(MAX_SPAN, count) + 1), count}) for count in cells]
@@ -244,22 +225,17 @@ def _sources(
     rows: Rows, transmitter: Tensor, candidates: Tensor, known: Tensor
 ) -> list[tuple[Tensor, Tensor]]:
     """Waves (C, n) of every word over a candidate, and where the candidate is met (C, n, 3), NaN if not."""
-    places, found = rows.position.float(), []
+    places = rows.position.float()
     once = reflect(transmitter[None], candidates)  # (C, 3)
-    found.append((_wave(rows, once), _meeting(places, once, candidates)))
+    found = [(once, _meeting(places, once, candidates))]
     for wall in known:
         after = reflect(reflect(transmitter, wall)[None], candidates)
-        found.append((_wave(rows, after), _meeting(places, after, candidates)))
+        found.append((after, _meeting(places, after, candidates)))
         before = reflect(once, wall[None])
         first = _meeting(places, before, wall[None].expand(len(candidates), 4))
-        found.append((_wave(rows, before), _meeting(first, once, candidates)))
-    return found
-
-
-def _wave(rows: Rows, sources: Tensor) -> Tensor:
-    distance = torch.cdist(sources, rows.position).clamp_min(NEAR_M)
-    cycles = distance * (rows.frequency / LIGHT)
-    return torch.polar((1 / distance).float(), ((cycles.round() - cycles) * (2 * math.pi)).float())
+        found.append((before, _meeting(first, once, candidates)))
+    away = ((torch.cdist(source, rows.position).clamp_min(NEAR_M), met) for source, met in found)
+    return [(wave(distance, rows.frequency), met) for distance, met in away]
 
 
 def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
@@ -270,12 +246,3 @@ def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:
     share = above / torch.where((above - below).abs() < 1e-6, torch.ones_like(above), above - below)
     share = torch.where((above * below < 0), share, torch.full_like(share, math.nan))
     return start + share[..., None] * (end - start)
-
-
-def _binned(values: Tensor, index: Tensor, cells: list[int]) -> Tensor:
-    flat = torch.zeros(len(values), cells[0] * cells[1]).scatter_add_(1, index, values.float())
-    return flat.view(-1, *cells)
-
-
-def _integral(table: Tensor) -> Tensor:
-    return torch.nn.functional.pad(table.cumsum(-1).cumsum(-2), (1, 0, 1, 0))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsparc.multipath.clutter.blocking import SOFT, Clutter, visible_share
+from gsparc.multipath.clutter.blocking import Clutter, visible_share
 from gsparc.multipath.clutter.residual import Residual
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.gp_likelihood import steering
@@ -20,6 +20,8 @@ from gsparc.multipath.phased_gp import PhasedScene
 from gsparc.physics.mirror_planes import Word, images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
+# Adam's steps: boxes and patches [m], planes (unit normal, offset [m]), phases [rad], log amplitudes.
+STEPS = (0.02, 0.02, 0.003, 0.03, 0.05)
 STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
 
@@ -63,45 +65,25 @@ class ReflectionPhasePrior:
         return self.concentration * (1 - (phase - self.expected(phase[0], words)).cos()).sum()
 
 
-@dataclass(frozen=True)
-class StepSizes:
-    """Step sizes of Adam.
-
-    Attributes:
-        edge: of boxes and patches [m].
-        plane: of normals and offsets (unit, m).
-        phase: [rad].
-        logarithm: of amplitudes.
-    """
-
-    edge: float = 0.02
-    plane: float = 0.003
-    phase: float = 0.03
-    logarithm: float = 0.05
-
-
 def descend(
     residual: Residual,
     phased: PhasedScene,
     paths: Paths,
     steps: int,
-    soft: float = SOFT,
-    step_sizes: StepSizes = StepSizes(),
-    phase_prior: ReflectionPhasePrior = ReflectionPhasePrior(0.0, 0.0),
+    soft: float,
+    phase_prior: ReflectionPhasePrior,
 ) -> PhasedScene:
     """The most likely scene of `steps` steps; paths are those of the start."""
     scene, rows = phased.scene, residual.rows
-    start = (
-        scene.clutter.boxes, scene.clutter.patches, scene.planes, phased.phase, scene.log_amplitude,
-    )  # fmt: skip
+    old = scene.clutter
+    start = (old.boxes, old.patches, scene.planes, phased.phase, scene.log_amplitude)
     values = [v.clone().requires_grad_() for v in start]
-    rates = (step_sizes.edge, step_sizes.edge, step_sizes.plane, step_sizes.phase, step_sizes.logarithm)
-    groups = [{"params": [v], "lr": rate} for v, rate in zip(values, rates, strict=True)]
+    groups = [{"params": [v], "lr": rate} for v, rate in zip(values, STEPS, strict=True)]
     optimizer = torch.optim.Adam(groups, betas=(0.8, 0.95))
     lowest, best = float("inf"), [v.detach() for v in values]
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
-        seen = visible_share(paths, Clutter(boxes, patches, scene.clutter.plane), scene.planes, soft)
+        seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes, soft)
         waves = steering(rows, images(scene.transmitter, planes, scene.words))
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
@@ -120,6 +102,6 @@ def descend(
         optimizer.step()
         for group in optimizer.param_groups:
             group["lr"] *= STEP_DECAY
-    clutter = Clutter(best[0], best[1], scene.clutter.plane)
+    clutter = Clutter(best[0], best[1], old.plane)
     moved = replace(scene, planes=best[2], log_amplitude=best[4], clutter=clutter)
     return replace(phased, scene=moved, phase=best[3])

@@ -8,6 +8,7 @@ and is added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -16,10 +17,10 @@ from torch import Tensor
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
 from gsparc.multipath.rows import Rows
-from gsparc.multipath.visibility_kernel import View
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
+BLOCK = 64  # candidates at a time
 CONSTANTS = (0.6, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.98, 0.99)  # candidates
 
 
@@ -41,22 +42,21 @@ class Residual:
         self.waves = phased.unobstructed(rows)
         self._cached = self._parts(phased)
         self.phased = self._tuned(phased)
-        self._factor(self.phased)
+        constant = float(self.phased.scene.visibility.constant)
+        self._factor(constant, self.phased.scene.log_noise, phased.quadrature)
+        self.share = self._constant(constant, phased.quadrature)
+        self.root = torch.linalg.solve_triangular(self._lower, torch.eye(len(self.target)), upper=False)
+        self.white = self.root @ self.target
+        del self._cached, self._lower
 
     def _parts(self, phased: PhasedScene) -> tuple[Tensor, Tensor]:
         """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
         n, scene = len(self.rows), phased.scene
         scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
-        kernel = phased.scene.visibility
-        varying = torch.zeros(2, n, 2, n)
+        varying, kernel = torch.zeros(2, n, 2, n), replace(scene.visibility, constant=0.0)
         for k, source in enumerate(scene.sources):
-            view = View.of(self.rows.position, source)
-            add_source(
-                varying,
-                scaled[:, k],
-                phased.quadrature,
-                replace(kernel, constant=0.0).correlation(view, view),
-            )
+            correlation = kernel.correlation(self.rows.position, source)
+            add_source(varying, scaled[:, k], phased.quadrature, correlation)
         across = stacked(scaled)[1]
         return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
 
@@ -67,8 +67,12 @@ class Residual:
         constant = min(CONSTANTS, key=lambda c: abs(c - float(kernel.constant)))
 
         def cost(constant: float, noise: float) -> float:
-            self._factored(constant, noise, phased.quadrature)
-            return self._nll(columns * self._constant(constant, phased.quadrature)).item()
+            self._factor(constant, noise, phased.quadrature)
+            whitened = torch.linalg.solve_triangular(
+                self._lower, columns * self._constant(constant, phased.quadrature), upper=False
+            )
+            white = torch.linalg.solve_triangular(self._lower, self.target[:, None], upper=False)[:, 0]
+            return _cost(whitened, white, self._determinant).item()
 
         best = cost(constant, noise)
         for _ in range(2):
@@ -83,30 +87,16 @@ class Residual:
         scene = replace(phased.scene, visibility=replace(kernel, constant=constant), log_noise=noise)
         return replace(phased, scene=scene)
 
-    def _factor(self, phased: PhasedScene) -> None:
-        constant = float(phased.scene.visibility.constant)
-        self._factored(constant, phased.scene.log_noise, phased.quadrature)
-        self.share = self._constant(constant, phased.quadrature)
-        eye = torch.eye(len(self.target))
-        self.root = torch.linalg.solve_triangular(self._lower, eye, upper=False)
-        self.white = self.root @ self.target
-        del self._cached, self._lower
-
-    def _factored(self, constant: float, noise: float, quadrature: float) -> None:
+    def _factor(self, constant: float, noise: float, quadrature: float) -> None:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
         self._lower = torch.linalg.cholesky(covariance)
         self._determinant = float(self._lower.diagonal().double().log().sum())
-        self._white = torch.linalg.solve_triangular(self._lower, self.target[:, None], upper=False)[:, 0]
 
     @staticmethod
     def _constant(constant: float, quadrature: float) -> float:
         return math.sqrt(constant * (1 - quadrature / 2))
-
-    def _nll(self, columns: Tensor) -> Tensor:
-        whitened = torch.linalg.solve_triangular(self._lower, columns, upper=False)
-        return _cost(whitened, self._white, self._determinant)
 
     # ---- the constant part ----
     def columns(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
@@ -159,6 +149,15 @@ class CandidateScorer:
     def score(self, change: Tensor) -> Tensor:
         """Nats that each positive multiple of complex changes (n, M) would gain, (M,) float32."""
         return self.score_positive(change)[0]
+
+    def score_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
+        """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
+        scores = []
+        for part in candidates.split(BLOCK):
+            each = share(part)
+            change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
+            scores.append(self.score(torch.complex(*change)))
+        return torch.cat(scores)
 
     def score_positive(self, change: Tensor) -> tuple[Tensor, Tensor]:
         """The same, and the multiples (M,)."""

@@ -6,6 +6,7 @@ import logging
 import math
 import time
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -27,10 +28,7 @@ from gsparc.physics.waves import LIGHT
 log = logging.getLogger(__name__)
 
 BOX, PATCH, MIRROR, WALL = 6, 4, 5, 3  # parameters of a box, a patch, a patch on a new plane, a new plane
-INITIAL_KERNEL, QUADRATURE = (
-    KernelVisibility(0.9, 0.6, 1.5),
-    0.15,
-)  # initial kernel and quadrature, in the presence of clutter
+INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the presence of clutter
 MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
 SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
 NEAR_WALL_M = 0.25  # [m]; faces closer to the end of the room are not tried as mirrors
@@ -83,11 +81,8 @@ def find_clutter(
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
-    fresh = replace(
-        phased,
-        scene=replace(phased.scene, visibility=INITIAL_KERNEL),
-        quadrature=min(phased.quadrature, QUADRATURE),
-    )
+    bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
+    fresh = replace(phased, scene=bare, quadrature=quadrature)
     found = _ClutterSearcher(rows, fresh, generator, settings, noise_floor).run(deadline)
     before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
     return found if after < before - settings.progress else phased
@@ -151,7 +146,7 @@ class _ClutterSearcher:
         return False
 
     def _descend(self, steps: int, soft: float = SOFT) -> None:
-        found = descend(self.residual, self.phased, self.paths, steps, soft, phase_prior=self.phase_prior)
+        found = descend(self.residual, self.phased, self.paths, steps, soft, self.phase_prior)
         clutter = found.scene.clutter
         tidy = replace(clutter, boxes=inside_out(clutter.boxes, self.room))
         self._set_scene(replace(found, scene=replace(found.scene, clutter=tidy)))
@@ -174,9 +169,11 @@ class _ClutterSearcher:
                 self._drop()
                 self._refactor(self.phased)
                 self._drop_words()
-                self._refactor(
-                    refine_phase.refine(self.rows, self.phased, s.steps, self.noise_floor, self._phase_cost)
+                words, prior = self.scene.words, self.phase_prior
+                found = refine_phase.refine(
+                    self.rows, self.phased, s.steps, self.noise_floor, partial(prior.cost, words=words)
                 )
+                self._refactor(found)
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
@@ -186,10 +183,6 @@ class _ClutterSearcher:
             if time.monotonic() > deadline or self.nll > before - s.progress:
                 break
         return best[1]
-
-    def _phase_cost(self, phase: Tensor) -> Tensor:
-        """Negative log prior of phases (K,)."""
-        return self.phase_prior.cost(phase, self.scene.words)
 
     def _descend_soft(self, soft: float) -> None:
         """Descend with softer edges, whose gradients reach farther, then with sharp ones."""
@@ -213,9 +206,8 @@ class _ClutterSearcher:
         for mirror in sorted(placed, key=lambda m: -m.score):
             if len(added) == s.mirrors or mirror.score < s.mirror_score:
                 break
-            if not any(same_mirror(mirror, other, self.wavelength) for other in added) and self._add_mirror(
-                mirror
-            ):
+            double = any(same_mirror(mirror, other, self.wavelength) for other in added)
+            if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
     def _faces(self) -> list[SmallMirror]:
@@ -231,9 +223,9 @@ class _ClutterSearcher:
                     plane[axis], plane[3] = 1.0, offset
                     corners = box.view(2, 3) @ tangents(plane).T
                     patch = torch.cat([corners.amin(0), corners.amax(0)])
-                    mirror_score = SmallMirror(plane, patch, 0.0)
-                    if not any(same_mirror(mirror_score, other, SAME_FACE_M) for other in self.tried):
-                        found.append(mirror_score)
+                    mirror = SmallMirror(plane, patch, 0.0)
+                    if not any(same_mirror(mirror, other, SAME_FACE_M) for other in self.tried):
+                        found.append(mirror)
         self.tried += found
         return found
 
@@ -258,23 +250,14 @@ class _ClutterSearcher:
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))
 
-    def _with_mirror(self, mirror: SmallMirror) -> tuple[Scene, list[Word]]:
-        scene = self.scene
-        number, known = len(scene.planes), walls(scene.planes, scene.words)
-        trial = replace(
-            scene,
-            planes=torch.cat([scene.planes, mirror.plane[None]]),
-            clutter=scene.clutter.with_patch(mirror.patch, number),
-        )
-        return trial, _words_over(number, known)
-
     def _add_mirror(self, mirror: SmallMirror) -> bool:
-        """Try a small mirror with its best words."""
-        trial, words = self._with_mirror(mirror)
-        if self._wide(mirror):  # try an infinite wall first
-            endless = replace(trial, clutter=self.scene.clutter)
-            if self._add(endless, words, 1.5, WALL * self.parameter_cost, len(words)):
-                return True
+        """Try a small mirror with its best words; a wide one as an infinite wall first."""
+        scene, number = self.scene, len(self.scene.planes)
+        words = _words_over(number, walls(scene.planes, scene.words))
+        endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
+        trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
+        if self._wide(mirror) and self._add(endless, words, 1.5, WALL * self.parameter_cost, len(words)):
+            return True
         return self._add(trial, words, 1.5, MIRROR * self.parameter_cost, len(words))
 
     def _wide(self, mirror: SmallMirror) -> bool:
@@ -327,11 +310,8 @@ class _ClutterSearcher:
             louder = self.scene.log_amplitude.clone()
             louder[own] = louder[own].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
-            self._try(
-                replace(self.scene, log_amplitude=louder, clutter=clutter),
-                PATCH * self.parameter_cost,
-                exact=True,
-            )
+            trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
+            self._try(trial, PATCH * self.parameter_cost, exact=True)
 
     def _boxes(self) -> None:
         for _ in range(self.settings.boxes):
@@ -362,7 +342,7 @@ class _ClutterSearcher:
         for number in range(len(self.scene.clutter.boxes)):
             before, own = self.phased, self.scene.clutter.boxes[number]
             nll = self.nll
-            self._set_scene(self._with_clutter(self.scene.clutter.without_box(number)))
+            self._set_scene(self._with_clutter(self.scene.clutter.without(number)))
             near = own + 0.1 * torch.randn(4, 6, generator=self.generator)
             box, _ = find_box(
                 self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator,
@@ -377,18 +357,13 @@ class _ClutterSearcher:
 
     def _drop(self) -> None:
         """Remove clutter that the likelihood no longer supports."""
-        for kind, least in (("box", BOX * self.parameter_cost), ("patch", PATCH * self.parameter_cost)):
-            number = 0
-            while True:
-                clutter = self.scene.clutter
-                if number >= (len(clutter.boxes) if kind == "box" else len(clutter.patches)):
-                    break
-                rest = clutter.without_box(number) if kind == "box" else clutter.without_patch(number)
-                before, nll = self.phased, self.nll
-                self._set_scene(self._with_clutter(rest))
-                if self.nll > nll + least:
-                    self._set_scene(before)
-                    number += 1
+        number = 0
+        while number < len(clutter := self.scene.clutter):
+            parameters, before, nll = BOX if number < len(clutter.boxes) else PATCH, self.phased, self.nll
+            self._set_scene(self._with_clutter(clutter.without(number)))
+            if self.nll > nll + parameters * self.parameter_cost:
+                self._set_scene(before)
+                number += 1
 
     def _drop_words(self) -> None:
         """Remove sources whose constant and varying parts both gain too little."""

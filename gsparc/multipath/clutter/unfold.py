@@ -84,12 +84,7 @@ class Unfolding:
         variants = max(u.letter.shape[1] for u in many)
         order = max(u.letter.shape[2] for u in many)
         padded = [u.padded(variants, order) for u in many]
-        return Unfolding(
-            *(
-                torch.cat([getattr(u, name) for u in padded])
-                for name in ("chain", "normal", "offset", "letter", "given")
-            )
-        )
+        return Unfolding(*map(torch.cat, zip(*(vars(u).values() for u in padded), strict=True)))
 
     def padded(self, variants: int, order: int) -> Unfolding:
         """With room for more variants and letters."""

@@ -48,11 +48,7 @@ class UplinkField(UplinkMethod):
     name = "uplink"
 
     def __init__(
-        self,
-        search: SearchSettings | None = None,
-        teachers: int = 1200,
-        shrink: bool = True,
-        seed: int = 0,
+        self, search: SearchSettings | None = None, teachers: int = 1200, shrink: bool = True, seed: int = 0
     ) -> None:
         if teachers < 50:
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
@@ -118,11 +114,7 @@ class UplinkField(UplinkMethod):
         return self._predict_at(uplink, noise, self._downlink)
 
     def listen_at(
-        self,
-        uplink: Tensor,
-        frequency_hz: Tensor,
-        noise: Tensor | None = None,
-        antennas: slice = slice(None),
+        self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
     ) -> Prediction:
         """The same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
         tones = ((frequency_hz.double() - self._middle_hz) / self._spacing_hz).float()
