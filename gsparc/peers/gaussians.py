@@ -14,6 +14,9 @@ from gsparc.peers.network import Scene
 
 MARGIN = 2.0  # [m] around the moving end's box
 OPACITY = 0.3
+GEOMETRY_RATES = {  # learning rates of a `GaussianField` called `field`
+    "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
+}  # fmt: skip
 
 
 def gaussians_of(scene: Scene, count: int) -> GaussianField:

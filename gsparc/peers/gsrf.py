@@ -12,6 +12,7 @@ absorb it), adaptive density control, orthographic splatting onto a sphere of ra
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -19,7 +20,7 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
 from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
-from gsparc.peers.gaussians import RenderSettings, gaussians_of
+from gsparc.peers.gaussians import GEOMETRY_RATES, RenderSettings, gaussians_of
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.radiance import fourier_legendre, terms
 from gsparc.peers.trained import TrainedPeer
@@ -27,6 +28,7 @@ from gsparc.peers.trained import TrainedPeer
 TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 
 
+@dataclass(eq=False, kw_only=True)
 class GSRF(TrainedPeer):
     """Spectra and channels.
 
@@ -34,33 +36,20 @@ class GSRF(TrainedPeer):
         count: Gaussians.
         degree, order: largest Legendre degree and Fourier order of the radiance.
         fourier_weight: share of the loss in the frequency domain (spectra).
-        **training: see `TrainedPeer`.
+        others: see `TrainedPeer`.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
-    rates: ClassVar[dict[str, float]] = {
-        "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
-    }  # fmt: skip
-
-    def __init__(
-        self,
-        count: int = 500,
-        degree: int = 3,
-        order: int = 3,
-        fourier_weight: float = 0.05,
-        name: str = "gsrf",
-        **training,
-    ) -> None:
-        super().__init__(name, **training)
-        self.count, self.degree, self.order, self.fourier_weight = count, degree, order, fourier_weight
+    rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
+    name: str = "gsrf"
+    count: int = 500
+    degree: int = 3
+    order: int = 3
+    fourier_weight: float = 0.05
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
         return ComplexGaussians(scene, self.count, self.degree, self.order, self.fourier_weight)
-
-    def size(self) -> int:
-        """Number of Gaussians."""
-        return self.count
 
 
 class ComplexGaussians(Network):
@@ -68,7 +57,7 @@ class ComplexGaussians(Network):
 
     def __init__(self, scene: Scene, count: int, degree: int, order: int, fourier_weight: float) -> None:
         super().__init__()
-        self.scene, self.degree, self.order = scene, degree, order
+        self.scene, self.count, self.degree, self.order = scene, count, degree, order
         self.fourier_weight = fourier_weight
         self.field = gaussians_of(scene, count)
         self.rendering = RenderSettings(scene)

@@ -10,6 +10,7 @@ networks of 8 x 256, 64 samples a ray) is `width=256 depth=8 samples=64`: minute
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -27,6 +28,7 @@ POINTS = 2**16  # evaluated at a time at inference
 TINY = 1e-8  # under the root of a magnitude
 
 
+@dataclass(eq=False, kw_only=True)
 class NeRF2(TrainedPeer):
     """Spectra.
 
@@ -35,27 +37,20 @@ class NeRF2(TrainedPeer):
         samples: points per ray.
         rays: pixels drawn per step, spread over the batch.
         octaves: of the Fourier features of places and transmitters.
-        **training: see `TrainedPeer`.
+        others: see `TrainedPeer`.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
-
-    def __init__(
-        self,
-        width: int = 64,
-        depth: int = 4,
-        samples: int = 32,
-        rays: int = 1024,
-        octaves: int = 6,
-        name: str = "nerf2",
-        **training,
-    ) -> None:
-        super().__init__(name, **training)
-        self.shape = (width, depth, samples, rays, octaves)
+    name: str = "nerf2"
+    width: int = 64
+    depth: int = 4
+    samples: int = 32
+    rays: int = 1024
+    octaves: int = 6
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
-        return MarchedField(scene, *self.shape)
+        return MarchedField(scene, self.width, self.depth, self.samples, self.rays, self.octaves)
 
 
 class MarchedField(Network):

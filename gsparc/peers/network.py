@@ -45,6 +45,9 @@ class Scene:
 class Network(nn.Module):
     """Positions in, targets out: called with tx (B, 3) [m] and one shared or B receiver poses."""
 
+    scene: Scene
+    count = 0  # Gaussians, or virtual transmitters
+
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """Training loss () of a batch; `draw` for whatever is drawn at random."""
         prediction = self(batch.tx, batch.rx)

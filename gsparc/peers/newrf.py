@@ -14,6 +14,7 @@ the samples lie within 10 cm of where the intersection found something, in place
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -32,6 +33,7 @@ NEAR = 0.1  # [m] from the receiver, where rays begin
 AROUND = 0.1  # [m], half the interval of the fine samples
 
 
+@dataclass(eq=False, kw_only=True)
 class NeWRF(TrainedPeer):
     """Channels of one antenna and one tone, with directions of arrival.
 
@@ -39,23 +41,16 @@ class NeWRF(TrainedPeer):
         width, depth, octaves: of the network.
         samples: points per ray, half of them fine.
         neighbours: training receivers that vote at a query.
-        **training: see `TrainedPeer`.
+        others: see `TrainedPeer`.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("csi",)
-
-    def __init__(
-        self,
-        width: int = 128,
-        depth: int = 4,
-        octaves: int = 8,
-        samples: int = 64,
-        neighbours: int = 6,
-        name: str = "newrf",
-        **training,
-    ) -> None:
-        super().__init__(name, **training)
-        self.shape = (width, depth, octaves, samples, neighbours)
+    name: str = "newrf"
+    width: int = 128
+    depth: int = 4
+    octaves: int = 8
+    samples: int = 64
+    neighbours: int = 6
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Virtual transmitters, and which of them every training receiver sees.
@@ -82,38 +77,26 @@ class NeWRF(TrainedPeer):
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
-        return DirectedRays(scene, found, *self.shape)
-
-    def size(self) -> int:
-        """Number of virtual transmitters."""
-        return len(self.found["virtual"]) if self.found else 0
+        return DirectedRays(scene, found, self)
 
 
 class DirectedRays(Network):
     """The network and the march."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        found: dict[str, Tensor],
-        width: int,
-        depth: int,
-        octaves: int,
-        samples: int,
-        neighbours: int,
-    ) -> None:
+    def __init__(self, scene: Scene, found: dict[str, Tensor], settings: NeWRF) -> None:
         super().__init__()
         assert scene.site.wavelength is not None
-        self.scene, self.found = scene, found
-        self.samples, self.neighbours = samples, min(neighbours, len(found["places"]))
+        self.scene, self.found, self.count = scene, found, len(found["virtual"])
+        self.samples, self.neighbours = settings.samples, min(settings.neighbours, len(found["places"]))
         self.wavenumber = 2 * math.pi / scene.site.wavelength
         self.paths = max(1, round(float((found["votes"] > 0).sum(1).float().mean())))
         reach = (found["virtual"][:, None] - found["places"][None]).norm(dim=-1)
         self.far = float(torch.quantile(reach[found["votes"].T > 0], 0.99)) + AROUND
         around = torch.stack([scene.box[0] - self.far, scene.box[1] + self.far])
-        self.place = PositionEncoding(EncodingSettings("fourier", octaves), around)
+        self.place = PositionEncoding(EncodingSettings("fourier", settings.octaves), around)
         self.heading = PositionEncoding(EncodingSettings("fourier", 2), torch.tensor([[-1.0] * 3, [1.0] * 3]))
-        self.network = perceptron(self.place.width + self.heading.width, 3, width, depth)
+        inputs = self.place.width + self.heading.width
+        self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
     def search(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
         """Virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and whether each is (B, P).

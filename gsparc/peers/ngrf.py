@@ -13,6 +13,7 @@ predict, are what a declared static array makes of the same waves.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -23,33 +24,27 @@ from gsparc.ops import Pose
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.trained import TrainedPeer
 from gsparc.physics.array_response import bartlett, normalised, steering
+from gsparc.physics.waves import LIGHT
 
-LIGHT = 299_792_458.0
 MARGIN = 3.0  # [m] around the moving end's box, where radiators start
 TRANSMITTER_SPREAD = 0.05  # [m] of the one that starts at a known transmitter
 
 
+@dataclass(eq=False, kw_only=True)
 class NGRF(TrainedPeer):
     """Channels, and spectra of a static array.
 
     Args:
         count: Gaussians.
-        **training: see `TrainedPeer`.
+        others: see `TrainedPeer`.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("csi", "spectrum")
     rates: ClassVar[dict[str, float]] = {
         "means": 3e-3, "log_extents": 5e-3, "gains": 1e-2, "antennas": 5e-3,
     }  # fmt: skip
-
-    def __init__(
-        self,
-        count: int = 30,
-        name: str = "ngrf",
-        **training,
-    ) -> None:
-        super().__init__(name, **training)
-        self.count = count
+    name: str = "ngrf"
+    count: int = 30
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`; `ValueError` without a frequency, or for spectra without an array."""
@@ -60,10 +55,6 @@ class NGRF(TrainedPeer):
             raise ValueError(f"{self.name}: spectra need a static receiver with a declared array")
         return Radiators(scene, self.count)
 
-    def size(self) -> int:
-        """Number of Gaussians."""
-        return self.count
-
 
 class Radiators(Network):
     """N radiators."""
@@ -73,7 +64,7 @@ class Radiators(Network):
 
     def __init__(self, scene: Scene, count: int) -> None:
         super().__init__()
-        self.scene = scene
+        self.scene, self.count = scene, count
         spectrum = scene.site.kind == "spectrum"
         antennas, tones = (len(scene.site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
         low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN

@@ -13,6 +13,7 @@ our compositing in the limit of vanishing opacity, without occlusion.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -32,42 +33,29 @@ CUTOFF = Cutoff(3e-3, relative=True)
 SHIFT = 0.1  # [rad] per unit of the network's output
 
 
+@dataclass(eq=False, kw_only=True)
 class SwiftWRF(TrainedPeer):
     """Spectra.
 
     Args:
         count: Gaussians.
         width, depth, octaves: of the deforming network.
-        **training: see `TrainedPeer`.
+        others: see `TrainedPeer`.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
     rates: ClassVar[dict[str, float]] = {
-        "centres": 2e-3,
-        "log_widths": 5e-3,
-        "angles": 5e-3,
-        "strengths": 1e-2,
-    }
-
-    def __init__(
-        self,
-        count: int = 300,
-        width: int = 64,
-        depth: int = 3,
-        octaves: int = 5,
-        name: str = "swiftwrf",
-        **training,
-    ) -> None:
-        super().__init__(name, **training)
-        self.count, self.width, self.depth, self.octaves = count, width, depth, octaves
+        "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
+    }  # fmt: skip
+    name: str = "swiftwrf"
+    count: int = 300
+    width: int = 64
+    depth: int = 3
+    octaves: int = 5
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
         return PlanarGaussians(scene, self.count, self.width, self.depth, self.octaves)
-
-    def size(self) -> int:
-        """Number of Gaussians."""
-        return self.count
 
 
 class PlanarGaussians(Network):
@@ -80,7 +68,7 @@ class PlanarGaussians(Network):
     def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
         super().__init__()
         assert scene.site.grid is not None
-        self.scene, self.grid = scene, scene.site.grid
+        self.scene, self.count, self.grid = scene, count, scene.site.grid
         base, axes = lattice(self.grid, count)
         self.register_buffer("base", base)
         self.register_buffer("axes", axes)

@@ -6,6 +6,7 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from itertools import count
 from typing import Any, ClassVar
 
@@ -27,6 +28,7 @@ WARMUP = 0.02  # share of the training over which rates rise
 QUERY_CHUNK = 32  # bounds the memory of one prediction call
 
 
+@dataclass(eq=False, kw_only=True)
 class TrainedPeer(Method):
     """Learns from `fold.train` and `fold.val` together for a given time; nothing is chosen on `val`.
 
@@ -43,29 +45,23 @@ class TrainedPeer(Method):
 
     kinds: ClassVar[tuple[Kind, ...]]
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
+    name: str
+    budget_s: float | None = None
+    max_steps: int | None = None
+    batch_size: int = 8
+    rate: float = 2e-3
+    seed: int = 0
+    scene: Scene | None = field(default=None, init=False, repr=False)
+    network: Network | None = field(default=None, init=False, repr=False)
+    found: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
+    steps: int = field(default=0, init=False)
 
-    def __init__(
-        self,
-        name: str,
-        budget_s: float | None = None,
-        max_steps: int | None = None,
-        batch_size: int = 8,
-        rate: float = 2e-3,
-        seed: int = 0,
-    ) -> None:
-        budget_s = DEFAULT_BUDGET_S if budget_s is None else budget_s
-        if not budget_s > 0 or batch_size < 1:
+    def __post_init__(self) -> None:
+        budget_s = self.budget_s = DEFAULT_BUDGET_S if self.budget_s is None else self.budget_s
+        if not budget_s > 0 or self.batch_size < 1:
             raise ValueError(
-                f"{name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {batch_size}"
+                f"{self.name}: budget_s > 0 and batch_size >= 1 are needed, got {budget_s}, {self.batch_size}"
             )
-        self.name = name
-        self.budget_s, self.max_steps, self.batch_size = budget_s, max_steps, batch_size
-        self.rate, self.seed = rate, seed
-        self.site: Site | None = None
-        self.scene: Scene | None = None
-        self.network: Network | None = None
-        self.found: dict[str, Tensor] = {}
-        self.steps = 0
 
     @abstractmethod
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
@@ -123,9 +119,11 @@ class TrainedPeer(Method):
 
     def _progress(self, step: int, elapsed_s: float) -> float:
         """Share of the training that is over; step 0 is always taken."""
+        assert self.budget_s is not None
+        spent = elapsed_s / self.budget_s if step else 0.0
         if self.max_steps is None:
-            return elapsed_s / self.budget_s if step else 0.0
-        return max(step / self.max_steps, elapsed_s / self.budget_s if step else 0.0)
+            return spent
+        return max(step / self.max_steps, spent)
 
     def _groups(self, network: nn.Module) -> Iterator[dict[str, Any]]:
         for name, parameter in network.named_parameters():
@@ -138,6 +136,10 @@ class TrainedPeer(Method):
         if self.network is None:
             raise ValueError(f"{self.name}: not fitted yet; call fit or restore first")
         return self.network
+
+    def size(self) -> int:
+        """Number of Gaussians or virtual transmitters; 0 for a network without, and before `fit`."""
+        return 0 if self.network is None else self.network.count
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:

@@ -10,6 +10,7 @@ density control and the authors' own initial grid of Gaussians (ours start aroun
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -18,7 +19,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.ops import Pose
 from gsparc.peers.deformation import Deformation
-from gsparc.peers.gaussians import RenderSettings, gaussians_of, render_each
+from gsparc.peers.gaussians import GEOMETRY_RATES, RenderSettings, gaussians_of, render_each
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.trained import TrainedPeer
 
@@ -26,40 +27,27 @@ CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
 SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
 
 
+@dataclass(eq=False, kw_only=True)
 class WRFGSPlus(TrainedPeer):
     """Spectra.
 
     Args:
         count: Gaussians.
         width, depth, octaves: of the deforming network.
-        **training: see `TrainedPeer`.
+        others: see `TrainedPeer`.
     """
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
-    rates: ClassVar[dict[str, float]] = {
-        "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
-        "signals": 1e-2,
-    }  # fmt: skip
-
-    def __init__(
-        self,
-        count: int = 500,
-        width: int = 64,
-        depth: int = 3,
-        octaves: int = 5,
-        name: str = "wrfgs",
-        **training,
-    ) -> None:
-        super().__init__(name, **training)
-        self.count, self.width, self.depth, self.octaves = count, width, depth, octaves
+    rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
+    name: str = "wrfgs"
+    count: int = 500
+    width: int = 64
+    depth: int = 3
+    octaves: int = 5
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:
         """See `TrainedPeer.build`."""
         return DeformedGaussians(scene, self.count, self.width, self.depth, self.octaves)
-
-    def size(self) -> int:
-        """Number of Gaussians."""
-        return self.count
 
 
 class DeformedGaussians(Network):
@@ -67,7 +55,7 @@ class DeformedGaussians(Network):
 
     def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
         super().__init__()
-        self.scene, self.rendering = scene, RenderSettings(scene)
+        self.scene, self.count, self.rendering = scene, count, RenderSettings(scene)
         self.field = gaussians_of(scene, count)
         self.signals = nn.Parameter(torch.zeros(count))
         low, high = self.field.means.detach().amin(0), self.field.means.detach().amax(0)
