@@ -33,7 +33,7 @@ from gsparc.auto.decide import (
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.response import ResponseSettings
-from gsparc.methods.method import FitContext, FitReport, HasPaths, LeaveOneOut, Method, Prediction, Resumable
+from gsparc.methods.method import FitContext, FitReport, HasPaths, LeaveOneOut, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import method_class
@@ -129,7 +129,7 @@ class Gsparc(LearnedField):
         chosen = self._models[self._chosen or ""]
         if chosen is self._directional:  # fitted while deciding
             return self._directional_report
-        if context.resume is not None and not isinstance(chosen, Resumable):
+        if context.resume is not None and not chosen.resumable:
             raise ValueError(
                 f"ckpt_path: effects.{self._chosen} trains in one piece (recovered vectors are cached); "
                 "start again without ckpt_path"

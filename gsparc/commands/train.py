@@ -31,7 +31,7 @@ from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitReport, Method, Resumable, TrainsByGradient
+from gsparc.methods.method import FitReport, Method, TrainsByGradient
 from gsparc.methods.registry import build
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     resumes = [_resume(config, number, count) for number in range(count)]
     unfitted = build(config.model)
     _refuse_start(config, unfitted)
-    if any(resumes) and not isinstance(unfitted, Resumable):
+    if any(resumes) and not unfitted.resumable:
         raise ValueError(f"ckpt_path: {unfitted.name} trains in one piece; start again without ckpt_path")
     for guess in unfitted.guesses:
         log.info("guess: %s", guess)

@@ -150,7 +150,6 @@ class GaussianProcess(Interpolator, PredictsVariance):
     name = "gp"
 
     def __init__(self, components: int = 512) -> None:
-        super().__init__()
         if components < 1:
             raise ValueError(f"gp: components must be at least 1, got {components}")
         self.limit = components

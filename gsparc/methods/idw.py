@@ -24,9 +24,8 @@ class InverseDistance(Interpolator):
     NEAR = 1e-6  # [m]; a query on a sample repeats it instead of dividing by zero
 
     def __init__(self, neighbours: int = 8, power: float = 2.0) -> None:
-        super().__init__()
         if neighbours < 1:
-            raise ValueError(f"idw: neighbours must be at least 1, got {neighbours}")
+            raise ValueError(f"{self.name}: neighbours must be at least 1, got {neighbours}")
         self.neighbours, self.power = neighbours, power
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
@@ -43,7 +42,8 @@ class InverseDistance(Interpolator):
         return Prediction(self._decode(blend), confidence=self.samples.confidence(distance[:, 0]))
 
     def _learned(self) -> dict[str, Any]:
-        return self.samples.state()
+        kept = self.samples
+        return {"positions": torch.from_numpy(kept.positions), "targets": torch.from_numpy(kept.targets)}
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        self.samples = Neighbours.from_state(state)
+        self.samples = Neighbours(state["positions"].numpy(), state["targets"].numpy())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -24,10 +24,9 @@ class Interpolator(Method):
     The query is the position of the moving end; orientations are not used.
     """
 
-    def __init__(self) -> None:
-        self.site: Site | None = None
-        self.shape: tuple[int, ...] = ()
-        self.seen = 0
+    stored: ClassVar[tuple[str, ...]] = ()  # attributes that are learned, by their names in a checkpoint
+    shape: tuple[int, ...] = ()
+    seen = 0
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none."""
@@ -75,11 +74,12 @@ class Interpolator(Method):
     def _look_up(self, queries: np.ndarray) -> Prediction:
         """Predict at (B, 3) float64 [m]."""
 
-    @abstractmethod
-    def _learned(self) -> dict[str, Any]: ...
+    def _learned(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in self.stored}
 
-    @abstractmethod
-    def _relearn(self, state: dict[str, Any]) -> None: ...
+    def _relearn(self, state: dict[str, Any]) -> None:
+        for name in self.stored:
+            setattr(self, name, state[name])
 
 
 class Neighbours:
@@ -97,15 +97,6 @@ class Neighbours:
     def confidence(self, nearest: np.ndarray) -> Tensor:
         """exp(-distance / typical spacing of the training set), (B,) in [0, 1]."""
         return torch.from_numpy(np.exp(-nearest / self.reach)).float()
-
-    def state(self) -> dict[str, Tensor]:
-        """Plain tensors."""
-        return {"positions": torch.from_numpy(self.positions), "targets": torch.from_numpy(self.targets)}
-
-    @staticmethod
-    def from_state(state: dict[str, Any]) -> Neighbours:
-        """Inverse of `state`."""
-        return Neighbours(state["positions"].numpy(), state["targets"].numpy())
 
 
 def _typical_spacing(tree: cKDTree, positions: np.ndarray) -> float:

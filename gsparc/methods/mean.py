@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 
@@ -16,6 +14,7 @@ class Mean(Interpolator):
     """Predicts the training mean everywhere (of decibels for RSSI)."""
 
     name = "mean"
+    stored = ("value",)
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         assert self.site is not None
@@ -27,9 +26,3 @@ class Mean(Interpolator):
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         return Prediction(self._decode(self.value.expand(len(queries), -1).contiguous()))
-
-    def _learned(self) -> dict[str, Any]:
-        return {"value": self.value}
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        self.value = state["value"]

@@ -97,6 +97,7 @@ class Method(ABC):
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
+    resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
 
     @abstractmethod
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -212,14 +213,6 @@ class Differentiable(Protocol):
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean of `predict`, with autograd, at tx (B, 3) [m] and one shared or B receiver poses."""
-
-
-@runtime_checkable
-class Resumable(Protocol):
-    """Goes on from what an interrupted run left (`FitContext.resume`)."""
-
-    def resume_problem(self) -> str | None:
-        """Why it cannot with its present settings; None when it can."""
 
 
 @runtime_checkable

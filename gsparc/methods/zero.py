@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 
@@ -23,9 +21,3 @@ class Zero(Interpolator):
         assert self.site is not None
         dtype = torch.complex64 if self.site.kind == "csi" else torch.float32
         return Prediction(torch.zeros(len(queries), *self.shape, dtype=dtype))
-
-    def _learned(self) -> dict[str, Any]:
-        return {}
-
-    def _relearn(self, state: dict[str, Any]) -> None:
-        pass

@@ -67,6 +67,7 @@ class ImageSourceGP(FramedMethod):
     """
 
     name = "image_source_gp"
+    resumable = True  # finished searches are kept in `last.ckpt`
 
     def __init__(
         self,
@@ -273,11 +274,7 @@ class ImageSourceGP(FramedMethod):
         predicted = (self.weights[:, None, None] * each).sum(0)
         return self._left_out(self.members[0].rows, predicted, self.offsets != "none")
 
-    # ---- resume and reductions ----
-    def resume_problem(self) -> str | None:
-        """None: finished searches are kept in `last.ckpt`."""
-        return None
-
+    # ---- reductions ----
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
         return ("searches", "keep", "confidence")

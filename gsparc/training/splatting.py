@@ -59,6 +59,8 @@ class LearnedField(Method):
         guesses: settings the source of this configuration does not give, one line each.
     """
 
+    resumable = True  # every step's state is in `last.ckpt`
+
     def __init__(
         self,
         field: FieldSettings = FieldSettings(),
@@ -260,10 +262,6 @@ class LearnedField(Method):
         return self.fitted()(tx, rx).mean
 
     # -- what it can do besides ----------------------------------------------------------------------
-
-    def resume_problem(self) -> str | None:
-        """None: every step's state is in `last.ckpt`."""
-        return None
 
     def trainer_options(self) -> bool:
         """See `TrainsByGradient`."""
