@@ -33,7 +33,15 @@ from gsparc.auto.decide import (
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.response import ResponseSettings
-from gsparc.methods.method import FitContext, FitReport, HasPaths, LeaveOneOut, Method, Prediction
+from gsparc.methods.method import (
+    Differentiable,
+    FitContext,
+    FitReport,
+    HasPaths,
+    LeaveOneOut,
+    Method,
+    Prediction,
+)
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import method_class
@@ -221,7 +229,10 @@ class Gsparc(LearnedField):
         """See `Differentiable`; of what was chosen, where that has gradients, without a companion."""
         if self._chosen is None:
             return super().mean_at(tx, rx)
-        return self._models[self._chosen].mean_at(tx, rx)  # type: ignore[attr-defined]
+        chosen = self._models[self._chosen]
+        if not isinstance(chosen, Differentiable):
+            raise ValueError(f"{chosen.name}: its mean has no gradients by position")
+        return chosen.mean_at(tx, rx)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """See `HasPaths`; of what was chosen, without a companion."""

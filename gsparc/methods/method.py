@@ -190,12 +190,13 @@ class Reducible(Protocol):
 
 
 class PredictsVariance(Method):
-    """Methods whose every prediction has a variance; makes them `HasVariance`."""
+    """Methods whose predictions have a variance; makes them `HasVariance`."""
 
     def variance_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `HasVariance`."""
         variance = self.predict(tx, rx).variance
-        assert variance is not None
+        if variance is None:
+            raise ValueError(f"{self.name}: has no variance of {self.site.kind if self.site else 'anything'}")
         return variance
 
 
@@ -204,7 +205,11 @@ class HasVariance(Protocol):
     """Knows the expected squared error of its predictions."""
 
     def variance_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """(B,) float32, expected squared error per entry, stored units."""
+        """(B,) float32, expected squared error per entry, stored units.
+
+        Raises:
+            ValueError: what was fitted here has none.
+        """
 
 
 @runtime_checkable
@@ -212,7 +217,11 @@ class Differentiable(Protocol):
     """Its mean has gradients by position."""
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The mean of `predict`, with autograd, at tx (B, 3) [m] and one shared or B receiver poses."""
+        """The mean of `predict`, with autograd, at tx (B, 3) [m] and one shared or B receiver poses.
+
+        Raises:
+            ValueError: what was fitted here has no gradients.
+        """
 
 
 @runtime_checkable

@@ -60,8 +60,8 @@ class FramedMethod(PredictsVariance):
         if site.moving_end == "rx":
             places = query_elements(site, rx, len(tx), self.antennas)
         else:
-            places = tx.detach().cpu().double().numpy()[:, None]
-        return torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle, len(places)
+            places = tx.cpu().double()[:, None]
+        return places.reshape(-1, 3) - self.frame.middle, len(places)
 
     def _stored(self, mean: Tensor, tones: Tensor) -> Tensor:
         """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""

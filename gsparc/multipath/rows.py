@@ -43,12 +43,13 @@ def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: i
     return position[:, None, :] + np.einsum("sij,ej->sei", rotation, np.asarray(site.array, np.float64))
 
 
-def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> np.ndarray:
-    """The same (count, E, 3) for queries: `count` poses, or one shared by all."""
-    position = rx.position.detach().cpu().double().numpy().reshape(-1, 3)
-    rotation = rx.rotation.detach().cpu().double().numpy().reshape(-1, 3, 3)
-    places = elements(site, position, rotation, antennas)
-    return np.broadcast_to(places, (count, *places.shape[1:]))
+def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> Tensor:
+    """The same (count, E, 3) for queries, with autograd: `count` poses, or one shared by all."""
+    places = rx.position.cpu().double().reshape(-1, 1, 3)
+    if site.array is not None and antennas > 1:
+        rotation = rx.rotation.cpu().double().reshape(-1, 3, 3)
+        places = places + torch.einsum("sij,ej->sei", rotation, torch.as_tensor(site.array).double())
+    return places.expand(count, -1, 3)
 
 
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:

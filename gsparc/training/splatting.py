@@ -25,7 +25,7 @@ from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
-from gsparc.field.response import ResponseSettings
+from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.pareto import Settings
@@ -258,7 +258,13 @@ class LearnedField(Method):
         return self._frozen
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """The model's own mean, not clamped; see `Differentiable`."""
+        """The model's own mean, not clamped; see `Differentiable`.
+
+        Raises:
+            ValueError: gradients by the receiver's position are asked for, and images depend on it.
+        """
+        if rx.position.requires_grad and not isinstance(self.fitted().response, PathResponse):
+            raise ValueError(f"{self.name}: footprints have no gradients by the receiver's position")
         return self.fitted()(tx, rx).mean
 
     # -- what it can do besides ----------------------------------------------------------------------
