@@ -21,7 +21,6 @@ import torch
 from gsparc.ops.settings import KernelSettings
 
 SOURCES = Path(__file__).parent / "csrc"
-UNITS = ("plan", "composite", "frozen", "networks", "similarity")
 FLAGS = ("-std=c++17", "-O3", "-fmad=false", "--expt-relaxed-constexpr", "-Xcompiler=-fPIC", "-shared", "-t0")
 LOG = logging.getLogger(__name__)
 
@@ -159,7 +158,7 @@ def fingerprint(*also: str) -> str:
 
 def units() -> list[str]:
     """The sources to compile."""
-    return [str(SOURCES / "cuda" / f"{unit}.cu") for unit in UNITS]
+    return sorted(str(unit) for unit in (SOURCES / "cuda").glob("*.cu"))
 
 
 def build(path: Path, *architectures: str) -> None:

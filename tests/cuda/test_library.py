@@ -219,4 +219,5 @@ def test_compiles(arch, tmp_path, monkeypatch):
 
 
 def test_sources_stay_beside_the_package():
-    assert all(Path(unit).is_file() for unit in cuda_library.units())
+    found = {Path(unit).stem for unit in cuda_library.units()}
+    assert {"plan", "composite", "frozen", "networks", "similarity"} <= found
