@@ -28,7 +28,7 @@ from gsparc.ops import (
     operators,
     rasterize,
 )
-from gsparc.training.losses import _Kernel, _Similarity, ssim
+from gsparc.training.losses import _Kernel, _written_out, ssim
 
 GRID = SphereGrid.hemisphere()
 Model = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -376,8 +376,8 @@ def similarity(batch: int, limits: dict[str, Any]) -> dict[str, Any]:
     images = torch.rand(2, batch, GRID.height, GRID.width, device="cuda")
     prediction, target = images[0].requires_grad_(), images[1]
     steps = {
-        name: lambda kind=kind: torch.autograd.grad(kind.apply(prediction, target).sum(), prediction)
-        for name, kind in (("ours", _Kernel), ("written_out", _Similarity))
+        name: lambda kind=kind: torch.autograd.grad(kind(prediction, target).sum(), prediction)
+        for name, kind in (("ours", _Kernel.apply), ("written_out", _written_out))
     }
     found: dict[str, Any] = {name: {"end_to_end": wall_ms(step)} for name, step in steps.items()}
     # Windows of 11 and 11 taps over five maps and, transposed, over three; images read, a gradient written.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from typing import Any
 
 import lightning.pytorch as L
@@ -14,6 +15,7 @@ from gsparc.field.response import PathResponse
 log = logging.getLogger(__name__)
 
 
+@dataclass(eq=False)
 class ContributionPruning(L.Callback):
     """Drop sources whose share of the power at the training rows is small; only where there is carrier phase.
 
@@ -22,9 +24,8 @@ class ContributionPruning(L.Callback):
         least_share: of the power; the strongest source always stays.
     """
 
-    def __init__(self, interval: int = 100, least_share: float = 1e-4) -> None:
-        self.interval = interval
-        self.least_share = least_share
+    interval: int = 100
+    least_share: float = 1e-4
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Prune when the schedule says so."""

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import logging
 import math
+from dataclasses import dataclass, field
 from typing import Any
 
 import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, whole
+from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 
 log = logging.getLogger(__name__)
 
 
-class Densify(L.Callback):
+@dataclass(eq=False)
+class Densify(Checked, L.Callback):
     """Clone, split and prune on a schedule of steps.
 
     Args:
@@ -32,33 +34,17 @@ class Densify(L.Callback):
         min_gaussians: pruning stops at this many, the most opaque stay.
     """
 
-    def __init__(
-        self,
-        start: int = 500,
-        stop: int = 15_000,
-        interval: int = 100,
-        grad_threshold: float = 2e-4,
-        size_share: float = 0.01,
-        children: int = 2,
-        min_opacity: float = 0.005,
-        max_radius: float | None = None,
-        max_gaussians: int = 100_000,
-        min_gaussians: int = 16,
-    ) -> None:
-        check_arguments(
-            locals(), start=whole(0), stop=whole(0), interval=whole(1), grad_threshold=number(0),
-            size_share=number(0), children=whole(2), max_radius=or_null(POSITIVE), max_gaussians=whole(1),
-            min_gaussians=whole(0),
-        )  # fmt: skip
-        self.start, self.stop, self.interval = start, stop, interval
-        self.grad_threshold = grad_threshold
-        self.size_share = size_share
-        self.children = children
-        self.min_opacity = min_opacity
-        self.max_radius = max_radius
-        self.max_gaussians = max_gaussians
-        self.min_gaussians = min_gaussians
-        self.statistics: dict[str, Tensor] = {}
+    start: int = setting(500, whole(0))
+    stop: int = setting(15_000, whole(0))
+    interval: int = setting(100, whole(1))
+    grad_threshold: float = setting(2e-4, number(0))
+    size_share: float = setting(0.01, number(0))
+    children: int = setting(2, whole(2))
+    min_opacity: float = 0.005
+    max_radius: float | None = setting(None, or_null(POSITIVE))
+    max_gaussians: int = setting(100_000, whole(1))
+    min_gaussians: int = setting(16, whole(0))
+    statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
 
     def _blank(self, model: GaussianModel) -> dict[str, Tensor]:
         count = len(model.gaussians)
@@ -99,17 +85,17 @@ class Densify(L.Callback):
 
     def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
-        field = model.gaussians
+        gaussians = model.gaussians
         mean_gradient = self.statistics["gradient"] / self.statistics["seen"].clamp_min(1)
         under_reconstructed = mean_gradient >= self.grad_threshold
-        size = field.scales.amax(1)
+        size = gaussians.scales.amax(1)
         scene_radius = float((torch.as_tensor(model.site.box[1] - model.site.box[0])).norm() / 2)
         large = size > self.size_share * scene_radius
 
-        prune = field.opacities < self.min_opacity
+        prune = gaussians.opacities < self.min_opacity
         if self.max_radius is not None:
             prune |= self.statistics["radius"] > self.max_radius
-        prune = self._keep_at_least(prune, field.opacities)
+        prune = self._keep_at_least(prune, gaussians.opacities)
 
         room = max(self.max_gaussians - int((~prune).sum()), 0)
         cost = torch.where(large, self.children - 1, 1)
@@ -118,14 +104,10 @@ class Densify(L.Callback):
         clones = clone.nonzero().squeeze(1)
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
         parents = torch.cat([clones, splits])
-        scales = torch.cat(
-            [
-                field.log_scales[clones],
-                field.log_scales[splits] - math.log(0.8 * self.children),
-            ]
-        )
-        spread = _sample_inside(field.scales[splits], field.quats[splits], generator)
-        means = torch.cat([field.means[clones], field.means[splits] + spread])
+        smaller = gaussians.log_scales[splits] - math.log(0.8 * self.children)
+        scales = torch.cat([gaussians.log_scales[clones], smaller])
+        spread = _sample_inside(gaussians.scales[splits], gaussians.quats[splits], generator)
+        means = torch.cat([gaussians.means[clones], gaussians.means[splits] + spread])
         return edit.Edit(
             keep=~(prune | split),
             parents=parents,

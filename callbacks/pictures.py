@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import lightning.pytorch as L
@@ -9,11 +10,12 @@ import numpy as np
 import torch
 
 from gsparc.callbacks.ledger import CostLedger
-from gsparc.data.limits import check_arguments, whole
+from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
 
 
-class Pictures(L.Callback):
+@dataclass(eq=False)
+class Pictures(Checked, L.Callback):
     """Draw a few validation rows; without any, nothing, because training rows flatter.
 
     Args:
@@ -21,10 +23,8 @@ class Pictures(L.Callback):
         count: number of rows drawn.
     """
 
-    def __init__(self, every: int = 1000, count: int = 4) -> None:
-        check_arguments(locals(), every=whole(1), count=whole(1))
-        self.every = every
-        self.count = count
+    every: int = setting(1000, whole(1))
+    count: int = setting(4, whole(1))
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Draw when it is time."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,11 @@ class Trusted:
         kernel: of the process whose variance is a rival; None where no rival was stored.
     """
 
-    kind: str | None
-    threshold: float
-    promise: Promise | None
-    known: np.ndarray
-    kernel: Kernel | None
+    kind: str | None = None
+    threshold: float = float("inf")
+    promise: Promise | None = None
+    known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    kernel: Kernel | None = None
 
     def confidence(self, said: Prediction, places: np.ndarray | None, kind: str | None = None) -> np.ndarray:
         """Confidence (B,) float32 in [0, 1] of predictions at local `places` (B, 3) [m] (None: unknown).
@@ -85,25 +85,14 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
 
 def keep(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    checkpoint.amend(
-        path,
-        {
-            KEY: {
-                "kind": trusted.kind,
-                "threshold": trusted.threshold,
-                "promise": None if trusted.promise is None else asdict(trusted.promise),
-                "known": trusted.known,
-                "kernel": None if trusted.kernel is None else asdict(trusted.kernel),
-            }
-        },
-    )
+    checkpoint.amend(path, {KEY: asdict(trusted)})
 
 
 def kept(extra: Mapping[str, Any]) -> Trusted:
     """What a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
     found = extra.get(KEY)
     if found is None:
-        return Trusted(None, float("inf"), None, np.zeros((0, 3)), None)
+        return Trusted()
     promise, kernel = found["promise"], found["kernel"]
     return Trusted(
         found["kind"],

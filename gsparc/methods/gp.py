@@ -148,6 +148,7 @@ class GaussianProcess(Interpolator, PredictsVariance):
     """
 
     name = "gp"
+    stored = ("mean", "axes", "weights", "lost")
 
     def __init__(self, components: int = 512) -> None:
         if components < 1:
@@ -161,15 +162,10 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.kernel = choose_kernel(positions, parts.scores, entries)
         self.lost, self.positions = parts.lost, positions
         self.factor = cho_factor(self.kernel.gram(positions), lower=True)
-        weights = torch.from_numpy(cho_solve(self.factor, parts.scores))
-        self.mean, self.axes, self.weights = (
-            torch.from_numpy(parts.mean),
-            torch.from_numpy(parts.axes),
-            weights,
-        )
-        notes = [
-            f"gp: length {self.kernel.length:.4g} m, noise {self.kernel.noise:.3g} of the signal's variance"
-        ]
+        self.weights = torch.from_numpy(cho_solve(self.factor, parts.scores))
+        self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
+        found = self.kernel
+        notes = [f"gp: length {found.length:.4g} m, noise {found.noise:.3g} of the signal's variance"]
         if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
             notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
         return tuple(notes)
@@ -211,17 +207,11 @@ class GaussianProcess(Interpolator, PredictsVariance):
         return reduced(self, settings)
 
     def _learned(self) -> dict[str, Any]:
-        return {
-            "positions": torch.from_numpy(self.positions),
-            "mean": self.mean,
-            "axes": self.axes,
-            "weights": self.weights,
-            "kernel": [self.kernel.length, self.kernel.noise, self.kernel.amplitude],
-            "lost": self.lost,
-        }
+        kernel = [self.kernel.length, self.kernel.noise, self.kernel.amplitude]
+        return {**super()._learned(), "positions": torch.from_numpy(self.positions), "kernel": kernel}
 
     def _relearn(self, state: dict[str, Any]) -> None:
+        super()._relearn(state)
         self.kernel = Kernel(*(float(v) for v in state["kernel"]))
-        self.positions, self.lost = state["positions"].numpy(), float(state["lost"])
-        self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
+        self.positions = state["positions"].numpy()
         self.factor = cho_factor(self.kernel.gram(self.positions), lower=True)

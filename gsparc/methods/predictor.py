@@ -13,7 +13,7 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import Kind, Site
 from gsparc.methods import checkpoint
 from gsparc.methods.confidence import Trusted, kept
-from gsparc.methods.method import Method, Prediction
+from gsparc.methods.method import Method
 from gsparc.methods.timing import Call
 from gsparc.ops import Pose
 
@@ -49,7 +49,7 @@ class Predictor:
         trusted: Trusted | None = None,
         kind: str | None = None,
     ) -> None:
-        self.trusted, self.kind = trusted or Trusted(None, float("inf"), None, np.zeros((0, 3)), None), kind
+        self.trusted, self.kind = trusted or Trusted(), kind
         self.method, self.site, self.point = method, site, point
         self._whole = whole or method
         self._still = self._still_pose()
@@ -174,15 +174,11 @@ class Predictor:
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
                 f"call .{self.site.kind}(...)"
             )
-        prediction, single, like = self._predict(tx, rx, self.method)
-        scale, mean = self.site.target_scale, prediction.mean
-        return _returned(mean if scale == 1 else mean * scale, single, like)
-
-    def _predict(self, tx: Any, rx: Any, method: Method) -> tuple[Prediction, bool, bool]:
-        """The prediction, whether one position was asked for, and whether torch was given."""
         asked, pose, single, like = self._ends(tx, rx)
         with torch.no_grad():
-            return method.predict(asked, pose), single, like
+            mean = self.method.predict(asked, pose).mean
+        scale = self.site.target_scale
+        return _returned(mean if scale == 1 else mean * scale, single, like)
 
     def _ends(self, tx: Any, rx: Any) -> tuple[Tensor, Pose, bool, bool]:
         """Both ends in local coordinates, whether one position was asked for, and whether torch was given."""

@@ -5,27 +5,21 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Fold
-from gsparc.methods.method import FitContext, FitReport, Method, Prediction, Reducible
+from gsparc.data.schema import Measurements
+from gsparc.methods.method import Method, Prediction, Reducible
 from gsparc.methods.pareto import Settings
 from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
-AS_TRAINED = {
-    "keep": 1.0,
-    "stride": 1,
-    "cutoff": 1,
-    "confidence": True,
-    "frozen": True,
-    "hybrid": True,
-}  # else: None
+AS_TRAINED = {  # else: None
+    "keep": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True, "hybrid": True,
+}  # fmt: skip
 Measured = dict[str, Tensor]
 
 
@@ -96,17 +90,11 @@ class View(Method):
         """As the inner method's."""
         return self.inner.size()
 
-    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+    def fit(self, *unused: Any, **named: Any) -> NoReturn:
         """Refused: `TypeError`."""
-        raise TypeError("a view of a trained method is not trained")
+        raise TypeError("a view of a trained method is neither trained nor stored")
 
-    def state(self) -> dict[str, Any]:
-        """Refused: `TypeError`."""
-        raise TypeError("a view of a trained method is not stored")
-
-    def restore(self, site: Site, state: dict[str, Any]) -> None:
-        """Refused: `TypeError`."""
-        raise TypeError("a view of a trained method is not stored")
+    state = restore = fit
 
 
 class MeanOnly(View):

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, Prediction
-from gsparc.methods.uplink_method import UplinkMethod
+from gsparc.methods.uplink_method import UplinkMethod, rms
 
 PENALTIES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 
@@ -57,22 +57,16 @@ class Ridge(UplinkMethod):
         """Gram matrices (M, F, F) and products with the targets (M, F, O)."""
         batch = data.batch(rows)
         assert batch.uplink is not None
-        scale = _scale(batch.uplink) if unit else torch.ones(len(rows))
-        x = self._inputs(batch.uplink) / scale[:, None, None]
-        y = self._outputs(batch.target) / scale[:, None, None]
-        x, y = x.transpose(0, 1), y.transpose(0, 1)
+        scale = rms(batch.uplink) if unit else torch.ones(len(rows))
+        targets = batch.target.flatten(1)[:, None] if self.inputs == "all" else batch.target
+        x = (self._inputs(batch.uplink) / scale[:, None, None]).transpose(0, 1)
+        y = (targets / scale[:, None, None]).transpose(0, 1)
         adjoint = x.transpose(1, 2).conj()
         return adjoint @ x, adjoint @ y
 
     def _inputs(self, uplink: Tensor) -> Tensor:
         """(B, M, F): M maps of F inputs each."""
-        assert self.site is not None
-        if self.inputs == "all":
-            return uplink.flatten(1)[:, None]
-        return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
-
-    def _outputs(self, target: Tensor) -> Tensor:
-        return target.flatten(1)[:, None] if self.inputs == "all" else target
+        return uplink.flatten(1)[:, None] if self.inputs == "all" else self.own(uplink)
 
     def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
         """See `UplinkMethod.listen`."""
@@ -94,10 +88,6 @@ def _solve(gram: Tensor, product: Tensor, penalty: float) -> Tensor:
     level = torch.where(level > 0, penalty * level, 1.0)  # a dead antenna has nothing to solve for
     ridge = level[:, None, None] * torch.eye(gram.shape[1])
     return torch.linalg.solve(gram + ridge, product)
-
-
-def _scale(uplink: Tensor) -> Tensor:
-    return uplink.abs().square().mean((1, 2)).sqrt().clamp_min(1e-30)
 
 
 def _power(channel: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -38,17 +38,10 @@ class Operating:
 def keep(path: Path, points: Sequence[Point], figure: str, measured: Measured) -> None:
     """Store points in a checkpoint, replacing earlier ones; the file is rewritten whole or not at all."""
     stored = [
-        {
-            "label": p.label,
-            "settings": dict(p.settings),
-            "threads": p.threads,
-            "score": p.closeness_db,
-            "figure": [figure, p.value(figure)],
-            "p50_ms": p.p50,
-        }
+        Operating(p.label, dict(p.settings), p.threads, p.closeness_db, (figure, p.value(figure)), p.p50)
         for p in points
     ]
-    checkpoint.amend(path, {KEY: {"points": stored, "measured": measured}})
+    checkpoint.amend(path, {KEY: {"points": [asdict(point) for point in stored], "measured": measured}})
 
 
 def kept(extra: dict[str, Any]) -> tuple[list[Operating], Measured]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from abc import abstractmethod
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
@@ -25,10 +27,13 @@ class SeparatesPaths(Protocol):
         """Channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
 
 
+def rms(channels: Tensor) -> Tensor:
+    """Root mean square (B,) of channels (B, antennas, tones), not below 1e-30."""
+    return channels.abs().square().mean((1, 2)).sqrt().clamp_min(1e-30)
+
+
 class UplinkMethod(Method):
     """A method that needs the snapshot's own uplink; a position alone is no question to it."""
-
-    site: Site | None = None
 
     def answer(self, batch: Batch) -> Prediction:
         """Predict from `batch.uplink` (B, U, L).
@@ -49,6 +54,11 @@ class UplinkMethod(Method):
     @abstractmethod
     def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
         """Channels of the downlink (B, A, K) from uplinks (B, U, L), with noise powers (B,) where known."""
+
+    def own(self, uplink: Tensor) -> Tensor:
+        """Of uplinks (B, U, L), those (B, A, L) heard by the antennas that answer."""
+        assert self.site is not None
+        return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
 
     def _need_uplink(self, data: Measurements) -> Site:
         if data.site.kind != "csi" or data.uplink is None or data.site.antennas is None:

@@ -10,17 +10,15 @@ from torch import Tensor, nn
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 
-def perceptron(inner: int, outer: int, width: int, depth: int, *, zero_output: bool = False) -> nn.Sequential:
-    """`depth` hidden layers of `width`; `zero_output`: the last layer starts at zero."""
+def perceptron(
+    inner: int, outer: int, width: int, depth: int, activation: type[nn.Module] = nn.ReLU
+) -> nn.Sequential:
+    """`depth` hidden layers of `width`."""
     sizes = [inner, *[width] * depth]
     layers: list[nn.Module] = []
     for a, b in pairwise(sizes):
-        layers += [nn.Linear(a, b), nn.ReLU()]
-    last = nn.Linear(sizes[-1], outer)
-    if zero_output:
-        nn.init.zeros_(last.weight)
-        nn.init.zeros_(last.bias)
-    return nn.Sequential(*layers, last)
+        layers += [nn.Linear(a, b), activation()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
 
 
 class Deformation(nn.Module):
@@ -43,7 +41,9 @@ class Deformation(nn.Module):
         # The first layer is linear: its two halves are added instead of writing every pair of inputs out.
         self.by_place = nn.Linear(self.place.width, width)
         self.by_query = nn.Linear(self.query.width, width)
-        self.rest = perceptron(width, outputs, width, depth - 1, zero_output=True)
+        self.rest = perceptron(width, outputs, width, depth - 1)
+        for parameter in self.rest[-1].parameters():
+            nn.init.zeros_(parameter)
 
     def forward(self, places: Tensor, queries: Tensor) -> Tensor:
         """places (N, 3) [m], queries (B, 3) [m] -> (B, N, outputs)."""

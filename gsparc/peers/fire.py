@@ -7,6 +7,7 @@ paths, and the decoder evaluates them in the other band. Sizes and training are 
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,8 @@ from torch import Tensor, nn
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, Prediction
-from gsparc.methods.uplink_method import UplinkMethod
+from gsparc.methods.uplink_method import UplinkMethod, rms
+from gsparc.peers.deformation import perceptron
 
 
 class Network(nn.Module):
@@ -24,14 +26,8 @@ class Network(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, hidden: int, code: int) -> None:
         super().__init__()
-        self.encoder = nn.Sequential(
-            nn.Linear(2 * inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(),
-            nn.Linear(hidden, 2 * code),
-        )  # fmt: skip
-        self.decoder = nn.Sequential(
-            nn.Linear(code, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(),
-            nn.Linear(hidden, 2 * outputs),
-        )  # fmt: skip
+        self.encoder = perceptron(2 * inputs, 2 * code, hidden, 2, nn.GELU)
+        self.decoder = perceptron(code, 2 * outputs, hidden, 2, nn.GELU)
 
     def forward(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Downlink (B, K) and the code's divergence from a standard normal (B,)."""
@@ -42,6 +38,7 @@ class Network(nn.Module):
         return torch.view_as_complex(out.view(len(out), -1, 2)), divergence
 
 
+@dataclass(eq=False)
 class Fire(UplinkMethod):
     """One network for all antennas, each snapshot at unit uplink power.
 
@@ -54,21 +51,17 @@ class Fire(UplinkMethod):
     """
 
     name = "fire"
+    hidden: int = 256
+    code: int = 32
+    divergence: float = 1e-4
+    steps: int = 4000
+    batch: int = 512
+    rate: float = 1e-3
+    seed: int = 0
 
-    def __init__(
-        self,
-        hidden: int = 256,
-        code: int = 32,
-        divergence: float = 1e-4,
-        steps: int = 4000,
-        batch: int = 512,
-        rate: float = 1e-3,
-        seed: int = 0,
-    ) -> None:
-        if min(hidden, code, steps, batch) < 1:
+    def __post_init__(self) -> None:
+        if min(self.hidden, self.code, self.steps, self.batch) < 1:
             raise ValueError("fire: hidden, code, steps and batch must be at least 1")
-        self.hidden, self.code, self.divergence = hidden, code, divergence
-        self.steps, self.batch, self.rate, self.seed = steps, batch, rate, seed
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train on all antennas of train and val rows (no choice is made on val)."""
@@ -76,8 +69,8 @@ class Fire(UplinkMethod):
         self.site = self._need_uplink(data)
         rows = data.batch(np.concatenate([fold.train, fold.val]))
         assert rows.uplink is not None
-        scale = _scale(rows.uplink)
-        x = (self._own(rows.uplink) / scale).flatten(0, 1)
+        scale = rms(rows.uplink)[:, None, None]
+        x = (self.own(rows.uplink) / scale).flatten(0, 1)
         y = (rows.target / scale).flatten(0, 1)
         generator = torch.Generator().manual_seed(self.seed)
         with torch.random.fork_rng():
@@ -90,9 +83,8 @@ class Fire(UplinkMethod):
             pick = torch.randint(len(x), (self.batch,), generator=generator)
             noise = torch.randn(self.batch, self.code, generator=generator)
             # Snapshots have arbitrary phase: rotating both ends augments the data.
-            turn = torch.polar(
-                torch.ones(self.batch, 1), 6.2832 * torch.rand(self.batch, 1, generator=generator)
-            )
+            angle = 6.2832 * torch.rand(self.batch, 1, generator=generator)
+            turn = torch.polar(torch.ones_like(angle), angle)
             guess, divergence = self.network(x[pick] * turn, noise)
             loss = (guess - y[pick] * turn).abs().square().mean() + self.divergence * divergence.mean()
             optimizer.zero_grad()
@@ -102,15 +94,11 @@ class Fire(UplinkMethod):
         self.network.eval().requires_grad_(False)
         return FitReport(time.perf_counter() - started)
 
-    def _own(self, uplink: Tensor) -> Tensor:
-        assert self.site is not None
-        return uplink[:, torch.from_numpy(np.asarray(self.site.antennas))]
-
     @torch.no_grad()
     def listen(self, uplink: Tensor, noise: Tensor | None = None) -> Prediction:
         """See `UplinkMethod.listen`."""
-        scale = _scale(uplink)
-        own = self._own(uplink) / scale
+        scale = rms(uplink)[:, None, None]
+        own = self.own(uplink) / scale
         guess = self.network(own.flatten(0, 1))[0]
         return Prediction(guess.view(*own.shape[:2], -1) * scale)
 
@@ -125,8 +113,3 @@ class Fire(UplinkMethod):
         self.network = Network(*self._sizes)
         self.network.load_state_dict(state["network"])
         self.network.eval().requires_grad_(False)
-
-
-def _scale(uplink: Tensor) -> Tensor:
-    """Root mean square over antennas and tones (B, 1, 1)."""
-    return uplink.abs().square().mean((1, 2), keepdim=True).sqrt().clamp_min(1e-30)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -22,28 +22,16 @@ GEOMETRY_RATES = {  # learning rates of a `GaussianField` called `field`
 def gaussians_of(scene: Scene, count: int) -> GaussianField:
     """All around a static receiver between 1 and 6 m; for a moving one uniform in its box and 2 m around."""
     static = scene.receiver
-    settings = FieldSettings(
-        count, "sphere" if static is not None else "uniform", margin=MARGIN, opacity=OPACITY
-    )
-    return initial_field(
-        settings,
-        scene.box,
-        None if static is None else static.position,
-        None if static is None else static.rotation,
-    )
+    place, turn = (None, None) if static is None else (static.position, static.rotation)
+    init: Literal["uniform", "sphere"] = "uniform" if static is None else "sphere"
+    settings = FieldSettings(count, init, margin=MARGIN, opacity=OPACITY)
+    return initial_field(settings, scene.box, place, turn)
 
 
-class RenderSettings:
-    """Grid and cut-off a scene is rendered with.
-
-    Args:
-        scene: spectra bring their grid; channels are rendered on the full sphere, with relative cut-offs.
-    """
-
-    def __init__(self, scene: Scene) -> None:
-        image = scene.site.kind == "spectrum"
-        self.grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
-        self.options: dict[str, Any] = {} if image else {"cutoff": Cutoff(1e-3, relative=True)}
+def rendering_of(scene: Scene) -> tuple[SphereGrid, dict[str, Any]]:
+    """Grid and cut-off: spectra bring their grid; channels see the full sphere, with relative cut-offs."""
+    grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
+    return grid, {} if scene.site.kind == "spectrum" else {"cutoff": Cutoff(1e-3, relative=True)}
 
 
 def render_each(

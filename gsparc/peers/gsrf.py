@@ -20,7 +20,7 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
 from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
-from gsparc.peers.gaussians import GEOMETRY_RATES, RenderSettings, gaussians_of
+from gsparc.peers.gaussians import GEOMETRY_RATES, gaussians_of, rendering_of
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.radiance import fourier_legendre, terms
 from gsparc.peers.trained import TrainedPeer
@@ -60,7 +60,7 @@ class ComplexGaussians(Network):
         self.scene, self.count, self.degree, self.order = scene, count, degree, order
         self.fourier_weight = fourier_weight
         self.field = gaussians_of(scene, count)
-        self.rendering = RenderSettings(scene)
+        self.grid, self.options = rendering_of(scene)
         self.coefficients = nn.Parameter(0.02 * torch.randn(count, terms(degree, order), 2))
         with torch.no_grad():
             self.coefficients[:, 0, 0] += 0.3
@@ -87,7 +87,7 @@ class ComplexGaussians(Network):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W) or channels (B, A, K)."""
         sent, geometry = self.radiance(tx, rx), self.field.geometry()
-        plan = make_plan(*geometry, rx, self.rendering.grid, **self.rendering.options)
+        plan = make_plan(*geometry, rx, self.grid, **self.options)
         if self.response is not None:
             seen = mean_weights(plan, *geometry).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
@@ -115,7 +115,7 @@ class ComplexGaussians(Network):
             return self(tx, rx)
         if self._frozen is None:
             geometry = self.field.geometry()
-            plan = make_plan(*geometry, rx, self.rendering.grid, **self.rendering.options)
+            plan = make_plan(*geometry, rx, self.grid, **self.options)
             self._frozen = freeze(plan, *geometry, version=0)
         return _magnitude(self._frozen.render(self.radiance(tx, rx), 0))
 

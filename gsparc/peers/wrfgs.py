@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.ops import Pose
 from gsparc.peers.deformation import Deformation
-from gsparc.peers.gaussians import GEOMETRY_RATES, RenderSettings, gaussians_of, render_each
+from gsparc.peers.gaussians import GEOMETRY_RATES, gaussians_of, render_each, rendering_of
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.trained import TrainedPeer
 
@@ -55,7 +55,8 @@ class DeformedGaussians(Network):
 
     def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
         super().__init__()
-        self.scene, self.count, self.rendering = scene, count, RenderSettings(scene)
+        self.scene, self.count = scene, count
+        self.grid, self.options = rendering_of(scene)
         self.field = gaussians_of(scene, count)
         self.signals = nn.Parameter(torch.zeros(count))
         low, high = self.field.means.detach().amin(0), self.field.means.detach().amax(0)
@@ -74,4 +75,4 @@ class DeformedGaussians(Network):
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
         )
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
-        return render_each(geometry, signal, rx, self.rendering.grid, **self.rendering.options).squeeze(1)
+        return render_each(geometry, signal, rx, self.grid, **self.options).squeeze(1)

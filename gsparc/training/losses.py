@@ -20,42 +20,23 @@ DELAYS_PER_TONE = 8  # grid of the delay search; the delay is held constant in t
 STABILITY = (0.01**2, 0.03**2)  # C1, C2 for data range 1
 
 
-class _Similarity(torch.autograd.Function):
-    """Mean SSIM per image with its own backward: three windowed maps instead of autograd's ten."""
-
-    @staticmethod
-    def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
-        # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
-        shift = target.mean(dim=(-2, -1), keepdim=True)
-        p, t = prediction - shift, target - shift
-        mean_p, mean_t = _window(p), _window(t)
-        square_p, square_t, cross = _window(p * p), _window(t * t), _window(p * t)
-        variance_p = square_p - mean_p**2
-        rounded = variance_p < 0  # only rounding makes a variance negative
-        spread = variance_p.clamp_min(0) + (square_t - mean_t**2).clamp_min(0) + STABILITY[1]
-        covariance = 2 * (cross - mean_p * mean_t) + STABILITY[1]
-        light_p, light_t = mean_p + shift, mean_t + shift
-        power = light_p**2 + light_t**2 + STABILITY[0]
-        product = 2 * light_p * light_t + STABILITY[0]
-        similarity = product * covariance / (power * spread)
-        if ctx.needs_input_grad[0]:
-            share = 1 / (similarity.shape[-1] * similarity.shape[-2])
-            by_cross = 2 * share * product / (power * spread)
-            by_square = (-share * similarity / spread).masked_fill_(rounded, 0)
-            by_light = 2 * share * (light_t * covariance / spread - light_p * similarity) / power
-            by_mean = by_light - mean_t * by_cross - 2 * mean_p * by_square
-            ctx.save_for_backward(p, t, by_mean, by_square, by_cross)
-        return similarity.mean(dim=(-2, -1))
-
-    @staticmethod
-    def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
-        p, t, by_mean, by_square, by_cross = ctx.saved_tensors
-        slope = _spread(by_mean).addcmul_(p, _spread(by_square), value=2).addcmul_(t, _spread(by_cross))
-        return slope * upstream[:, None, None], None
+def _written_out(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean SSIM (B,) of images (B, H, W) that no kernel serves."""
+    # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
+    shift = target.mean(dim=(-2, -1), keepdim=True)
+    p, t = prediction - shift, target - shift
+    mean_p, mean_t = _window(p), _window(t)
+    # Only rounding makes a variance negative.
+    variances = (_window(p * p) - mean_p**2).clamp_min(0) + (_window(t * t) - mean_t**2).clamp_min(0)
+    covariance = 2 * (_window(p * t) - mean_p * mean_t) + STABILITY[1]
+    light_p, light_t = mean_p + shift, mean_t + shift
+    power = light_p**2 + light_t**2 + STABILITY[0]
+    product = 2 * light_p * light_t + STABILITY[0]
+    return (product * covariance / (power * (variances + STABILITY[1]))).mean(dim=(-2, -1))
 
 
 class _Kernel(torch.autograd.Function):
-    """`_Similarity` by a kernel for float32 images."""
+    """`_written_out` as a kernel for float32 images, with its gradient."""
 
     @staticmethod
     def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
@@ -90,19 +71,6 @@ def _window(images: Tensor) -> Tensor:
     return images
 
 
-def _spread(images: Tensor) -> Tensor:
-    """The transpose of `_window`: (B, H - 10, W - 10) -> (B, H, W)."""
-    for axis in (2, 1):
-        shape = list(images.shape)
-        length = shape[axis]
-        shape[axis] += 2 * WINDOW_RADIUS
-        total = images.new_zeros(shape)
-        for k, tap in enumerate(_taps()):
-            total.narrow(axis, k, length).add_(images, alpha=tap)
-        images = total
-    return images
-
-
 def holds_window(images: Tensor | np.ndarray) -> bool:
     """Whether images (..., H, W) are as large as the window of `ssim`, 11 x 11."""
     return min(images.shape[-2:]) > 2 * WINDOW_RADIUS
@@ -123,7 +91,7 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     if not holds_window(prediction):
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
     kernel = prediction.dtype == target.dtype and served(prediction)
-    return (_Kernel if kernel else _Similarity).apply(prediction, target)
+    return (_Kernel.apply if kernel else _written_out)(prediction, target)
 
 
 def spectrum_loss(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2) -> Tensor:

@@ -6,7 +6,7 @@ from torch.library import opcheck
 
 from gsparc.ops import _native, backends
 from gsparc.ops.similarity import similarity_op
-from gsparc.training.losses import _Kernel, _Similarity
+from gsparc.training.losses import _Kernel, _written_out
 
 backends.named("cpu")  # the operators find its kernels
 
@@ -17,7 +17,7 @@ def images(shape, seed=0):
 
 def evaluated(kind, prediction, target):
     leaf = prediction.clone().requires_grad_()
-    value = kind.apply(leaf, target)
+    value = kind(leaf, target)
     (value * torch.arange(1, len(value) + 1)).sum().backward()
     return value.detach().double(), leaf.grad.double()
 
@@ -30,17 +30,17 @@ def test_equals_float64(name, shape):
         pytest.skip(f"this machine or build has no {name}")
     a, b = images(shape), images(shape, 1)
     try:
-        value, slope = evaluated(_Kernel, a.float(), b.float())
+        value, slope = evaluated(_Kernel.apply, a.float(), b.float())
     finally:
         _native.use_instruction_set(fastest)
-    wanted, wanted_slope = evaluated(_Similarity, a, b)
+    wanted, wanted_slope = evaluated(_written_out, a, b)
     assert torch.allclose(value, wanted, atol=1e-5)
     assert not slope.numel() or (slope - wanted_slope).abs().max() < 1e-4 * wanted_slope.abs().max()
 
 
 def test_flat_images_stay_finite_and_alike():
     a, b = torch.full((1, 20, 20), 0.6), torch.full((1, 20, 20), 0.6 + 1e-7)
-    value, slope = evaluated(_Kernel, a, b)
+    value, slope = evaluated(_Kernel.apply, a, b)
     assert abs(float(value) - 1) < 1e-5 and torch.isfinite(slope).all()
 
 
@@ -50,7 +50,7 @@ def test_bit_identical_for_any_threads():
     try:
         for threads in (1, 2, 5):
             torch.set_num_threads(threads)
-            results.append(evaluated(_Kernel, a, b))
+            results.append(evaluated(_Kernel.apply, a, b))
     finally:
         torch.set_num_threads(before)
     assert all(torch.equal(x, y) for other in results[1:] for x, y in zip(results[0], other, strict=True))
