@@ -20,6 +20,7 @@ def machine() -> dict[str, Any]:
     """GPU, driver, versions, commit, date."""
     import torch
 
+    commit = output_of("git", "describe", "--always", "--dirty")
     asked = "--query-gpu=name,driver_version,clocks.max.sm,clocks.max.mem"
     return {
         "gpu": torch.cuda.get_device_name(),
@@ -27,8 +28,7 @@ def machine() -> dict[str, Any]:
         "capability": ".".join(map(str, torch.cuda.get_device_capability())),
         "torch": torch.__version__,
         "cuda": torch.version.cuda,
-        "commit": output_of("git", "describe", "--always", "--dirty")
-        or os.environ.get("GSPARC_COMMIT", "unknown"),
+        "commit": commit or os.environ.get("GSPARC_COMMIT", "unknown"),
         "date": datetime.date.today().isoformat(),
     }
 
@@ -46,11 +46,8 @@ NEEDED = {
 
 def needs(file: Path) -> None:
     """Record which modules each stage lacks."""
-    missing = {
-        stage: [name for name in names if importlib.util.find_spec(name) is None]
-        for stage, names in NEEDED.items()
-    }
-    update(file, missing={stage: names for stage, names in missing.items() if names})
+    lacks = {s: [n for n in names if importlib.util.find_spec(n) is None] for s, names in NEEDED.items()}
+    update(file, missing={stage: names for stage, names in lacks.items() if names})
 
 
 def build(file: Path) -> None:
@@ -102,9 +99,8 @@ def train(file: Path) -> None:
     results: dict[str, Any] = {"dataset": dataset_overrides()[0]}
     for accelerator in ("gpu", "cpu"):
         folder = Path("build") / f"train-{accelerator}"
-        command = [sys.executable, "-P", "train.py", *dataset_overrides()]
+        command = [sys.executable, "-P", "train.py", *dataset_overrides(), "baselines=[zero,mean,nearest]"]
         command += [f"trainer.accelerator={accelerator}", f"hydra.run.dir={folder}"]
-        command += ["baselines=[zero,mean,nearest]"]
         command += ["model.effects.array=false", "model.effects.phase=false"]  # the splatted field
         started = time.perf_counter()
         try:
@@ -136,28 +132,17 @@ def table(file: Path) -> None:
     lines = [f"# CUDA on {named.get('gpu', 'an unknown GPU')}", ""]
     lines += [f"- {key}: {value}" for key, value in named.items() if key != "gpu"]
     for title, section in facts.items():
-        if title == "machine":
-            continue
-        lines += ["", f"## {title}", ""]
-        if not isinstance(section, dict):
-            lines.append(f"{section}")
-            continue
-        lines += ["| | |", "|---|---|"]
-        for key, value in flat(section):
-            lines.append(f"| {key} | {value} |")
+        if title != "machine":
+            lines += ["", f"## {title}", "", "| | |", "|---|---|"]
+            lines += [f"| {key} | {value} |" for key, value in flat(section)]
     sys.stdout.write("\n".join(lines) + "\n")
 
 
-def flat(section: dict[str, Any], before: str = "") -> list[tuple[str, Any]]:
+def flat(found: Any, before: str = "") -> list[tuple[str, str]]:
     """Nested keys joined by dots, numbers to four digits."""
-    rows: list[tuple[str, Any]] = []
-    for key, value in section.items():
-        if isinstance(value, dict):
-            rows += flat(value, f"{before}{key}.")
-        else:
-            shown = f"{value:.4g}" if isinstance(value, float) else str(value).replace("\n", " ")[:300]
-            rows.append((before + key, shown))
-    return rows
+    if isinstance(found, dict):
+        return [row for key, inner in found.items() for row in flat(inner, f"{before}.{key}".lstrip("."))]
+    return [(before, f"{found:.4g}" if isinstance(found, float) else str(found).replace("\n", " ")[:300])]
 
 
 SUMMARY_WORDS = ("passed", "failed", "skipped", "SUMMARY", " error")

@@ -17,17 +17,10 @@ import torch
 from record import guarded, output_of
 from torch import Tensor
 
-from gsparc.ops import (
-    Pose,
-    SphereGrid,
-    composite,
-    freeze,
-    make_plan,
-    mean_weights,
-    networks,
-    operators,
-    rasterize,
-)
+from gsparc.methods.timing import ClockSettings, interleaved
+from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops.networks import networks, products
+from gsparc.ops.operators import composite_backward_op, view_of
 from gsparc.training.losses import _Kernel, _written_out, ssim
 
 GRID = SphereGrid.hemisphere()
@@ -92,16 +85,8 @@ def spread(times: list[float]) -> dict[str, float]:
 
 def wall_ms(function: Callable[[], Any], rounds: int = 60) -> dict[str, float]:
     """Milliseconds from call to finished result, as a caller sees them."""
-    for _ in range(5):
-        function()
-    times = []
-    for _ in range(rounds):
-        torch.cuda.synchronize()
-        started = time.perf_counter()
-        function()
-        torch.cuda.synchronize()
-        times.append(1e3 * (time.perf_counter() - started))
-    return spread(times)
+    clock = ClockSettings(rounds, least=rounds, warmup=5)
+    return spread(interleaved({"it": lambda turn: function()}, clock)["it"].tolist())
 
 
 def graph_of(function: Callable[[], Any], inner: int = 1) -> torch.cuda.CUDAGraph:
@@ -127,9 +112,8 @@ def kernel_ms(function: Callable[[], Any], inner: int = 10, rounds: int = 100) -
 def cold_ms(function: Callable[[], Any], rounds: int = 100) -> dict[str, float]:
     """The same of one call that finds nothing of its own in the second-level cache."""
     size = 4 * torch.cuda.get_device_properties().L2_cache_size
-    return event_ms(
-        graph_of(function).replay, rounds, forget=torch.empty(size, dtype=torch.uint8, device="cuda")
-    )
+    cache = torch.empty(size, dtype=torch.uint8, device="cuda")
+    return event_ms(graph_of(function).replay, rounds, forget=cache)
 
 
 def clocks() -> str:
@@ -198,12 +182,13 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
     thawing = (4 * pairs, 2 * pairs)
 
     view = freeze(plan, *model, version=0)
+    query, thaw = (lambda: rasterize(*model, features, pose, GRID)), (lambda: view.render(features, 0))
     calls: dict[str, tuple[Callable[[], Any], tuple[int, int]]] = {
         "plan": (lambda: make_plan(*model, pose, GRID), planning),
         "forward": (lambda: composite(plan, *model, features), forward),
-        "plan_and_forward": (lambda: rasterize(*model, features, pose, GRID), whole),
+        "plan_and_forward": (query, whole),
         "backward": (backward_of(plan, model, features[None]), backward),
-        "frozen_query": (lambda: view.render(features, 0), thawing),
+        "frozen_query": (thaw, thawing),
     }
     for name, (call, cost) in calls.items():
         found[name] = guarded(lambda call=call, cost=cost: compared(kernel_ms(call), *cost, limits))
@@ -216,10 +201,9 @@ def pipeline(count: int, limits: dict[str, Any]) -> dict[str, Any]:
         rasterize(*leaves, pose, GRID).image.backward(upstream)
 
     with torch.no_grad():
-        query = lambda: rasterize(*model, features, pose, GRID)  # noqa: E731
         ends = {
             "forward": (query, whole),
-            "frozen": (lambda: view.render(features, 0), thawing),
+            "frozen": (thaw, thawing),
             "graph": (graph_of(query).replay, whole),
         }
         for name, (call, cost) in ends.items():
@@ -234,8 +218,8 @@ def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     raster = composite(plan, *model, features)
     upstream = torch.randn_like(raster.image)
     inputs = (upstream, None, raster.image, raster.transmittance, *model, None, features)
-    view = operators.view_of(plan)
-    return lambda: operators.composite_backward_op(*inputs, *view)
+    view = view_of(plan)
+    return lambda: composite_backward_op(*inputs, *view)
 
 
 def by_kernel(function: Callable[[], Any]) -> dict[str, float]:
@@ -286,14 +270,11 @@ def frozen(count: int, limits: dict[str, Any]) -> dict[str, Any]:
     with torch.no_grad():
         dense = view.render(torch.eye(count, device="cuda").unsqueeze(-1), 0).flatten(1)
         sparse = dense.mT.contiguous().to_sparse_csr()
-        found: dict[str, Any] = {
-            "gaussians": count,
-            "share_of_weights_not_zero": weights / dense.numel(),
-            "weights_not_zero": weights,
-        }
+        found: dict[str, Any] = {"gaussians": count, "weights_not_zero": weights}
+        found["share_of_weights_not_zero"] = weights / dense.numel()
         for batch in BATCHES:
             found[f"batch{batch}"] = guarded(
-                lambda batch=batch: frozen_batch(view, dense, sparse, batch, weights, limits)
+                partial(frozen_batch, view, dense, sparse, batch, weights, limits)
             )
         found |= guarded(lambda: with_networks(view, model, BATCHES[-1]))
     return found
@@ -308,10 +289,7 @@ def frozen_batch(
     columns = flat.mT.contiguous()
     query = lambda: view.render(features, 0)  # noqa: E731
     wall = wall_ms(query, rounds=30)
-    cost = (
-        4 * batch * dense.shape[1],
-        2 * batch * weights,
-    )  # images written, products of weights that are not zero
+    cost = 4 * batch * dense.shape[1], 2 * batch * weights  # images written, products of weights not zero
     kernels = compared(kernel_ms(query, inner=2, rounds=30), *cost, limits)
     rates = {"": wall["p50"], "_captured": kernels["p50"]}
     for tf32, name in ((False, "_dense_float32"), (True, "_dense_tf32")):
@@ -328,42 +306,41 @@ def frozen_batch(
     return found | {f"spectra_per_s{name}": 1e3 * batch / ms for name, ms in rates.items()}
 
 
+def network_weights(count: int, inputs: int, hidden: int, outputs: int) -> list[Tensor]:
+    """Weights and biases of N networks of one hidden layer."""
+    shapes = (inputs, hidden), (hidden,), (hidden, outputs), (outputs,)
+    return [torch.randn(count, *shape, device="cuda") for shape in shapes]
+
+
 def with_networks(view: Any, model: Model, batch: int) -> dict[str, float]:
     """The same from positions: encoding, networks (33-32-1), attenuation, image."""
     count = len(model[0])
-    weights = [
-        torch.randn(shape, device="cuda")
-        for shape in ((count, 33, 32), (count, 32), (count, 32, 1), (count, 1))
-    ]
+    weights = network_weights(count, 33, 32, 1)
     places, axes = torch.randn(batch, 3, device="cuda"), torch.randn(3, 15, device="cuda")
 
     def answer() -> Tensor:
         waves = places @ axes
         encoded = torch.cat([places, waves.sin(), waves.cos()], -1)
         distance = torch.cdist(places, model[0]).unsqueeze(-1)
-        return view.render(torch.sigmoid(networks.networks(encoded, *weights) - distance.log()) / distance, 0)
+        return view.render(torch.sigmoid(networks(encoded, *weights) - distance.log()) / distance, 0)
 
     return {"spectra_per_s_with_networks": 1e3 * batch / wall_ms(answer, rounds=10)["p50"]}
 
 
 def emission(count: int, batch: int, limits: dict[str, Any]) -> dict[str, Any]:
     """The emission networks alone (33-32-2), ours beside matrix products."""
-    weights = [
-        torch.randn(shape, device="cuda")
-        for shape in ((count, 33, 32), (count, 32), (count, 32, 2), (count, 2))
-    ]
-    found = {}
+    weights, found = network_weights(count, 33, 32, 2), {}
     for samples in (1, batch):
         encoded = torch.randn(samples, 33, device="cuda")
         flops = 2 * samples * count * (33 * 32 + 64)
         bytes_ = 4 * sum(w.numel() for w in weights) + 8 * samples * count
-        ours = kernel_ms(lambda encoded=encoded: networks.networks(encoded, *weights), inner=2)
+        ours = kernel_ms(lambda encoded=encoded: networks(encoded, *weights), inner=2)
         found[f"batch{samples}"] = compared(ours, bytes_, flops, limits)
-        theirs = event_ms(lambda encoded=encoded: networks.products(encoded, *weights), rounds=10)
+        theirs = event_ms(lambda encoded=encoded: products(encoded, *weights), rounds=10)
         found[f"batch{samples}_matrix_products"] = theirs
     leaves = [weight.requires_grad_() for weight in weights]
     encoded = torch.randn(batch, 33, device="cuda")
-    for name, function in (("ours", networks.networks), ("matrix_products", networks.products)):
+    for name, function in (("ours", networks), ("matrix_products", products)):
         out = function(encoded, *leaves)
         slope = torch.randn_like(out)
         grads = lambda out=out, slope=slope: torch.autograd.grad(out, leaves, slope, retain_graph=True)  # noqa: E731
@@ -404,10 +381,9 @@ def touch_everything() -> None:
         view.render(torch.rand(40, 300, 1, device="cuda"), 0)
     images = torch.rand(2, 23, 40, device="cuda", requires_grad=True)
     ssim(images, images.detach().flip(0)).sum().backward()
-    shapes = ((300, 19, 24), (300, 24), (300, 24, 2), (300, 2))
-    weights = [torch.randn(shape, device="cuda", requires_grad=True) for shape in shapes]
+    weights = [weight.requires_grad_() for weight in network_weights(300, 19, 24, 2)]
     for samples in (1, 21):
-        networks.networks(torch.rand(samples, 19, device="cuda"), *weights).sum().backward()
+        networks(torch.rand(samples, 19, device="cuda"), *weights).sum().backward()
     torch.cuda.synchronize()
 
 
@@ -433,7 +409,7 @@ def learning(steps: int) -> dict[str, Any]:
             loss.backward()
             optimizer.step()
             losses.append(loss.detach())
-        ends = [float(losses[0]), float(losses[-1])]
-        found[device] = {"first": ends[0], "last": ends[1], "seconds": time.perf_counter() - started}
+        first, last = float(losses[0]), float(losses[-1])
+        found[device] = {"first": first, "last": last, "seconds": time.perf_counter() - started}
     found["last_loss_ratio"] = found["cuda"]["last"] / found["cpu"]["last"]
     return found

@@ -15,7 +15,6 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -70,19 +69,19 @@ class Steps:
         fit.LOG_EVERY = log_every
         trainer = partial(fit.DEFAULTS, max_steps=STEPS, val_check_interval=STEPS)
         with tempfile.TemporaryDirectory() as folder:
-            method.fit(
-                self.data, self.fold, FitContext(Path(folder), trainer=trainer, callbacks=lambda: [timer])
-            )
+            context = FitContext(Path(folder), trainer=trainer, callbacks=lambda: [timer])
+            method.fit(self.data, self.fold, context)
         assert timer.module is not None
         return median_step(timer.ends), timer.module
 
-    def bare(self, adam: Callable, ssim: bool = True) -> float:
-        """Milliseconds of a step of a loop that does nothing else."""
+    def bare(self, ssim: bool = True, **form: bool) -> float:
+        """Milliseconds of a step of a loop that does nothing else, with a form of Adam."""
         module, ends = self.module, []
         batch = self.data.batch(self.fold.train[: self.config.dataset.batch_size])
         module.log = lambda *a, **k: None
         module.loss = type(module.loss)(0.2 if ssim else 0.0)
-        optimizer = adam([{"params": [p]} for p in module.parameters() if p.requires_grad])
+        groups = [{"params": [p]} for p in module.parameters() if p.requires_grad]
+        optimizer = torch.optim.Adam(groups, lr=0, **form)
         for _ in range(STEPS):
             optimizer.zero_grad(set_to_none=True)
             module.training_step(batch, 0).backward()
@@ -94,24 +93,18 @@ class Steps:
 def main() -> None:
     """Print the table."""
     steps = Steps(sys.argv[1:])
-    adam = {
-        form: lambda groups, f=form: torch.optim.Adam(groups, lr=0, **{f: True})
-        for form in ("fused", "foreach")
-    }
     contenders = {
-        "bare": lambda: steps.bare(adam["fused"]),
-        "bare, foreach Adam": lambda: steps.bare(adam["foreach"]),
-        "bare, looped Adam": lambda: steps.bare(lambda g: torch.optim.Adam(g, lr=0, foreach=False)),
-        "bare, L1 alone": lambda: steps.bare(adam["fused"], ssim=False),
+        "bare": lambda: steps.bare(fused=True),
+        "bare, foreach Adam": lambda: steps.bare(foreach=True),
+        "bare, looped Adam": lambda: steps.bare(foreach=False),
+        "bare, L1 alone": lambda: steps.bare(ssim=False, fused=True),
         "Lightning, logging every 10th step": lambda: steps.under_lightning(10)[0],
         "Lightning, logging every step": lambda: steps.under_lightning(1)[0],
     }
-    times: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(TURNS):
-        for name, call in contenders.items():
-            times[name].append(call())
+    times = [[call() for call in contenders.values()] for _ in range(TURNS)]
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
-    rows = [f"{name:36s} {statistics.median(found):7.2f} ms" for name, found in times.items()]
+    medians = map(statistics.median, zip(*times, strict=True))
+    rows = [f"{name:36s} {found:7.2f} ms" for name, found in zip(contenders, medians, strict=True)]
     title = f"{torch.get_num_threads()} threads, load {load:.1f} per core"
     sys.stdout.write("\n".join([title, *rows, ""]))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -18,14 +20,9 @@ def coarser(grid: SphereGrid, stride: int) -> SphereGrid:
     """
     if grid.width % stride:
         raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
-    return SphereGrid(
-        (grid.height - 1) // stride + 1,
-        grid.width // stride,
-        grid.first_elevation,
-        grid.first_azimuth,
-        grid.elevation_step * stride,
-        grid.azimuth_step * stride,
-    )
+    height, width = (grid.height - 1) // stride + 1, grid.width // stride
+    steps = {"elevation_step": grid.elevation_step * stride, "azimuth_step": grid.azimuth_step * stride}
+    return replace(grid, height=height, width=width, **steps)
 
 
 class Filled(View):

@@ -30,11 +30,9 @@ def reduced(method: GaussianProcess, settings: Settings) -> Method:
     mean, axes, shape = method.mean, method.axes[kept], method.shape
     if stride > 1:
         assert grid is not None
-        mean, axes = (
-            part.unflatten(-1, shape)[..., ::stride, ::stride].flatten(-2).contiguous()
-            for part in (mean, axes)
-        )
-        shape = ((grid.height - 1) // stride + 1, grid.width // stride)
+        parts = [part.unflatten(-1, shape)[..., ::stride, ::stride] for part in (mean, axes)]
+        shape = tuple(parts[0].shape)
+        mean, axes = (part.flatten(-2).contiguous() for part in parts)
     lean = Mean(method, mean, axes, method.weights[:, kept], shape)
     return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
 

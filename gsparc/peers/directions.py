@@ -24,24 +24,16 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
     Returns:
         (V, 3) [m], and n arrays of rows of it, one entry per ray (-1: the ray meets no other).
     """
-    distances = [np.full(len(r), np.nan) for r in rays]
     near = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(places)))[1]
-    meetings: list[list[list[float]]] = [[[] for _ in r] for r in rays]
+    points = []
     for i, row in enumerate(np.atleast_2d(near)):
-        for j in row:
-            if j == i:
-                continue
+        meetings = [np.full((len(rays[i]), 1), np.nan)]
+        for j in row[row != i]:
             along, _, miss = closest_approach(places[i], rays[i], places[j], rays[j])
-            a, b = np.nonzero(miss < MISS)
-            for p, q in zip(a, b, strict=True):
-                meetings[i][p].append(float(along[p, q]))
-    for i, found in enumerate(meetings):
-        for p, values in enumerate(found):  # type: ignore[assignment]
-            if values:
-                distances[i][p] = np.median(values)
-    points = [
-        places[i] + distances[i][:, None] * rays[i] for i in range(len(places))
-    ]  # NaN where a ray meets no other
+            meetings.append(np.where(miss < MISS, along, np.nan))
+        met = np.ma.masked_invalid(np.concatenate(meetings, 1))
+        distance = np.ma.median(met, axis=1).filled(np.nan)
+        points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
     owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
     flat = np.concatenate(points) if points else np.zeros((0, 3))
     met = np.isfinite(flat[:, 0])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -11,9 +11,9 @@ import torch
 
 from gsparc.commands.bench import kernels, layers, steps
 from gsparc.commands.bench.case import Call
-from gsparc.commands.bench.measure import Machine, measure, undisturbed
+from gsparc.commands.bench.measure import Machine, measure, timed, undisturbed
 from gsparc.commands.bench.scene import Scene, scene
-from gsparc.methods.timing import ClockSettings, interleaved
+from gsparc.methods.timing import ClockSettings
 from gsparc.ops.settings import Projection
 
 
@@ -82,17 +82,13 @@ def _channels(field: Scene, clock: ClockSettings) -> list[Claim]:
 
 
 def _frozen(field: Scene, batch: int, clock: ClockSettings) -> list[Claim]:
-    moving, one, many = (
-        _whole(case)
-        for case in (kernels.moving(field, 1), kernels.frozen(field, 1), kernels.frozen(field, batch))
-    )
+    moving, one = _whole(kernels.moving(field, 1)), _whole(kernels.frozen(field, 1))
+    many = _whole(kernels.frozen(field, batch))
     times = _times({"moving": moving, "one": one, "many": many}, clock)
+    each, together = times["moving"] / times["one"], batch * times["moving"] / times["many"]
     return [
-        Claim(f"moving / frozen at {len(field)}", times["moving"] / times["one"], 3.0, True),
-        Claim(
-            f"moving / frozen, {batch} at once, per query",
-            *(batch * times["moving"] / times["many"], 10.0, True),
-        ),
+        Claim(f"moving / frozen at {len(field)}", each, 3.0, True),
+        Claim(f"moving / frozen, {batch} at once, per query", together, 10.0, True),
     ]
 
 
@@ -127,8 +123,4 @@ def _ratio(above: Call, below: Call, clock: ClockSettings) -> float:
 
 
 def _times(calls: dict[str, Call], clock: ClockSettings) -> dict[str, float]:
-    def ignoring(call: Call) -> Callable[[int], object]:
-        return lambda turn: call()
-
-    times = interleaved({name: ignoring(call) for name, call in calls.items()}, clock)
-    return {name: undisturbed(values) for name, values in times.items()}
+    return {name: undisturbed(values) for name, values in timed(calls, clock).items()}

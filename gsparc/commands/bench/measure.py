@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from gsparc.commands.bench.case import Case
+from gsparc.commands.bench.case import Call, Case
 from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.ops import machine_limits
 
@@ -38,6 +39,12 @@ class Row:
     reference: float | None
 
 
+def timed(calls: Mapping[str, Call | None], clock: ClockSettings) -> dict[str, np.ndarray]:
+    """Wall times of calls in turns [ms]; None is left out."""
+    known = {name: call for name, call in calls.items() if call is not None}
+    return interleaved({name: lambda turn, call=call: call() for name, call in known.items()}, clock)
+
+
 def undisturbed(times: np.ndarray) -> float:
     """The fastest fifth of the rounds: a competing process stretches long calls more than short ones."""
     return float(np.quantile(times, 0.2))
@@ -50,11 +57,11 @@ class Machine:
         self._source = torch.ones(COPY_BYTES // 4)
         self._target = torch.zeros_like(self._source)
 
-    def copy(self, _: int = 0) -> int:
+    def copy(self) -> int:
         """Returns the bytes moved."""
         return machine_limits.copy(self._source, self._target)
 
-    def exponentials(self, _: int = 0) -> int:
+    def exponentials(self) -> int:
         """Returns how many."""
         return machine_limits.exponentials(MARK_TASKS)
 
@@ -69,17 +76,10 @@ def measure(
     torch.set_num_threads(threads)
     try:
         moved, counted = machine.copy(), machine.exponentials()
-        contenders = {"kernel": lambda turn: case.kernel()}
-        if case.whole is not None:
-            whole = case.whole
-            contenders["whole"] = lambda turn: whole()
-        contenders |= {"exponentials": machine.exponentials, "copy": machine.copy}
-        times = interleaved(contenders, clock)
-        reference = None
-        if references and case.reference is not None:
-            call = case.reference
-            once = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
-            reference = float(np.median(interleaved({"it": lambda turn: call()}, once)["it"]))
+        calls = {"kernel": case.kernel, "whole": case.whole}
+        times = timed(calls | {"exponentials": machine.exponentials, "copy": machine.copy}, clock)
+        once = ClockSettings(rounds=3, least=1, warmup=0, budget_s=0.5)
+        reference = timed({"it": case.reference if references else None}, once).get("it")
     finally:
         torch.set_num_threads(before)
     by_bytes = undisturbed(times["copy"]) * case.work.bytes / moved
@@ -90,7 +90,7 @@ def measure(
         limit=limit,
         over=undisturbed(times["kernel"]) / limit,
         bound="pairs" if by_pairs > by_bytes else "bytes",
-        reference=reference,
+        reference=None if reference is None else float(np.median(reference)),
     )
 
 
@@ -98,8 +98,6 @@ def facts(row: Row) -> dict[str, float | str | None]:
     """Flat keys of one row for the summary; times in milliseconds."""
     stem = f"bench/{row.case.key}/t{row.threads}"
     found: dict[str, float | str | None] = {
-        f"{stem}/kernel_ms_p50": float(np.median(row.kernel)),
-        f"{stem}/kernel_ms_p95": float(np.quantile(row.kernel, 0.95)),
         f"{stem}/limit_ms": row.limit,
         f"{stem}/over_limit": row.over,
         f"{stem}/bound": row.bound,
@@ -107,7 +105,8 @@ def facts(row: Row) -> dict[str, float | str | None]:
         f"{stem}/bytes": row.case.work.bytes,
         f"{stem}/reference_ms": row.reference,
     }
-    if row.whole is not None:
-        found[f"{stem}/end_to_end_ms_p50"] = float(np.median(row.whole))
-        found[f"{stem}/end_to_end_ms_p95"] = float(np.quantile(row.whole, 0.95))
+    for name, times in (("kernel", row.kernel), ("end_to_end", row.whole)):
+        if times is not None:
+            found[f"{stem}/{name}_ms_p50"] = float(np.median(times))
+            found[f"{stem}/{name}_ms_p95"] = float(np.quantile(times, 0.95))
     return found
