@@ -108,11 +108,8 @@ class Densify(Checked, L.Callback):
         scales = torch.cat([gaussians.log_scales[clones], smaller])
         spread = _sample_inside(gaussians.scales[splits], gaussians.quats[splits], generator)
         means = torch.cat([gaussians.means[clones], gaussians.means[splits] + spread])
-        return edit.Edit(
-            keep=~(prune | split),
-            parents=parents,
-            replace={"gaussians.means": means, "gaussians.log_scales": scales},
-        )
+        moved = {"gaussians.means": means, "gaussians.log_scales": scales}
+        return edit.Edit(~(prune | split), parents, moved)
 
     def _keep_at_least(self, prune: Tensor, opacities: Tensor) -> Tensor:
         short = min(self.min_gaussians, len(prune)) - int((~prune).sum())
@@ -124,9 +121,8 @@ class Densify(Checked, L.Callback):
 
     @staticmethod
     def _strongest(under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
-        order = torch.where(under_reconstructed, gradient, -torch.ones_like(gradient)).argsort(
-            descending=True, stable=True
-        )
+        rank = torch.where(under_reconstructed, gradient, -torch.ones_like(gradient))
+        order = rank.argsort(descending=True, stable=True)
         spent = torch.where(under_reconstructed, cost, 0)[order].cumsum(0)
         chosen = torch.zeros_like(under_reconstructed)
         chosen[order] = under_reconstructed[order] & (spent <= room)

@@ -66,18 +66,15 @@ class CostLedger(L.Callback):
         self._start()
 
     def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Stop the watch."""
+        """Stop the watch; also for a validation, which does not count as training time."""
         self._stop()
         module.train_seconds = self.seconds
+
+    on_validation_start = on_train_end  # type: ignore[assignment]
 
     def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
         """Stop the watch."""
         self._stop()
-
-    def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Validation does not count as training time."""
-        self._stop()
-        module.train_seconds = self.seconds
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Write a row of the learning curve and go on."""

@@ -48,18 +48,13 @@ class StepProgress(L.Callback):
             figures = [form.format(float(value)) for form, value in found.items() if value is not None]
             self._bar.update(task, figures=", ".join([*figures, f"{len(module.model.gaussians)} Gaussians"]))
 
-    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
-        """Leave the finished bar on the screen."""
-        self._close()
-
-    def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
-        """Remove the bar."""
-        self._close()
-
-    def _close(self) -> None:
+    def on_train_end(self, *unused: Any, **named: Any) -> None:
+        """Leave the bar as it is on the screen; also after an error."""
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+    on_exception = on_train_end
 
 
 def _progress(trainer: L.Trainer, module: Any) -> tuple[int, int]:

@@ -16,7 +16,7 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import Explains, FitContext, Method
 
 Switch = bool | Literal["auto", "splat"]
-SPLAT = "splat"
+SPLAT: Literal["splat"] = "splat"
 
 DENSE = 0.25  # neighbours closer than this many wavelengths can be interpolated without a carrier
 PROBE_IMAGES = 12
@@ -86,7 +86,7 @@ def decide_phase(switch: Switch, site: Site, splatting: str | None, antennas: in
         obstacle = "the dataset declares no frequency"
     elif switch == "auto" and splatting is not None:
         obstacle = f"{splatting} asks for the splatted field"
-    return _settle("phase", switch, obstacle)
+    return _settle("phase", switch, obstacle, SPLAT)
 
 
 def decide_array(switch: Switch, site: Site, splatting: str | None) -> Decision:
@@ -109,7 +109,7 @@ def decide_array(switch: Switch, site: Site, splatting: str | None) -> Decision:
         obstacle = "the dataset declares no array or no carrier"
     elif switch == "auto" and splatting is not None:
         obstacle = f"{splatting} asks for the splatted field"
-    return _settle("array", switch, obstacle)
+    return _settle("array", switch, obstacle, SPLAT)
 
 
 def decide_directions(switch: Switch, sources: bool, data: Measurements) -> Decision:
@@ -130,22 +130,16 @@ def decide_directions(switch: Switch, sources: bool, data: Measurements) -> Deci
         obstacle = "no directions of arrival were measured"
     elif switch == "auto" and not sources:
         obstacle = "no sources with carrier phase are asked for"
-    return _settle("directions", switch, obstacle, ("auto", True, False))
+    return _settle("directions", switch, obstacle)
 
 
-def _settle(
-    effect: str,
-    switch: Switch,
-    obstacle: str | None,
-    choices: tuple[Switch, ...] = ("auto", "splat", True, False),
-) -> Decision:
+def _settle(effect: str, switch: Switch, obstacle: str | None, *splat: Switch) -> Decision:
+    choices, asked = ("auto", *splat, True, False), f"model.effects.{effect}={str(switch).lower()}"
     if switch not in choices:
         named = [str(choice).lower() for choice in choices]
-        raise ValueError(
-            f"model.effects.{effect}={str(switch).lower()}: choose {', '.join(named[:-1])} or {named[-1]}"
-        )
+        raise ValueError(f"{asked}: choose {', '.join(named[:-1])} or {named[-1]}")
     if switch in (SPLAT, True) and obstacle is not None:
-        raise ValueError(f"model.effects.{effect}={str(switch).lower()} is not possible: {obstacle}")
+        raise ValueError(f"{asked} is not possible: {obstacle}")
     if obstacle is not None:
         return Decision(effect, False, obstacle)
     if switch == SPLAT:
@@ -189,21 +183,18 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
     dense = spacing_in_wavelengths(data, fold.train)
     inner = fifths(fold.train, seed)[0]
     if not (data.target[inner.train].any() and data.target[inner.test].any()):
-        return Decision(
-            "phase", False, "the channels to probe with are silent", time.perf_counter() - started
-        )
-    errors = {}
-    for name, method in (("coherent", trial), ("interpolation", rival)):
+        silent = "the channels to probe with are silent"
+        return Decision("phase", False, silent, time.perf_counter() - started)
+    errors = []
+    for method in (trial, rival):
         method.fit(data, inner, FitContext())
-        errors[name] = nmse_of(method, data, inner.test)
-    better = errors["coherent"] < errors["interpolation"]
+        errors.append(nmse_of(method, data, inner.test))
     reason = (
         f"neighbours are {dense:.2f} wavelengths apart"
         f"{' (dense enough to interpolate)' if dense < DENSE else ''}; on a held-out fifth of the training "
-        f"data a short search leaves NMSE {errors['coherent']:.3f}, the Gaussian process "
-        f"{errors['interpolation']:.3f}"
+        f"data a short search leaves NMSE {errors[0]:.3f}, the Gaussian process {errors[1]:.3f}"
     )
-    return Decision("phase", better, reason, time.perf_counter() - started)
+    return Decision("phase", errors[0] < errors[1], reason, time.perf_counter() - started)
 
 
 def probe_array(candidate: Method, data: Measurements, fold: Fold, seed: int) -> Decision:

@@ -10,26 +10,9 @@ from typing import Any
 
 from torch import Tensor
 
-from gsparc.auto.combine import (
-    Companion,
-    DirectionalEnsemble,
-    held_out_ratio,
-    learn_companion,
-    left_out_nmse,
-    restored,
-    weight_of,
-)
-from gsparc.auto.decide import (
-    SPLAT,
-    Decision,
-    EffectSettings,
-    contest_array,
-    decide_array,
-    decide_directions,
-    decide_phase,
-    probe_array,
-    probe_phase,
-)
+from gsparc.auto import combine, decide
+from gsparc.auto.combine import Companion, DirectionalEnsemble
+from gsparc.auto.decide import SPLAT, Decision, EffectSettings
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.response import ResponseSettings
@@ -80,11 +63,8 @@ class Gsparc(LearnedField):
         directional_model: Method | None = None,
         **field: Any,
     ) -> None:
-        response = replace(
-            field.pop("response", ResponseSettings()),
-            array=effects.array == SPLAT,
-            carrier=effects.phase == SPLAT,
-        )
+        splatted = {"array": effects.array == SPLAT, "carrier": effects.phase == SPLAT}
+        response = replace(field.pop("response", ResponseSettings()), **splatted)
         super().__init__(response=response, **field)
         self.switches = effects
         self._models = {"phase": phase_model, "array": array_model, "moving_array": moving_array_model}
@@ -121,9 +101,8 @@ class Gsparc(LearnedField):
         else:
             log.info("settings of the splatted field (emission, raster, trainer) are not used")
             report = self._fit_chosen(data, fold, context)
-            decision, self._companion = learn_companion(
-                self.switches.hybrid, self._models[self._chosen], data, fold
-            )
+            model = self._models[self._chosen]
+            decision, self._companion = combine.learn_companion(self.switches.hybrid, model, data, fold)
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
             self._weigh_directional()
@@ -153,7 +132,7 @@ class Gsparc(LearnedField):
         searched = None if self._chosen is None else self._models[self._chosen]
         if not wanted or searched is self._directional or not isinstance(searched, LeaveOneOut):
             return
-        weight = weight_of(self._directional, searched, self._ratio)  # type: ignore[arg-type]
+        weight = combine.weight_of(self._directional, searched, self._ratio)  # type: ignore[arg-type]
         log.info("effects.directions: weight %.0f%%, by left-out channels", 100 * weight)
         if weight > ALONE:
             self._chosen, self._companion = "directions", None
@@ -164,19 +143,19 @@ class Gsparc(LearnedField):
         hidden = self.settings.emission.hidden
         splatting = f"emission.hidden={hidden}" if hidden else None
         antennas = data.target.shape[1] if data.site.kind == "csi" else 1
-        phase = decide_phase(self.switches.phase, data.site, splatting, antennas)
-        array = decide_array(self.switches.array, data.site, splatting)
+        phase = decide.decide_phase(self.switches.phase, data.site, splatting, antennas)
+        array = decide.decide_array(self.switches.array, data.site, splatting)
         sources = phase.on and self.switches.phase != SPLAT
-        directions = decide_directions(self.switches.directions, sources, data)
+        directions = decide.decide_directions(self.switches.directions, sources, data)
         if directions.on:
             directions = self._fit_directional(data, fold)
         if directions.on and sources:
             phase = self._search_beside(data, fold, seed)
         elif phase.on and self.switches.phase == "auto":
-            phase = probe_phase(self._probe, method_class("gp")(), data, fold, seed)
+            phase = decide.probe_phase(self._probe, method_class("gp")(), data, fold, seed)
         if array.on and self.switches.array == "auto":
             candidate = self._models[self._named("array", data.site) or ""]
-            array = probe_array(candidate, data, fold, seed)
+            array = decide.probe_array(candidate, data, fold, seed)
             if array.on and data.site.static_end == "rx":
                 array = self._contest(array, data, fold, seed)
         return phase, array, directions
@@ -184,15 +163,13 @@ class Gsparc(LearnedField):
     def _contest(self, array: Decision, data: Measurements, fold: Fold, seed: int) -> Decision:
         """The array's vectors explain the spectra; whether they predict held-out spectra."""
         trial = copy.deepcopy(self._models["array"])
-        contest = contest_array(trial, method_class("gp")(), data, fold, seed)
-        if contest.on:
-            return replace(array, seconds=array.seconds + contest.seconds)
-        return replace(contest, seconds=array.seconds + contest.seconds)
+        contest = decide.contest_array(trial, method_class("gp")(), data, fold, seed)
+        return replace(array if contest.on else contest, seconds=array.seconds + contest.seconds)
 
     def _search_beside(self, data: Measurements, fold: Fold, seed: int) -> Decision:
         """Whether a search is worth its time beside measured directions."""
         started = time.perf_counter()
-        error, self._ratio = held_out_ratio(self._probe, data, fold.train, seed)
+        error, self._ratio = combine.held_out_ratio(self._probe, data, fold.train, seed)
         reason = (
             f"short searches leave NMSE {error:.3f} of held-out channels, "
             f"{self._ratio:.1f} times their leave-one-out error"
@@ -210,7 +187,7 @@ class Gsparc(LearnedField):
             if wanted:
                 raise
             return Decision("directions", False, str(error))
-        nmse = left_out_nmse(self._directional, data)
+        nmse = combine.left_out_nmse(self._directional, data)
         reason = f"{self._directional.size()} triangulated sources leave a leave-one-out NMSE of {nmse:.3f}"
         return Decision("directions", wanted or nmse < 1, reason, report.seconds)
 
@@ -259,10 +236,8 @@ class Gsparc(LearnedField):
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
         own = {knob: value for knob, value in settings.items() if knob != "hybrid"}
-        if self._chosen is None:
-            found = super().reduced(own, measured)
-        else:
-            found = reduced(self._models[self._chosen], own, measured)
+        chosen = None if self._chosen is None else self._models[self._chosen]
+        found = super().reduced(own, measured) if chosen is None else reduced(chosen, own, measured)
         keep = self._companion is not None and settings.get("hybrid", True)
         return Completed(found, self._companion) if keep else found  # type: ignore[arg-type]
 
@@ -282,7 +257,7 @@ class Gsparc(LearnedField):
         else:
             self._models[self._chosen].restore(site, state["inner"])
         companion = state.get("rest")
-        self._companion = None if companion is None else restored(site, companion)
+        self._companion = None if companion is None else combine.restored(site, companion)
 
     def size(self) -> int:
         """Number of Gaussians or sources."""

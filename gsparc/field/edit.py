@@ -39,12 +39,7 @@ def row_parameters(root: nn.Module, count: int) -> dict[str, nn.Parameter]:
     return rows
 
 
-def apply(
-    edit: Edit,
-    root: nn.Module,
-    gaussians: GaussianField,
-    optimizer: Optimizer | None = None,
-) -> None:
+def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Optimizer | None = None) -> None:
     """Edit all per-Gaussian state at once.
 
     Appended rows start with zero Adam moments and get fresh ids; kept rows stay bit-identical.

@@ -10,6 +10,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from gsparc import ops
 from gsparc.data.limits import POSITIVE, Checked, or_null, setting
 from gsparc.data.schema import Site
 from gsparc.field.confidence import Confidence, ConfidenceSettings
@@ -17,18 +18,7 @@ from gsparc.field.emission import Emission, EmissionSettings
 from gsparc.field.encoding import PositionEncoding, Prior
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
-from gsparc.ops import (
-    Cutoff,
-    FrozenPlan,
-    Plan,
-    Pose,
-    Raster,
-    SphereGrid,
-    composite,
-    freeze,
-    make_plan,
-    mean_weights,
-)
+from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Raster, SphereGrid
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 
@@ -198,10 +188,10 @@ class GaussianModel(nn.Module):
             return Rendered(self.response(gains, self.gaussians.means, rx), None)
         plan = self.plan(rx)
         if self.site.kind == "spectrum":
-            raster = composite(plan, *self.gaussians.geometry(), features)
+            raster = ops.composite(plan, *self.gaussians.geometry(), features)
             image = raster.image
             return Rendered(self.response(image) if self.response else image.squeeze(1), raster)
-        weights = mean_weights(plan, *self.gaussians.geometry()).share
+        weights = ops.mean_weights(plan, *self.gaussians.geometry()).share
         if self.response is None:
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)
         gains = torch.view_as_complex(features.contiguous())
@@ -212,7 +202,7 @@ class GaussianModel(nn.Module):
         settings = self.settings.raster
         image = self.site.kind == "spectrum"
         cutoff = Cutoff(settings.alpha_cutoff if image else settings.relative_cutoff, relative=not image)
-        return make_plan(
+        return ops.make_plan(
             *self.gaussians.geometry(),
             rx,
             self.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS),
@@ -227,4 +217,4 @@ class GaussianModel(nn.Module):
     def freeze(self, rx: Pose) -> FrozenPlan:
         """The pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
         with torch.no_grad():
-            return freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))
+            return ops.freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))

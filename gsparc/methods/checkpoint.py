@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import zipfile
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +63,8 @@ class Stored:
         try:
             loaded = yaml.safe_load(self.config) or {}
         except yaml.YAMLError:
-            raise CheckpointError(
-                f"{self.path}: its configuration is not YAML; the file is damaged"
-            ) from None
+            damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
+            raise CheckpointError(damaged) from None
         return renamed(loaded) if isinstance(loaded, dict) else {}
 
 
@@ -90,7 +89,7 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
         "method": method.name,
         "target": f"{type(method).__module__}.{type(method).__qualname__}",
         "config": config,
-        "site": _plain(_site_facts(site), "site"),
+        "site": _plain(asdict(site), "site"),
         "state": _plain(method.state(), "state"),
         "extra": _plain(dict(extra or {}), "extra"),
     }
@@ -149,9 +148,8 @@ def read(path: str | Path) -> Stored:
         ) from None
     except Exception as error:  # whatever a damaged archive raises
         reason = str(error).strip().splitlines()
-        raise CheckpointError(
-            f"{path}: cannot be read ({reason[0] if reason else type(error).__name__})"
-        ) from None
+        why = reason[0] if reason else type(error).__name__
+        raise CheckpointError(f"{path}: cannot be read ({why})") from None
     if isinstance(content, dict) and SEARCHES in content:
         raise CheckpointError(
             f"{path}: the finished searches of a run, to go on from with ckpt_path=; the model is {MODEL}"
@@ -223,16 +221,10 @@ def load(path: str | Path) -> tuple[Method, Stored]:
 
 
 def _registered(stored: Stored) -> str:
-    for name, target in METHODS.items():
-        if target == stored.target:
-            return name
-    raise CheckpointError(f"{stored.path}: made by {stored.target!r}, which this gsparc does not know")
-
-
-def _site_facts(site: Site) -> dict[str, Any]:
-    facts = {f.name: getattr(site, f.name) for f in fields(site)}
-    facts["grid"] = None if site.grid is None else dict(vars(site.grid))
-    return facts
+    names = [name for name, target in METHODS.items() if target == stored.target]
+    if not names:
+        raise CheckpointError(f"{stored.path}: made by {stored.target!r}, which this gsparc does not know")
+    return names[0]
 
 
 def _site_from(facts: Mapping[str, Any]) -> Site:

@@ -93,14 +93,10 @@ def kept(extra: Mapping[str, Any]) -> Trusted:
     found = extra.get(KEY)
     if found is None:
         return Trusted()
-    promise, kernel = found["promise"], found["kernel"]
-    return Trusted(
-        found["kind"],
-        float(found["threshold"]),
-        None if promise is None else Promise(**promise),
-        np.asarray(found["known"], np.float64),
-        None if kernel is None else Kernel(**kernel),
-    )
+    promise = None if found["promise"] is None else Promise(**found["promise"])
+    kernel = None if found["kernel"] is None else Kernel(**found["kernel"])
+    known = np.asarray(found["known"], np.float64)
+    return Trusted(found["kind"], float(found["threshold"]), promise, known, kernel)
 
 
 def threshold_of(kind: str, found: Threshold) -> float:

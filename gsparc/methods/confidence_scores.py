@@ -106,9 +106,7 @@ def expected_score(said: Prediction) -> Tensor:
 def joined(parts: Sequence[Evidence]) -> Evidence:
     """Folds together; scores that not every part has are dropped."""
     kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
-    return Evidence(
-        np.concatenate([part.row for part in parts]),
-        np.concatenate([part.position for part in parts]),
-        np.concatenate([part.error for part in parts]),
-        {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds},
-    )
+    scores = {kind: np.concatenate([part.scores[kind] for part in parts]) for kind in kinds}
+    facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
+    row, position, error = map(np.concatenate, facts)
+    return Evidence(row, position, error, scores)

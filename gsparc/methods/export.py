@@ -64,12 +64,8 @@ def heard_paths(method: Method, site: Site, uplink: Any) -> Paths:
     found = _separator(method).sources(_snapshots(method, site, uplink))
     assert site.uplink_hz is not None
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
-    return Paths(
-        (found.gain * site.target_scale).numpy(),
-        (found.delay.double() / spacing).numpy(),
-        float(site.uplink_hz.mean()),
-        cosines=found.direction.numpy(),
-    )
+    gain, delay = (found.gain * site.target_scale).numpy(), (found.delay.double() / spacing).numpy()
+    return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=found.direction.numpy())
 
 
 def placed_paths(method: Method, site: Site, tx: Tensor, rx: Pose) -> Paths:

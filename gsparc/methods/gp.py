@@ -156,8 +156,7 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.limit = components
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        assert self.site is not None
-        parts = principal_components(targets, self.site.kind, self.limit)
+        parts = principal_components(targets, self.kind, self.limit)
         entries = len(parts.mean)
         self.kernel = choose_kernel(positions, parts.scores, entries)
         self.lost, self.positions = parts.lost, positions
@@ -171,7 +170,6 @@ class GaussianProcess(Interpolator, PredictsVariance):
         return tuple(notes)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        assert self.site is not None
         cross = self.kernel.cross(queries, self.positions)
         scores = (torch.from_numpy(cross) @ self.weights).float()
         mean = self._decode(torch.addmm(self.mean, scores, self.axes))
@@ -179,11 +177,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
         prior = 1 + self.kernel.noise
         left = np.clip(prior - explained, 0.0, prior)
         variance = torch.from_numpy(self.kernel.amplitude * left + self.lost).float()
-        return Prediction(
-            mean,
-            confidence=torch.from_numpy(1 - left / prior).float(),
-            variance=entry_variance(variance, mean, self.site.kind),
-        )
+        sure = torch.from_numpy(1 - left / prior).float()
+        return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
@@ -195,8 +190,7 @@ class GaussianProcess(Interpolator, PredictsVariance):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        assert self.site is not None
-        return ("keep", "confidence", *(("stride",) if self.site.kind == "spectrum" else ()))
+        return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Nothing: what a component contributes stands in the process."""

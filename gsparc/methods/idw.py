@@ -6,14 +6,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
-from gsparc.methods.interpolation import Interpolator, Neighbours
+from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Prediction
 from gsparc.methods.target_rows import to_real
 
 
 class InverseDistance(Interpolator):
     """Averages the `neighbours` nearest samples with weights 1 / distance^power.
+
+    Its confidence is exp(-distance to the nearest / typical spacing of the training set).
 
     Args:
         neighbours: samples averaged (fewer when the training set is smaller).
@@ -29,21 +32,25 @@ class InverseDistance(Interpolator):
         self.neighbours, self.power = neighbours, power
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        self.samples = Neighbours(positions, targets)
+        # Targets keep their stored type: bytes stay bytes.
+        self.positions, self.targets, self.tree = positions, targets, cKDTree(positions)
+        nearest = self.tree.query(positions, k=[2])[0][:, 0]  # infinite where there is no second place
+        apart = nearest[(nearest > 0) & np.isfinite(nearest)]
+        self.spacing = float(np.median(apart)) if len(apart) else 1.0  # [m], of neighbouring places
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        assert self.site is not None
-        distance, row = self.samples.find(queries, self.neighbours)
+        count = min(self.neighbours, len(self.positions))
+        distance, row = self.tree.query(queries, k=np.arange(1, count + 1))  # nearest first
         weight = 1 / np.maximum(distance, self.NEAR) ** self.power
         weight = torch.from_numpy(weight / weight.sum(1, keepdims=True)).float()
-        found = torch.from_numpy(to_real(self.samples.targets[row.ravel()], self.site.kind))
+        found = torch.from_numpy(to_real(self.targets[row.ravel()], self.kind))
         blend = torch.bmm(weight[:, None], found.view(*row.shape, -1))[:, 0]
-        return Prediction(self._decode(blend), confidence=self.samples.confidence(distance[:, 0]))
+        sure = torch.from_numpy(np.exp(-distance[:, 0] / self.spacing)).float()
+        return Prediction(self._decode(blend), confidence=sure)
 
     def _learned(self) -> dict[str, Any]:
-        kept = self.samples
-        return {"positions": torch.from_numpy(kept.positions), "targets": torch.from_numpy(kept.targets)}
+        return {"positions": torch.from_numpy(self.positions), "targets": torch.from_numpy(self.targets)}
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        self.samples = Neighbours(state["positions"].numpy(), state["targets"].numpy())
+        self._learn(state["positions"].numpy(), state["targets"].numpy())

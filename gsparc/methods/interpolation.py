@@ -7,11 +7,9 @@ from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
-import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.target_rows import from_real, training_targets
@@ -62,9 +60,14 @@ class Interpolator(Method):
         """Number of stored training samples."""
         return self.seen
 
-    def _decode(self, rows: Tensor) -> Tensor:
+    @property
+    def kind(self) -> Kind:
+        """Of the targets that were learned."""
         assert self.site is not None
-        return from_real(rows, self.site.kind, self.shape)
+        return self.site.kind
+
+    def _decode(self, rows: Tensor) -> Tensor:
+        return from_real(rows, self.kind, self.shape)
 
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
@@ -80,29 +83,3 @@ class Interpolator(Method):
     def _relearn(self, state: dict[str, Any]) -> None:
         for name in self.stored:
             setattr(self, name, state[name])
-
-
-class Neighbours:
-    """Stored samples with a search tree; targets keep their stored type (bytes stay bytes)."""
-
-    def __init__(self, positions: np.ndarray, targets: np.ndarray) -> None:
-        self.positions, self.targets = positions, targets
-        self.tree = cKDTree(positions)
-        self.reach = _typical_spacing(self.tree, positions)
-
-    def find(self, queries: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-        """Distances [m] and rows of the `count` nearest samples, both (B, count), nearest first."""
-        return self.tree.query(queries, k=np.arange(1, min(count, len(self.positions)) + 1))
-
-    def confidence(self, nearest: np.ndarray) -> Tensor:
-        """exp(-distance / typical spacing of the training set), (B,) in [0, 1]."""
-        return torch.from_numpy(np.exp(-nearest / self.reach)).float()
-
-
-def _typical_spacing(tree: cKDTree, positions: np.ndarray) -> float:
-    """Median distance of a sample to its nearest *other* place [m]; 1 when there is only one place."""
-    if len(positions) < 2:
-        return 1.0
-    nearest = tree.query(positions, k=[2])[0][:, 0]
-    apart = nearest[nearest > 0]
-    return float(np.median(apart)) if len(apart) else 1.0

@@ -89,29 +89,23 @@ class Kriging(Interpolator, PredictsVariance):
     name = "kriging"
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        assert self.site is not None
         # Repeated places would make the system singular: their mean is kriged.
         self.positions, group = np.unique(positions, axis=0, return_inverse=True)
         decibels, group = self._decibels(targets), group.reshape(-1)
         self.values = _by_place(decibels, group)
-        self.channels = _by_place(targets.reshape(len(targets), -1), group) if self._complex else None
+        self.channels = _by_place(targets.reshape(len(targets), -1), group) if self.kind == "csi" else None
         self.variogram = fit_variogram(positions, decibels)
         self._solve()
         v = self.variogram
         return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m",)
 
-    @property
-    def _complex(self) -> bool:
-        return self.site is not None and self.site.kind == "csi"
-
     def _decibels(self, targets: np.ndarray) -> np.ndarray:
-        assert self.site is not None
-        if self._complex:
+        if self.kind == "csi":
             power = np.abs(targets.reshape(len(targets), -1)) ** 2
             floor = max(float(power.mean()) * 1e-8, SILENCE)
             return 10 * np.log10(np.maximum(power, floor)).astype(np.float32)
-        rows = to_real(targets, self.site.kind)
-        if self.site.kind == "rssi":
+        rows = to_real(targets, self.kind)
+        if self.kind == "rssi":
             return rows  # already decibels
         return 10 * np.log10(np.maximum(rows, np.float32(10 ** (FLOOR_DB / 10))))
 
@@ -128,7 +122,6 @@ class Kriging(Interpolator, PredictsVariance):
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        assert self.site is not None
         right = np.ones((len(self.positions) + 1, len(queries)))
         right[:-1] = self._covariance(cdist(self.positions, queries))  # without the nugget: noise is not kept
         weights = lu_solve(self.system, right)
@@ -136,7 +129,7 @@ class Kriging(Interpolator, PredictsVariance):
         decibels = shares.float() @ torch.from_numpy(self.values)
         left = np.clip(self.variogram.total - (weights * right).sum(0), 0.0, None)
         variance = torch.from_numpy(left).float()
-        power = self.site.kind == "rssi"
+        power = self.kind == "rssi"
         if self.channels is None:
             mean = self._decode(decibels if power else 10 ** (decibels / 10))
         else:

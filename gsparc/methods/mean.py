@@ -17,10 +17,9 @@ class Mean(Interpolator):
     stored = ("value",)
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        assert self.site is not None
-        total = np.zeros(int(np.prod(self.shape)) * (2 if self.site.kind == "csi" else 1))
+        total = np.zeros(int(np.prod(self.shape)) * (2 if self.kind == "csi" else 1))
         for start in range(0, len(targets), 256):  # thousands of byte images never become floats at once
-            total += to_real(targets[start : start + 256], self.site.kind).sum(0, dtype=np.float64)
+            total += to_real(targets[start : start + 256], self.kind).sum(0, dtype=np.float64)
         self.value = torch.from_numpy(total / len(targets)).float()
         return ()
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from typing import Any
 
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.instantiate import refuse_foreign, suggest, targets
@@ -44,16 +43,14 @@ INITIALISERS = {  # of a splatted field, by the coherent term they are for
 
 def initialiser(name: str) -> Any:
     """The initialiser (`gsparc.field.initial.Initialiser`) called `name`."""
-    module, _, attribute = INITIALISERS[name].rpartition(".")
-    return getattr(import_module(module), attribute)()
+    return get_class(INITIALISERS[name])()
 
 
 def method_class(name: str) -> type[Method]:
     """The class called `name`; `ValueError` with the nearest right name when there is none."""
     if name not in METHODS:
         raise ValueError(f"no method is called {name!r}{suggest(name, METHODS)}")
-    module, _, attribute = METHODS[name].rpartition(".")
-    return getattr(import_module(module), attribute)
+    return get_class(METHODS[name])
 
 
 def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:

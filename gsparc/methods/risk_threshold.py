@@ -58,9 +58,7 @@ class Threshold:
 
     def bound(self, delta: float) -> float:
         """Upper confidence bound on the share of bad ones among the accepted (Clopper and Pearson 1934)."""
-        if self.accepted == 0 or self.bad == self.accepted:
-            return 1.0
-        return float(beta.ppf(1 - delta, self.bad + 1, self.accepted - self.bad))
+        return binomial_interval(self.bad, self.accepted, 1 - 2 * delta)[1]
 
 
 def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[float, float]:
@@ -79,11 +77,7 @@ def levels_of(score: np.ndarray, count: int = LEVELS) -> np.ndarray:
 
 
 def choose(
-    score: np.ndarray,
-    bad: np.ndarray,
-    levels: np.ndarray,
-    promise: Promise,
-    group: np.ndarray | None = None,
+    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, promise: Promise, group: np.ndarray | None = None
 ) -> Threshold:
     """The laxest threshold that the calibration set (n,) supports.
 

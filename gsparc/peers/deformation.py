@@ -15,9 +15,7 @@ def perceptron(
 ) -> nn.Sequential:
     """`depth` hidden layers of `width`."""
     sizes = [inner, *[width] * depth]
-    layers: list[nn.Module] = []
-    for a, b in pairwise(sizes):
-        layers += [nn.Linear(a, b), activation()]
+    layers = [layer for a, b in pairwise(sizes) for layer in (nn.Linear(a, b), activation())]
     return nn.Sequential(*layers, nn.Linear(sizes[-1], outer))
 
 

@@ -31,8 +31,8 @@ def virtual_transmitters(places: np.ndarray, rays: list[np.ndarray]) -> tuple[np
         for j in row[row != i]:
             along, _, miss = closest_approach(places[i], rays[i], places[j], rays[j])
             meetings.append(np.where(miss < MISS, along, np.nan))
-        met = np.ma.masked_invalid(np.concatenate(meetings, 1))
-        distance = np.ma.median(met, axis=1).filled(np.nan)
+        known = np.ma.masked_invalid(np.concatenate(meetings, 1))
+        distance = np.ma.median(known, axis=1).filled(np.nan)
         points.append(places[i] + distance[:, None] * rays[i])  # NaN where a ray meets no other
     owner = np.repeat(np.arange(len(points)), [len(p) for p in points])
     flat = np.concatenate(points) if points else np.zeros((0, 3))

@@ -11,6 +11,7 @@ networks of 8 x 256, 64 samples a ray) is `width=256 depth=8 samples=64`: minute
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import ClassVar
 
 import torch
@@ -109,15 +110,11 @@ class MarchedField(Network):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W), every ray of them."""
         moving, pixels = self.scene.site.moving(tx, rx), torch.arange(len(self.directions))
-        images = []
-        for sample in range(len(tx)):
-            parts = []
-            for some in pixels.split(max(POINTS // self.samples, 1)):
-                which = torch.full_like(some, sample)
-                origin, heading = self._rays(rx, which, some)
-                parts.append(self.march(origin, heading, moving[which], None))
-            images.append(torch.cat(parts))
-        return torch.stack(images).view(len(tx), *self.scene.shape)
+        parts = []
+        for sample, some in product(range(len(tx)), pixels.split(max(POINTS // self.samples, 1))):
+            which = torch.full_like(some, sample)
+            parts.append(self.march(*self._rays(rx, which, some), moving[which], None))
+        return torch.cat(parts).view(len(tx), *self.scene.shape)
 
     def _rays(self, rx: Pose, sample: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
         """Origins and world directions (R, 3) of the pixels of samples."""

@@ -127,16 +127,9 @@ class DirectedRays(Network):
         fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
         depth = torch.cat([coarse, fine], -1).sort(-1).values
         points = places[:, None, None] + depth[..., None] * heading[:, :, None]
-        inputs = torch.cat(
-            [
-                self.place(points.reshape(-1, 3)).view(*depth.shape, -1),
-                self.heading(heading.reshape(-1, 3))
-                .view(*heading.shape[:2], 1, -1)
-                .expand(-1, -1, self.samples, -1),
-            ],
-            -1,
-        )
-        out = self.network(inputs)
+        place = self.place(points.reshape(-1, 3)).view(*depth.shape, -1)
+        turn = self.heading(heading.reshape(-1, 3)).view(*heading.shape[:2], 1, -1)
+        out = self.network(torch.cat([place, turn.expand(-1, -1, self.samples, -1)], -1))
         # Before training the samples of a ray let 1/e through: what stands at its end can be seen.
         opaque = torch.sigmoid(out[..., 2] - math.log(self.samples))
         clear = torch.log1p(-opaque)

@@ -108,10 +108,8 @@ def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
     step = torch.arange(count) + 0.5
     bottom, top = math.sin(max(low, -math.pi / 2)), math.sin(min(high, math.pi / 2))
     z = bottom + (top - bottom) * step / count
-    azimuth = (
-        grid.first_azimuth
-        + torch.remainder(step * (math.sqrt(5) - 1) / 2, 1.0) * grid.width * grid.azimuth_step
-    )
+    turns = torch.remainder(step * (math.sqrt(5) - 1) / 2, 1.0)
+    azimuth = grid.first_azimuth + turns * grid.width * grid.azimuth_step
     horizontal = (1 - z**2).clamp_min(0).sqrt()
     base = torch.stack([horizontal * azimuth.cos(), horizontal * azimuth.sin(), z], -1)
     east = torch.stack([-azimuth.sin(), azimuth.cos(), torch.zeros_like(azimuth)], -1)

@@ -51,7 +51,6 @@ class TrainedPeer(Method):
     batch_size: int = 8
     rate: float = 2e-3
     seed: int = 0
-    scene: Scene | None = field(default=None, init=False, repr=False)
     network: Network | None = field(default=None, init=False, repr=False)
     found: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
     steps: int = field(default=0, init=False)
@@ -78,7 +77,7 @@ class TrainedPeer(Method):
             ValueError: a kind of data the method does not serve, or no training rows.
             RuntimeError: the loss became NaN or infinite.
         """
-        started, watch = time.perf_counter(), _Stopwatch()
+        started, began = time.perf_counter(), time.process_time()
         rows = np.sort(np.concatenate([fold.train, fold.val]))
         if data.site.kind not in self.kinds:
             raise ValueError(
@@ -87,21 +86,20 @@ class TrainedPeer(Method):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         L.seed_everything(self.seed, verbose=False)
-        self.site, self.scene = data.site, _scene(data, rows)
-        self.found = self.precompute(data, rows)
-        self.network = self.build(self.scene, self.found)
-        self._train(data, rows, watch)
+        self.site, self.found = data.site, self.precompute(data, rows)
+        self.network = self.build(_scene(data, rows), self.found)
+        self._train(data, rows, began)
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
         return FitReport(time.perf_counter() - started, (note,))
 
-    def _train(self, data: Measurements, rows: np.ndarray, watch: _Stopwatch) -> None:
+    def _train(self, data: Measurements, rows: np.ndarray, began: float) -> None:
         network = self.fitted()
         optimizer = torch.optim.Adam(self._groups(network), eps=1e-15)
         base = [group["lr"] for group in optimizer.param_groups]
         draw = torch.Generator().manual_seed(self.seed)
         for step in count():
-            progress = self._progress(step, watch.seconds())
+            progress = self._progress(step, (time.process_time() - began) / torch.get_num_threads())
             if progress >= 1:
                 break
             for group, rate in zip(optimizer.param_groups, base, strict=True):
@@ -154,38 +152,24 @@ class TrainedPeer(Method):
 
     def state(self) -> dict[str, Any]:
         """Weights, and what the network is built from."""
-        scene, network = self.scene, self.fitted()
-        assert scene is not None
-        receiver = scene.receiver
+        network = self.fitted()
+        scene, receiver = network.scene, network.scene.receiver
         return {
             "shape": list(scene.shape),
             "receiver": None if receiver is None else [receiver.position, receiver.rotation],
-            "transmitter": scene.transmitter,
-            "box": scene.box,
-            "found": self.found,
-            "network": network.state_dict(),
-            "steps": self.steps,
+            **{"transmitter": scene.transmitter, "box": scene.box},
+            **{"found": self.found, "network": network.state_dict(), "steps": self.steps},
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         receiver = None if state["receiver"] is None else Pose(*state["receiver"])
         self.site = site
-        self.scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"], state["box"])
+        scene = Scene(site, tuple(state["shape"]), receiver, state["transmitter"], state["box"])
         self.found, self.steps = dict(state["found"]), int(state["steps"])
-        self.network = self.build(self.scene, self.found)
+        self.network = self.build(scene, self.found)
         self.network.load_state_dict(state["network"])
         self.network.eval()
-
-
-class _Stopwatch:
-    """Processor time of this process since it was made, per thread."""
-
-    def __init__(self) -> None:
-        self.started = time.process_time()
-
-    def seconds(self) -> float:
-        return (time.process_time() - self.started) / torch.get_num_threads()
 
 
 def rate_factor(progress: float) -> float:

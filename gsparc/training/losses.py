@@ -123,9 +123,7 @@ def channel_loss(
         raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
     if snapshot != "none":
         return _up_to_offsets(prediction, target, mask, snapshot == "phase_timing")
-    error = (
-        (prediction - target).abs().square() if prediction.is_complex() else (prediction - target).square()
-    )
+    error = (prediction - target).abs().square()
     if mask is None:
         return error.flatten(1).mean(1)
     return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)

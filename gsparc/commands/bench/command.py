@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 from collections.abc import Iterator
+from itertools import product
 from typing import Any
 
 from omegaconf import DictConfig
@@ -23,10 +24,8 @@ from gsparc.ops.native import instruction_set
 
 log = logging.getLogger(__name__)
 
-RASTERIZER = (
-    *(kernels.plan, kernels.moving, kernels.static, kernels.frozen, kernels.backward, kernels.weights),
-)
 MOVING = (kernels.plan, kernels.moving, kernels.weights)  # a batch is as many plans
+RASTERIZER = (*MOVING[:2], kernels.static, kernels.frozen, kernels.backward, kernels.weights)
 MOST_PLANNED = 1_000_000  # Gaussians times poses in one call
 
 
@@ -56,10 +55,9 @@ def cases(config: DictConfig) -> Iterator[Case]:
 def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
     if config.quick:
+        small = {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
         config = config.copy()
-        config.update(
-            {"counts": [200, 400], "batches": [1, 2], "threads": [1], "rounds": 2, "budget_s": 0.01}
-        )
+        config.update(small)
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, budget_s=config.budget_s)
     machine, console = Machine(), open_console()
     before = machine_facts()["machine/load"]
@@ -73,8 +71,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         log.info("%s: %.3g ms, %.1f x the limit", case.key, float(rows[-1].kernel.mean()), rows[-1].over)
     promises = [
         (f"{projection}, {threads} threads", claim)
-        for projection in config.projections
-        for threads in config.threads
+        for projection, threads in product(config.projections, config.threads)
         for claim in claims(projection, list(config.counts), threads, max(config.batches), machine, clock)
     ]
     found: dict[str, Any] = {**machine_facts(), **peak_memory(), **provenance()}

@@ -42,7 +42,7 @@ class Row:
 def timed(calls: Mapping[str, Call | None], clock: ClockSettings) -> dict[str, np.ndarray]:
     """Wall times of calls in turns [ms]; None is left out."""
     known = {name: call for name, call in calls.items() if call is not None}
-    return interleaved({name: lambda turn, call=call: call() for name, call in known.items()}, clock)
+    return interleaved({name: lambda turn, call=call: call() for name, call in known.items()}, clock)  # type: ignore[misc]
 
 
 def undisturbed(times: np.ndarray) -> float:
