@@ -10,19 +10,18 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from gsparc.data.schema import Site
 from gsparc.methods.checkpoint import Stored
 from gsparc.methods.method import Method
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import reduced
 from gsparc.methods.stored_front import Operating, kept
-from gsparc.methods.timing import BLOCKS, Call, interleaved
+from gsparc.methods.timing import BLOCKS, interleaved
 
 log = logging.getLogger(__name__)
 
 CLOCK = replace(BLOCKS, rounds=12, budget_s=3.0)
 QUANTILE = 0.75  # a point fits when three of four of its queries did: its median then does so again
-QUERIES = 16
+QUERIES = 16  # at places drawn in the scene's box
 
 
 def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Operating]:
@@ -46,7 +45,9 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
         points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
     ways = [reduced(method, point.settings, measured) for point in points]
-    calls = {i: _ask(way, stored.site) for i, way in enumerate(ways)}
+    site, draw = stored.site, np.random.default_rng(0)
+    places = draw.uniform(site.box[0], site.box[1], (QUERIES, 3)) + site.origin
+    calls = {i: Predictor(way, site).cycling(places) for i, way in enumerate(ways)}
     times = interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
     here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
     fitting = [i for i in here if here[i] <= budget_ms]
@@ -60,10 +61,3 @@ def within(method: Method, stored: Stored, budget_ms: float) -> tuple[Method, Op
     torch.set_num_threads(points[best].threads)
     log.info("%s: %s, %.3g ms here", stored.path, points[best].label, np.median(times[best]))
     return ways[best], points[best]
-
-
-def _ask(method: Method, site: Site) -> Call:
-    """Queries at places drawn in the scene's box."""
-    draw = np.random.default_rng(0)
-    places = draw.uniform(site.box[0], site.box[1], (QUERIES, 3)) + site.origin
-    return Predictor(method, site).cycling(places)

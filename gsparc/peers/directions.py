@@ -60,9 +60,7 @@ def _merged(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.stack(centres), labels
 
 
-def votes(places: np.ndarray, seen: list[np.ndarray], count: int) -> Tensor:
+def votes(seen: list[np.ndarray], count: int) -> Tensor:
     """How many rays of each receiver point at each virtual transmitter: (n, V) float32."""
-    table = np.zeros((len(places), count), dtype=np.float32)
-    for i, rows in enumerate(seen):
-        np.add.at(table[i], rows[rows >= 0], 1.0)
-    return torch.from_numpy(table)
+    table = np.stack([np.bincount(rows[rows >= 0], minlength=count) for rows in seen])
+    return torch.from_numpy(table.astype(np.float32))

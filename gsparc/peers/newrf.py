@@ -72,7 +72,7 @@ class NeWRF(TrainedPeer):
         return {
             "places": torch.from_numpy(places).float(),
             "virtual": torch.from_numpy(centres).float(),
-            "votes": votes(places, seen, len(centres)),
+            "votes": votes(seen, len(centres)),
         }
 
     def build(self, scene: Scene, found: dict[str, Tensor]) -> Network:

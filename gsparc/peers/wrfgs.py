@@ -59,8 +59,7 @@ class DeformedGaussians(Network):
         self.grid, self.options = rendering_of(scene)
         self.field = gaussians_of(scene, count)
         self.signals = nn.Parameter(torch.zeros(count))
-        low, high = self.field.means.detach().amin(0), self.field.means.detach().amax(0)
-        places = torch.stack([low, high])
+        places = torch.stack(self.field.means.detach().aminmax(dim=0))
         self.deformation = Deformation(places, scene.box, sum(CHANGES), width, depth, octaves)
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:

@@ -104,14 +104,18 @@ def backward(scene: Scene, batch: int) -> Case:
             g = scene.model.gaussians.geometry()
             composite(made, *g, values).image.backward(slope)
 
-    reference = _backward_reference(scene, slope) if batch == 1 and len(scene) <= 1000 else None
+    def dense() -> object:
+        with torch.enable_grad():
+            image = composite(scene.plan(pose, backend="reference"), *leaves).image
+            return torch.autograd.grad(image, leaves, slope)
+
     work = _blending(scene, pose, batch * COMPLEX)
     return Case(
         *("backward", scene.projection, len(scene), batch),
         work=Work(2 * work.bytes, work.pairs),
         kernel=kernel,
         whole=whole,
-        reference=reference,
+        reference=dense if batch == 1 and len(scene) <= 1000 else None,
         unaffordable=_too_big(scene, 2),
     )
 
@@ -150,14 +154,3 @@ def _too_big(scene: Scene, batch: int) -> str:
 def _reference(scene: Scene, batch: int, call: Call) -> dict:
     affordable = _dense_bytes(scene, batch) <= REFERENCE_BYTES
     return {"reference": call} if affordable else {"unaffordable": _too_big(scene, batch)}
-
-
-def _backward_reference(scene: Scene, slope: Tensor) -> Call:
-    leaves = [tensor.clone().requires_grad_() for tensor in (*scene.geometry, scene.features)]
-
-    def call() -> object:
-        with torch.enable_grad():
-            made = scene.plan(receiver(), backend="reference")
-            return torch.autograd.grad(composite(made, *leaves).image, leaves, slope)
-
-    return call
