@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.evaluation.drawing import panels, save
 from gsparc.methods.method import Method
 
 
@@ -31,12 +30,11 @@ def draw_predictions(
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
     found = method.answer(batch)
-    predicted = found.mean.numpy()
-    if spectra:
-        confidence = None if found.confidence is None else found.confidence.numpy()
-        draw_spectra(batch.target.numpy(), predicted, rows, title, path, confidence)
-    else:
-        draw_points(batch.target.numpy(), predicted, title, path)
+    true, predicted = batch.target.numpy(), found.mean.numpy()
+    if not spectra:
+        return draw_points(true, predicted, title, path)
+    confidence = None if found.confidence is None else found.confidence.numpy()
+    return draw_spectra(true, predicted, rows, title, path, confidence)
 
 
 def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path) -> None:
@@ -48,9 +46,7 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
         path: PNG file.
     """
     channels = np.iscomplexobj(target)
-    figure = Figure(figsize=(11 if channels else 5.5, 4.6), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(1, 2 if channels else 1, squeeze=False)[0]
+    figure, (axes,) = panels(11 if channels else 5.5, 4.6, 1, 2 if channels else 1, grid=False)
     tiny, factor = np.finfo(np.float32).tiny, 20 if channels else 10
     true_db, guess_db = (factor * np.log10(np.maximum(np.abs(x).ravel(), tiny)) for x in (target, predicted))
     low, high = np.percentile(true_db, [0.5, 100])
@@ -66,8 +62,7 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
         axes[1].set(xlabel="measured strength [dB]", ylabel="phase error [degrees]", ylim=(-180, 180))
         axes[1].set_title(f"phase error, median {np.median(np.abs(turn)):.1f} degrees")
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=90)
+    save(figure, path, 90)
 
 
 def draw_spectra(
@@ -87,25 +82,21 @@ def draw_spectra(
         path: PNG file.
         confidence: (B,) in [0, 1], written into the predictions.
     """
-    figure = Figure(figsize=(13, 1.6 * len(target) + 0.9), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(len(target), 3, squeeze=False, sharex=True, sharey=True)
-    for line, (true, guess, row) in enumerate(zip(target, predicted, rows, strict=True)):
-        options: dict[str, Any] = {"origin": "lower", "aspect": "auto"}
-        options["extent"] = (0, true.shape[1], 0, true.shape[0])
-        power = axes[line, 0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
-        axes[line, 1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
-        error = axes[line, 2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
+    height = 1.6 * len(target) + 0.9
+    figure, axes = panels(13, height, len(target), 3, grid=False, sharex=True, sharey=True)
+    options: dict[str, Any] = {"origin": "lower", "aspect": "auto"}
+    options["extent"] = (0, target.shape[2], 0, target.shape[1])
+    for number, (line, true, guess, row) in enumerate(zip(axes, target, predicted, rows, strict=True)):
+        power = line[0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
+        line[1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
+        error = line[2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
+        line[0].set_ylabel(f"sample {row}\nelevation row")
+        corner = {"x": 0.99, "y": 0.95, "ha": "right", "va": "top"}
         if confidence is not None:
-            axes[line, 1].text(
-                0.99, 0.95, f"confidence {confidence[line]:.2f}", ha="right", va="top", color="white",
-                transform=axes[line, 1].transAxes,
-            )  # fmt: skip
-        axes[line, 0].set_ylabel(f"sample {row}\nelevation row")
-        axes[line, 2].text(
-            0.99, 0.95, f"rms {np.sqrt(np.mean((guess - true) ** 2)):.3f}", ha="right", va="top",
-            transform=axes[line, 2].transAxes,
-        )  # fmt: skip
+            said = f"confidence {confidence[number]:.2f}"
+            line[1].text(s=said, color="white", transform=line[1].transAxes, **corner)
+        rms = np.sqrt(np.mean((guess - true) ** 2))
+        line[2].text(s=f"rms {rms:.3f}", transform=line[2].transAxes, **corner)
     for axis, name in zip(axes[0], ("measured", "predicted", "predicted - measured"), strict=True):
         axis.set_title(name)
     for axis in axes[-1]:
@@ -113,5 +104,4 @@ def draw_spectra(
     figure.colorbar(power, ax=axes[:, 1], label="relative strength")
     figure.colorbar(error, ax=axes[:, 2], label="difference")
     figure.suptitle(title)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=80)
+    save(figure, path, 80)

@@ -7,7 +7,8 @@ import json
 import math
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from rich.table import Table
 from gsparc.data.files import whole_file
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
-
+ORDER = ("zero", "mean", "nearest", "idw", "gp")  # of the baselines
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -62,25 +63,37 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
         title: what was measured.
         prefix: `test`, `train` or `val`.
     """
-    spectra = f"{prefix}/ssim" in facts
-    power = f"{prefix}/rmse_db" in facts
-    if spectra:
+    if f"{prefix}/ssim" in facts:
         wanted = (("ssim", ".4f"), ("ssim_gauss", ".4f"), ("psnr_db", ".2f"), ("skill", ".3f"))
-    elif power:
+    elif f"{prefix}/rmse_db" in facts:
         wanted = (("rmse_db", ".2f"), ("mae_db", ".2f"), ("nmse", ".4f"), ("skill", ".3f"))
     else:
         wanted = (("nmse", ".3g"), ("nmse_scalar", ".3g"), ("snr_db", ".2f"), ("skill", ".3f"))
-    table = Table(title=title)
-    table.add_column("method")
-    for name in (*(name for name, _ in wanted), "train s", "query ms p50"):
-        table.add_column(name, justify="right")
-    baselines = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")}, key=_rank)
-    rows = [(name, f"baseline/{name}", f"baseline/{name}") for name in baselines] + [(method, prefix, "time")]
-    for name, figures, times in rows:
-        cells = [_shown(facts.get(f"{figures}/{figure}"), form) for figure, form in wanted]
-        cells += [_shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
-        table.add_row(name, *cells, style="bold" if name == method and figures == prefix else None)
-    return table
+    names = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")})
+    names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
+    rows = []
+    for name, figures, times in [*((n, *[f"baseline/{n}"] * 2) for n in names), (method, prefix, "time")]:
+        cells = [shown(facts.get(f"{figures}/{figure}"), form) for figure, form in wanted]
+        cells += [shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
+        rows.append([name, *cells])
+    found = table(title, ["method"], [*(name for name, _ in wanted), "train s", "query ms p50"], rows)
+    found.rows[-1].style = "bold"
+    return found
+
+
+def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+    """A table with columns of `words`, aligned left, before columns of `numbers`, aligned right."""
+    found = Table(title=title)
+    for column in (*words, *numbers):
+        found.add_column(column, justify="left" if column in words else "right")
+    for row in rows:
+        found.add_row(*row)
+    return found
+
+
+def shown(value: float | None, form: str) -> str:
+    """A number in a format, or a dash where there is none."""
+    return "-" if value is None else format(value, form)
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -113,15 +126,6 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
     return [f"{best} has the better {figure} here: for this data and split it is the better choice"]
 
 
-def _rank(name: str) -> tuple[int, str]:
-    order = ("zero", "mean", "nearest", "idw", "gp")
-    return (order.index(name) if name in order else len(order), name)
-
-
-def _shown(value: Any, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
 def _value(key: str, value: Any) -> int | float | str | None:
     if hasattr(value, "item") and getattr(value, "ndim", 0) == 0:  # NumPy and torch scalars
         value = value.item()
@@ -146,10 +150,9 @@ def _git() -> str | None:
     here = Path(__file__).resolve()
 
     def ask(*arguments: str) -> str | None:
+        command = ["git", "-C", str(here.parent), *arguments]
         try:
-            done = subprocess.run(
-                ["git", "-C", str(here.parent), *arguments], capture_output=True, text=True, timeout=10
-            )
+            done = subprocess.run(command, capture_output=True, text=True, timeout=10)
         except (OSError, subprocess.TimeoutExpired):
             return None
         return done.stdout.strip() if done.returncode == 0 else None
@@ -157,18 +160,13 @@ def _git() -> str | None:
     if ask("ls-files", "--error-unmatch", here.name) is None:  # an installed copy inside someone else's tree
         return None
     commit = ask("rev-parse", "HEAD")
-    return (
-        commit
-        if not commit or not ask("status", "--porcelain", "--untracked-files=no")
-        else f"{commit}-dirty"
-    )
+    edited = commit and ask("status", "--porcelain", "--untracked-files=no")
+    return f"{commit}-dirty" if edited else commit
 
 
 def _versions() -> str:
     found = [f"python {platform.python_version()}"]
     for package in PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):
             found.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            continue
     return ", ".join(found)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 
 from gsparc.evaluation.report.intervals import Interval
-from gsparc.evaluation.report.runs import PER_SAMPLE, Run
+from gsparc.evaluation.report.runs import PER_SAMPLE, Run, number, sizes
 from gsparc.evaluation.report.table import Column, Table
 from gsparc.evaluation.report.tables import HEADS
 
@@ -25,21 +26,17 @@ def effects(runs: Sequence[Run]) -> Table | None:
         ],
         note="Differences per test sample, mean and 95 % interval; same seed, same split.",
     )  # fmt: skip
-    for off in runs:
-        for on in runs:
-            if not _differ_by_effect(off, on):
-                continue
-            gain = _paired(off, on, name)
-            spent = [_minus(on.facts.get("time/train_s"), off.facts.get("time/train_s"))]
-            spent.append(_minus(on.latency[0], off.latency[0]))
-            table.add(on.facts.get("model/effects"), off.setting, on.setting, gain, *spent)
+    for off, on in product(runs, runs):
+        if _differ_by_effect(off, on):
+            costs = [(number(run.facts.get("time/train_s")), run.latency[0]) for run in (off, on)]
+            spent = [None if a is None or b is None else b - a for a, b in zip(*costs, strict=True)]
+            table.add(on.facts.get("model/effects"), off.setting, on.setting, _paired(off, on, name), *spent)
     return table if table.rows else None
 
 
 def _differ_by_effect(off: Run, on: Run) -> bool:
-    same = all(
-        off.facts.get(k) == on.facts.get(k) for k in ("dataset/sha256", "split/sha256", "seed", "model/name")
-    )
+    names = ("dataset/sha256", "split/sha256", "seed", "model/name")
+    same = all(off.facts.get(name) == on.facts.get(name) for name in names)
     plain = (off.facts.get("model/effects") or "none") == "none"
     return same and plain and (on.facts.get("model/effects") or "none") != "none"
 
@@ -48,13 +45,7 @@ def _paired(off: Run, on: Run, name: str) -> Interval | None:
     """Mean difference per sample in dB, larger is better."""
     if name not in off.samples or name not in on.samples or len(off.samples[name]) != len(on.samples[name]):
         return None
-    sign = -1 if name == "error_db" else 1
-    values = [np.abs(r.samples[name]) if sign < 0 else r.samples[name] for r in (off, on)]
-    gap = sign * (values[1] - values[0])
+    gap = (-1 if name == "error_db" else 1) * (sizes(on, name) - sizes(off, name))
     gap = gap[np.isfinite(gap)]
     half = 1.96 * float(gap.std(ddof=1)) / math.sqrt(len(gap)) if len(gap) > 1 else math.nan
     return Interval(float(gap.mean()), float(gap.mean()) - half, float(gap.mean()) + half)
-
-
-def _minus(a: object, b: object) -> float | None:
-    return float(a) - float(b) if isinstance(a, (int, float)) and isinstance(b, (int, float)) else None

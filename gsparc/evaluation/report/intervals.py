@@ -46,14 +46,10 @@ def bootstrap(values: np.ndarray, weights: np.ndarray | None = None, seed: int =
 
 def interval(run: Run, figure: str) -> Interval | None:
     """A test figure of a run with its bootstrap interval over test samples; None without the figure."""
-    value = run.figure_of(figure)
+    value, parts = run.figure_of(figure), _parts(run, figure)
     if value is None:
         return None
-    parts = _parts(run, figure)
-    if parts is None:
-        return Interval(value)
-    values, weights = parts
-    return Interval(value, *bootstrap(values, weights))
+    return Interval(value) if parts is None else Interval(value, *bootstrap(*parts))
 
 
 def _parts(run: Run, figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
@@ -71,6 +67,6 @@ def _parts(run: Run, figure: str) -> tuple[np.ndarray, np.ndarray | None] | None
 
 def over_seeds(values: Sequence[float]) -> Interval:
     """Mean, least and largest over seeds."""
-    return (
-        Interval(float(np.mean(values)), min(values), max(values)) if len(values) > 1 else Interval(values[0])
-    )
+    if len(values) == 1:
+        return Interval(values[0])
+    return Interval(float(np.mean(values)), min(values), max(values))

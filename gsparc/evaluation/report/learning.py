@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 
@@ -34,14 +35,10 @@ def within_minutes(runs: Sequence[Run]) -> Table:
         if not len(seconds):
             continue
         best = np.array([score_of(figure, v) for v in values])
-        cells = []
-        for minutes in MINUTES:
-            there = seconds <= 60 * minutes
-            cells.append(float(values[there][best[there].argmax()]) if there.any() else None)
-        reached = []
-        for level in levels(runs):
-            there = best >= score_of(figure, level)
-            reached.append(float(seconds[there.argmax()]) if there.any() else None)
+        early = [seconds <= 60 * minutes for minutes in MINUTES]
+        cells = [float(values[t][best[t].argmax()]) if t.any() else None for t in early]
+        good = [best >= score_of(figure, level) for level in levels(runs)]
+        reached = [float(seconds[t.argmax()]) if t.any() else None for t in good]
         table.add(run.setting, run.facts.get("seed"), *cells, *reached, run.facts.get("time/train_s"))
     return table
 
@@ -66,11 +63,7 @@ def curve(run: Run) -> tuple[np.ndarray, np.ndarray]:
 
 def levels(runs: Sequence[Run], count: int = 3) -> list[float]:
     """Round figures between what the worst and the best run reach, the worst first."""
-    figure = validation_figure(runs[0])
-
-    def score(value: float) -> float:
-        return score_of(figure, value)
-
+    score = partial(score_of, validation_figure(runs[0]))
     ends = [max(curve(run)[1], key=score) for run in runs if len(curve(run)[0])]
     if not ends:
         return []

@@ -60,23 +60,13 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
     study = Study(title, warnings(runs))
     if len(tables.grouped(runs)) < len(runs):
         study.tables.append(tables.seeds(runs))
-    found = (
-        tables.results(runs),
-        learning.within_minutes(runs),
-        tables.costs(runs),
-        effects.effects(runs),
-        tables.worst(runs),
-    )
+    makers = (tables.results, learning.within_minutes, tables.costs, effects.effects, tables.worst)
+    found = [make(runs) for make in makers]
     study.tables += [table for table in found if table is not None and table.rows]
     drawn = (
-        plots.pareto(runs, fronts),
-        plots.accuracy_cdf(runs),
-        plots.latency_cdf(runs),
-        plots.learning(runs),
-        plots.costs(runs),
-        plots.measurements(runs),
-        plots.confidence(runs),
-    )
+        plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.latency_cdf(runs), plots.learning(runs),
+        plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
+    )  # fmt: skip
     study.plots = [_unique_ids(plots.svg(figure), i) for i, figure in enumerate(drawn) if figure is not None]
     firsts = [group[0] for group in tables.grouped(runs).values()]
     study.pictures = [
@@ -137,9 +127,8 @@ def write(folder: Path, title: str, made: str, shown: Sequence[Study]) -> None:
         parts += [f"{remark}\n" for remark in study.remarks]
         parts += [table.markdown() for table in study.tables]
         for table in study.tables:
-            (folder / f"{_slug(study.title)}-{_slug(table.title)}.csv").write_text(
-                table.csv(), encoding="utf-8"
-            )
+            file = folder / f"{_slug(study.title)}-{_slug(table.title)}.csv"
+            file.write_text(table.csv(), encoding="utf-8")
     (folder / "report.md").write_text("\n".join(parts), encoding="utf-8")
 
 

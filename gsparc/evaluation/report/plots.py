@@ -9,17 +9,17 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
+from gsparc.evaluation.drawing import logarithmic, panels, save
 from gsparc.evaluation.metrics import lower_is_better, score_of
 from gsparc.evaluation.report.intervals import interval, over_seeds
 from gsparc.evaluation.report.learning import curve, validation_figure
-from gsparc.evaluation.report.runs import PER_SAMPLE, Run
+from gsparc.evaluation.report.runs import PER_SAMPLE, Run, sizes
 from gsparc.evaluation.report.tables import BASELINES, HEADS, grouped
 from gsparc.methods.pareto import front
 
@@ -41,10 +41,8 @@ def svg(figure: Figure) -> str:
 
 def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
-    name = runs[0].figure
-    figure, axes = _figure()
-    x: list[float] = []
-    y: list[float] = []
+    name, axes = runs[0].figure, _axes()
+    points: list[tuple[float, float]] = []
     for number, (setting, group) in enumerate(grouped(runs).items()):
         for run in group:
             p50, p95 = run.latency
@@ -58,53 +56,45 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
                 fmt="o", ms=4, lw=0.7, color=f"C{number % 10}",
                 label=setting if run is group[0] else None,
             )  # fmt: skip
-            x.append(p50)
-            y.append(found.value)
+            points.append((p50, found.value))
     for base in BASELINES:
-        value = runs[0].facts.get(f"baseline/{base}/{name}")
-        ms = runs[0].facts.get(f"baseline/{base}/render_ms_p50")
+        value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
         if value is not None and ms is not None:
             axes.scatter([ms], [value], marker="s", s=16, c="0.5")
-            axes.annotate(
-                base, (ms, value), xytext=(4, -3), textcoords="offset points", fontsize=7, color="0.4"
-            )
-            x.append(float(ms))
-            y.append(float(value))
+            how = {"xytext": (4, -3), "textcoords": "offset points", "fontsize": 7, "color": "0.4"}
+            axes.annotate(base, (ms, value), **how)
+            points.append((float(ms), float(value)))
     for columns in fronts:
         if name in columns:
-            on = columns["front"] == 1
-            axes.plot(
-                columns["render_ms_p50"][on], columns[name][on], ".-", lw=0.8, c="k", label="swept front"
-            )
-    best = front(x, [score_of(name, v) for v in y])
-    axes.step([x[i] for i in best], [y[i] for i in best], where="post", lw=0.6, c="0.7", label="Pareto front")
+            x, y = (columns[key][columns["front"] == 1] for key in ("render_ms_p50", name))
+            axes.plot(x, y, ".-", lw=0.8, c="k", label="swept front")
+    best = front([x for x, _ in points], [score_of(name, y) for _, y in points])
+    x, y = [points[i][0] for i in best], [points[i][1] for i in best]
+    axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
     axes.set_xscale("log")
     _accuracy_axis(axes, name)
-    _clip_outliers(axes, name, y)
-    axes.set_xlabel("one query [ms], median; whisker to the 95th percentile")
-    axes.set_title("Accuracy against latency (95 % intervals)", fontsize=9)
-    _legend(axes)
-    return figure
+    if name == "psnr_db" and len(points) > 1:  # a black image at 6 dB would flatten everything above 25
+        values = [value for _, value in points]
+        middle, best_value = float(np.median(values)), max(values)
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best_value - middle), 5.0)))
+    what = "one query [ms], median; whisker to the 95th percentile"
+    return _finished(axes, "Accuracy against latency (95 % intervals)", what)
 
 
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
-    name = PER_SAMPLE[runs[0].kind]
-    figure, axes = _figure()
+    name, axes = PER_SAMPLE[runs[0].kind], _axes()
     for number, (setting, group) in enumerate(grouped(runs).items()):
-        values = [run.samples[name] for run in group if name in run.samples]
+        values = [sizes(run, name) for run in group if name in run.samples]
         if values:
             pooled = np.concatenate(values)
-            pooled = np.abs(pooled) if name == "error_db" else pooled
             _cdf(axes, pooled[np.isfinite(pooled)], setting, number, samples=len(values[0]))
     rival = runs[0].samples.get(f"baseline/gp/{name}")
     if rival is not None:
         axes.step(np.sort(rival), np.arange(1, len(rival) + 1) / len(rival), c="k", lw=0.8, label="gp")
-    axes.set_xlabel(f"{HEADS.get(name, name)} of a test sample")
     axes.set_ylabel("share of samples")
-    axes.set_title("How the accuracy is distributed (95 % bands)", fontsize=9)
-    _legend(axes)
-    return figure
+    title = "How the accuracy is distributed (95 % bands)"
+    return _finished(axes, title, f"{HEADS.get(name, name)} of a test sample")
 
 
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
@@ -112,42 +102,31 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
-    kind = runs[0].kind
-    names = [name for name in CDFS[kind] if name in runs[0].samples]
+    names = [name for name in CDFS[runs[0].kind] if name in runs[0].samples]
     timed = any(len(run.render_ms) for run in runs)
-    figure = Figure(figsize=(4.2 * (len(names) + timed), 3.9), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(names) + timed, squeeze=False)[0]
+    figure, ((*line,),) = panels(4.2 * (len(names) + timed), 3.9, 1, len(names) + timed)
     for number, (setting, group) in enumerate(grouped(runs).items()):
         seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
         ms = [p50 for p50, _ in (run.latency for run in group) if p50 is not None]
-        label = f"{_short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
-        for axes, name in zip(panels, names, strict=False):
+        label = f"{short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
+        for axes, name in zip(line, names, strict=False):
             values = np.abs(np.concatenate([run.samples[name] for run in group]))
             _cdf(axes, values[np.isfinite(values)], label, number, samples=len(group[0].samples[name]))
             axes.set_xlabel(HEADS.get(name, name))
         if timed:
             every = [run.render_ms for run in group if len(run.render_ms)]
-            _cdf(panels[-1], np.concatenate(every), label, number)
-            panels[-1].set_xlabel("one query, alone [ms]")
-            panels[-1].set_xscale("log")
-            panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            panels[-1].xaxis.set_major_formatter("{x:g}")
-            panels[-1].xaxis.set_minor_formatter(NullFormatter())
-    for axes, name in zip(panels, names, strict=False):
+            _cdf(line[-1], np.concatenate(every), label, number)
+            line[-1].set_xlabel("one query, alone [ms]")
+            logarithmic(line[-1], fine=True)
+    for axes, name in zip(line, names, strict=False):
         if name in ("mse", "error_power"):
             axes.set_xscale("log")
             axes.xaxis.set_minor_formatter(NullFormatter())  # within a decade its labels would overlap
-    for axes in panels:
-        axes.grid(alpha=0.3)
-    panels[0].set_ylabel("share")
+    line[0].set_ylabel("share")
     figure.suptitle(title, fontsize=9)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", fontsize=7, ncols=2, title="training, one query"
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100)
+    legend = {"loc": "outside lower center", "fontsize": 7, "ncols": 2, "title": "training, one query"}
+    figure.legend(*line[0].get_legend_handles_labels(), **legend)
+    save(figure, path, 100)
 
 
 def latency_cdf(runs: Sequence[Run]) -> Figure | None:
@@ -155,15 +134,13 @@ def latency_cdf(runs: Sequence[Run]) -> Figure | None:
     timed = {k: g for k, g in grouped(runs).items() if any(len(run.render_ms) for run in g)}
     if not timed:
         return None
-    figure, axes = _figure()
+    axes = _axes()
     for number, (setting, group) in enumerate(timed.items()):
         _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, number)
     axes.set_xscale("log")
-    axes.set_xlabel("one query, end to end [ms]")
     axes.set_ylabel("share of queries")
-    axes.set_title("Render times, measured after the sweep, alone and in turns (95 % bands)", fontsize=9)
-    _legend(axes)
-    return figure
+    title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
+    return _finished(axes, title, "one query, end to end [ms]")
 
 
 def _cdf(axes: Axes, values: np.ndarray, label: str, number: int, samples: int | None = None) -> None:
@@ -178,42 +155,36 @@ def _cdf(axes: Axes, values: np.ndarray, label: str, number: int, samples: int |
 
 def learning(runs: Sequence[Run]) -> Figure:
     """Validation accuracy against seconds of learning; settings of several seeds as a band."""
-    name = validation_figure(runs[0])
-    figure, axes = _figure()
+    name, axes = validation_figure(runs[0]), _axes()
     for number, (setting, group) in enumerate(grouped(runs).items()):
-        color, first = f"C{number % 10}", True
-        for run in group:
-            seconds, values = curve(run)
-            style = "o-" if len(seconds) > 1 else "D"
-            axes.plot(seconds, values, style, ms=3, lw=1, color=color, label=setting if first else None)
-            first = False
-        same = {len(curve(run)[0]) for run in group}
-        if len(group) > 1 and len(same) == 1:
-            every = np.stack([curve(run)[1] for run in group])
-            when = np.stack([curve(run)[0] for run in group]).mean(0)
-            axes.fill_between(when, every.min(0), every.max(0), color=color, alpha=0.15, lw=0)
+        color, curves = f"C{number % 10}", [curve(run) for run in group]
+        for run, (seconds, values) in zip(group, curves, strict=True):
+            label = setting if run is group[0] else None
+            axes.plot(
+                seconds, values, "o-" if len(seconds) > 1 else "D", ms=3, lw=1, color=color, label=label
+            )
+        if len(group) > 1 and len({len(seconds) for seconds, _ in curves}) == 1:
+            when, every = (np.stack(parts) for parts in zip(*curves, strict=True))
+            axes.fill_between(when.mean(0), every.min(0), every.max(0), color=color, alpha=0.15, lw=0)
     axes.set_xscale("log")
     _accuracy_axis(axes, name)
-    axes.set_xlabel("seconds of learning (diamond: trained in one piece, test rows)")
-    axes.set_title("Validation accuracy against training time (band: seeds)", fontsize=9)
-    _legend(axes)
-    return figure
+    what = "seconds of learning (diamond: trained in one piece, test rows)"
+    return _finished(axes, "Validation accuracy against training time (band: seeds)", what)
 
 
 def costs(runs: Sequence[Run]) -> Figure:
     """Points measured, seconds simulated, seconds trained, milliseconds a query, and the accuracy."""
     groups = grouped(runs)
-    figure = Figure(figsize=(WIDE + 2, 1.2 + 0.35 * len(groups)), layout="constrained")
-    panels = figure.subplots(1, 5, sharey=True)
+    figure, (line,) = panels(WIDE + 2, 1.2 + 0.35 * len(groups), 1, 5, grid=False, sharey=True)
     name = runs[0].figure
-    columns = [
-        ("points measured", lambda run: float(run.measured)),
-        ("s simulated", lambda run: run.facts.get("dataset/simulate_s")),
-        ("s trained", lambda run: run.facts.get("time/train_s")),
-        ("ms a query", lambda run: run.latency[0]),
-        (HEADS.get(name, name), lambda run: run.figure_of(name)),
-    ]
-    for panel, (title, value) in zip(panels, columns, strict=True):
+    columns = {
+        "points measured": lambda run: float(run.measured),
+        "s simulated": lambda run: run.facts.get("dataset/simulate_s"),
+        "s trained": lambda run: run.facts.get("time/train_s"),
+        "ms a query": lambda run: run.latency[0],
+        HEADS.get(name, name): lambda run: run.figure_of(name),
+    }
+    for panel, (title, value) in zip(line, columns.items(), strict=True):
         for row, group in enumerate(groups.values()):
             known = [float(v) for v in map(value, group) if v is not None]
             if not known:
@@ -221,16 +192,15 @@ def costs(runs: Sequence[Run]) -> Figure:
                 continue
             found = over_seeds(known)
             low, high = found.low or found.value, found.high or found.value
+            reach = [[found.value - low], [high - found.value]]
             panel.barh(row, found.value, color=f"C{row % 10}", alpha=0.8)
-            panel.errorbar(
-                [found.value], [row], xerr=[[found.value - low], [high - found.value]], c="k", lw=0.8
-            )
+            panel.errorbar([found.value], [row], xerr=reach, c="k", lw=0.8)
             panel.text(found.value, row, f" {found.value:.3g}", va="center", fontsize=7)
         panel.set_title(title, fontsize=8)
         panel.tick_params(labelsize=7)
         panel.margins(x=0.3)
-    panels[0].set_yticks(range(len(groups)), [_short(setting) for setting in groups])
-    panels[0].invert_yaxis()
+    line[0].set_yticks(range(len(groups)), [short(setting) for setting in groups])
+    line[0].invert_yaxis()
     figure.suptitle("Total costs (lines: spread over seeds)", fontsize=9)
     return figure
 
@@ -239,8 +209,7 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     """Accuracy against the number of measurements for every method; None when all runs had equally many."""
     if len({run.measured for run in runs}) < 2:
         return None
-    name = runs[0].figure
-    figure, axes = _figure()
+    name, axes = runs[0].figure, _axes()
     series: dict[str, dict[int, list[float]]] = {}
     for run in runs:
         found = {str(run.facts.get("model/name")): run.figure_of(name)}
@@ -249,17 +218,14 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
             if value is not None:
                 series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
     for number, (method, by_count) in enumerate(series.items()):
-        counts = sorted(by_count)
-        mean = [float(np.mean(by_count[n])) for n in counts]
-        axes.plot(counts, mean, "o-", ms=3, lw=1, color=f"C{number % 10}", label=method)
-        low, high = [min(by_count[n]) for n in counts], [max(by_count[n]) for n in counts]
-        axes.fill_between(counts, low, high, color=f"C{number % 10}", alpha=0.15, lw=0)
+        counts, color = sorted(by_count), f"C{number % 10}"
+        mean, low, high = ([float(of(by_count[n])) for n in counts] for of in (np.mean, min, max))
+        axes.plot(counts, mean, "o-", ms=3, lw=1, color=color, label=method)
+        axes.fill_between(counts, low, high, color=color, alpha=0.15, lw=0)
     axes.set_xscale("log")
     _accuracy_axis(axes, name)
-    axes.set_xlabel("measurements learned from")
-    axes.set_title("Accuracy against the number of measurements (band: seeds)", fontsize=9)
-    _legend(axes)
-    return figure
+    title = "Accuracy against the number of measurements (band: seeds)"
+    return _finished(axes, title, "measurements learned from")
 
 
 def confidence(runs: Sequence[Run]) -> Figure | None:
@@ -268,40 +234,36 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     sure = [r for r in runs if name in r.samples and np.isfinite(r.samples.get("confidence", [np.nan])).any()]
     if not sure:
         return None
-    figure = Figure(figsize=(WIDE, TALL), layout="constrained")
-    points, kept = figure.subplots(1, 2)
+    figure, ((points, kept),) = panels(WIDE, TALL, 1, 2)
     for number, run in enumerate(sure[:8]):
-        value = np.abs(run.samples[name]) if name == "error_db" else run.samples[name]
-        known = np.isfinite(value) & np.isfinite(run.samples["confidence"])
-        stated, value = run.samples["confidence"][known], value[known]
+        value, stated = sizes(run, name), run.samples["confidence"]
+        known = np.isfinite(value) & np.isfinite(stated)
+        stated, value = stated[known], value[known]
         if len(stated) < 3 or np.ptp(stated) == 0:
             continue
-        rank = spearmanr(stated, value)
-        order = np.argsort(-stated, kind="stable")
-        share = np.arange(1, len(order) + 1) / len(order)
-        mean = np.cumsum(value[order]) / np.arange(1, len(order) + 1)
-        error = value.std(ddof=1) / np.sqrt(np.arange(1, len(order) + 1))
-        color = f"C{number % 10}"
-        points.scatter(
-            stated, value, s=8, color=color, label=f"{_short(run.setting)}: rank {rank.statistic:+.2f}"
-        )
+        rank, color = spearmanr(stated, value).statistic, f"C{number % 10}"
+        order, count = np.argsort(-stated, kind="stable"), np.arange(1, len(stated) + 1)
+        share, mean = count / len(count), np.cumsum(value[order]) / count
+        error = value.std(ddof=1) / np.sqrt(count)
+        points.scatter(stated, value, s=8, color=color, label=f"{short(run.setting)}: rank {rank:+.2f}")
         kept.plot(share, mean, color=color, lw=1)
         kept.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
-    points.set_xlabel("confidence")
-    points.set_ylabel(HEADS.get(name, name))
+    points.set(xlabel="confidence", ylabel=HEADS.get(name, name))
     kept.set_xlabel("share of answers used, most confident first")
     kept.set_title("mean over the answers used (95 % band)", fontsize=8)
-    for axes in (points, kept):
-        axes.grid(alpha=0.3)
     _legend(points)
     return figure
 
 
-def _figure() -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(WIDE, TALL), layout="constrained")
-    axes = figure.subplots()
-    axes.grid(alpha=0.3)
-    return figure, axes
+def _axes() -> Axes:
+    return panels(WIDE, TALL)[1][0, 0]
+
+
+def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
+    axes.set_xlabel(horizontal)
+    axes.set_title(title, fontsize=9)
+    _legend(axes)
+    return axes.figure  # type: ignore[return-value]
 
 
 def _accuracy_axis(axes: Axes, name: str) -> None:
@@ -310,20 +272,13 @@ def _accuracy_axis(axes: Axes, name: str) -> None:
         axes.set_yscale("log")
 
 
-def _clip_outliers(axes: Axes, name: str, values: Sequence[float]) -> None:
-    """A black image at 6 dB would flatten everything above 25: values far below the median are not drawn."""
-    if name == "psnr_db" and len(values) > 1:
-        middle, best = float(np.median(values)), max(values)
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best - middle), 5.0)))
-
-
 def _legend(axes: Axes) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        axes.legend(handles, [_short(label, 44) for label in labels], fontsize=6.5)
+        axes.legend(handles, [short(label, 44) for label in labels], fontsize=6.5)
 
 
-def _short(text: str, most: int = 32) -> str:
+def short(text: str, most: int = 32) -> str:
     """Overrides by the last part of their names, then cut to `most` characters."""
     words = [word.partition("=") for word in text.split()]
     text = " ".join(

@@ -42,23 +42,16 @@ def tables(runs: Sequence[Run]) -> str:
 
 def _short(title: str, runs: Sequence[Run]) -> str:
     runs = [replace(run, render_ms=np.zeros(0)) for run in runs]  # on the clock that timed the baselines
-    table = seeds(runs)
-    wanted = [column.name for column in table.columns]
-    whole = results(runs)
-    heads = [column.name for column in whole.columns]
+    table, whole, facts = seeds(runs), results(runs), runs[0].facts
+    names, heads = ([column.name for column in one.columns] for one in (table, whole))
     rows = list(table.rows)
     for row in whole.rows[len(runs) :]:  # the baselines have no seeds
         cells = dict(zip(heads, row, strict=True))
-        if cells[heads[0]] in OMITTED_ROWS:
-            continue
-        named = {"query ms p50": cells["query ms p50"], "seeds": None, **cells}
-        rows.append([named.get(name) for name in wanted])
+        if row[0] not in OMITTED_ROWS:
+            rows.append([cells.get(name) for name in names])
     load = max((float(run.facts.get("machine/load") or 0) for run in runs), default=0.0)
-    facts = runs[0].facts
-    machine = (
-        f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s), load {load:.1f} per core"
-    )
-    note = f"{machine}; queries in turns."
-    kept = [i for i, name in enumerate(wanted) if name not in OMITTED_COLUMNS]
+    machine = f"{facts.get('machine/cpu')}, {facts.get('machine/threads')} thread(s)"
+    note = f"{machine}, load {load:.1f} per core; queries in turns."
+    kept = [i for i, name in enumerate(names) if name not in OMITTED_COLUMNS]
     short = [[row[i] for i in kept] for row in rows]
     return Table(title, [table.columns[i] for i in kept], short, note).markdown()

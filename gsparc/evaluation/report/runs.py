@@ -200,3 +200,8 @@ def _overrides(path: Path) -> tuple[str, ...]:
 def number(value: object) -> float | None:
     """As a float, None for anything that is no number."""
     return float(value) if isinstance(value, (int, float)) else None
+
+
+def sizes(run: Run, name: str) -> np.ndarray:
+    """A per-sample figure (n,) of a run; an error by its size."""
+    return np.abs(run.samples[name]) if name == "error_db" else run.samples[name]

@@ -14,10 +14,10 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table as Shown
 
+from gsparc.evaluation import summary
 from gsparc.evaluation.console import one_line, open_console
 from gsparc.evaluation.report.intervals import Interval
 from gsparc.evaluation.report.table import Column, Table
-from gsparc.evaluation.summary import provenance, write_summary
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +75,7 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
     runs = find_runs([folder])
     if settings.retime:
         runs = retime(runs, rounds=settings.rounds, budget_s=settings.budget_s)
-    origin = provenance()
+    origin = summary.provenance()
     write(folder, title, f"{len(runs)} runs at commit {str(origin['git'])[:8]}", studies(runs))
     facts: dict[str, Any] = {"sweep/runs": len(runs), **origin}
     for number, (study, together) in enumerate(by_study(runs).items()):
@@ -89,19 +89,18 @@ def report(folder: Path, title: str, console: Console, settings: SweepReport) ->
         for row in table.rows:
             for column, value in zip(table.columns[1:], row[1:], strict=True):
                 facts[f"{study[0]}/{study[1]}/{row[0]}/{column.name}"] = getattr(value, "value", value)
-    write_summary(folder / "summary.json", facts)
+    summary.write_summary(folder / "summary.json", facts)
     console.print(f"written to {folder}", highlight=False)
 
 
 def _on_screen(table: Table) -> Shown:
     """What fits a terminal; the files have the rest."""
     columns = [i for i, column in enumerate(table.columns) if column.name not in WIDE]
-    shown = Shown(title=table.title, caption="least to largest over seeds; sweep.csv has more")
-    for i in columns:
-        shown.add_column(table.columns[i].name, justify="left" if i == 0 else "right")
-    for row in table.rows:
-        shown.add_row(*(_spread(row[i], table.columns[i]) for i in columns))
-    return shown
+    first, *others = (table.columns[i].name for i in columns)
+    rows = ([_spread(row[i], table.columns[i]) for i in columns] for row in table.rows)
+    found = summary.table(table.title, [first], others, rows)
+    found.caption = "least to largest over seeds; sweep.csv has more"
+    return found
 
 
 def _spread(value: Any, column: Column) -> str:

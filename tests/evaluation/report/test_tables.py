@@ -11,7 +11,7 @@ import pytest
 
 from gsparc.evaluation.report import effects, learning, tables
 from gsparc.evaluation.report.intervals import Interval, bootstrap, interval
-from gsparc.evaluation.report.plots import _short
+from gsparc.evaluation.report.plots import short
 from gsparc.evaluation.report.runs import Run, columns, distinct_overrides, find_runs
 from gsparc.evaluation.report.table import Column, Table
 
@@ -170,6 +170,6 @@ def test_a_simulation_among_the_directories_is_on_the_bill(three):
 
 def test_labels_keep_the_value_that_tells_settings_apart():
     """Cut at 40 letters, `attenuation.inverse_distance=True` and `=False` read the same."""
-    said = [_short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
+    said = [short(f"gsparc-paper model.attenuation.inverse_distance={on}", 40) for on in (True, False)]
     assert said == ["gsparc-paper inverse_distance=True", "gsparc-paper inverse_distance=False"]
-    assert _short("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and _short("gp") == "gp"
+    assert short("gsparc budget_s=0.5") == "gsparc budget_s=0.5" and short("gp") == "gp"
