@@ -8,12 +8,11 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import run_directory
+from gsparc.commands.output import report, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
@@ -68,7 +67,5 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    console = open_console()
-    console.print(results_table(facts, facts["model/name"], title, config.eval_on))
-    console.print(f"written to {run_dir}", highlight=False)
+    report(run_dir, results_table(facts, facts["model/name"], title, config.eval_on))
     return facts

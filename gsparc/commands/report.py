@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,8 +17,6 @@ from gsparc.evaluation.report.readme import refresh
 from gsparc.evaluation.report.runs import columns, find_runs
 from gsparc.evaluation.report.timing import retime
 from gsparc.evaluation.summary import provenance, write_summary
-
-log = logging.getLogger(__name__)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -36,12 +33,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(shown), **origin}
     for run in runs:
         stem = f"run/{run.setting}/{run.facts.get('seed')}/{'/'.join(run.study)}"
-        p50, p95 = run.latency
-        facts |= {
-            f"{stem}/{run.figure}": run.figure_of(run.figure),
-            f"{stem}/train_s": run.facts["time/train_s"],
-        }
-        facts |= {f"{stem}/render_ms_p50": p50, f"{stem}/render_ms_p95": p95}
+        own = {run.figure: run.figure_of(run.figure), "train_s": run.facts["time/train_s"]}
+        own |= dict(zip(("render_ms_p50", "render_ms_p95"), run.latency, strict=True))
+        facts |= {f"{stem}/{name}": value for name, value in own.items()}
     write_summary(out / "summary.json", facts)
     console = open_console()
     if config.readme:
@@ -54,8 +48,5 @@ def task(config: DictConfig) -> dict[str, Any]:
 def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
     """Swept fronts in and below the directories, with the names of their datasets."""
     files = [file for path in paths for file in sorted(path.rglob("tradeoff.csv"))]
-    found = []
-    for file in files:
-        summary = json.loads((file.parent / "summary.json").read_text(encoding="utf-8"))
-        found.append((str(summary["dataset/name"]), columns(file)))
-    return found
+    texts = ((file.parent / "summary.json").read_text(encoding="utf-8") for file in files)
+    return [(str(json.loads(t)["dataset/name"]), columns(f)) for t, f in zip(texts, files, strict=True)]

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from gsparc.commands.bench.claims import Claim
 from gsparc.commands.bench.measure import Row
-from gsparc.commands.output import table
+from gsparc.evaluation.summary import table
 
 ROWS = ("N", "batch", "threads", "kernel", "end to end", "PyTorch", "limit", "kernel / limit")
 

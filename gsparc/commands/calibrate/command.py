@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -13,25 +12,17 @@ from rich.table import Table
 from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.commands.calibrate.pictures import draw
 from gsparc.commands.calibrate.trial import How, Trial, accept, divisible, trials
-from gsparc.commands.output import run_directory, shown, table
+from gsparc.commands.output import report, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.argos import published_figures, published_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.scores import rows_of
-from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.summary import provenance, shown, table, write_summary
 from gsparc.methods.confidence import Trusted, keep, threshold_of
-from gsparc.methods.confidence_scores import (
-    CHUNK,
-    Evidence,
-    gather,
-    joined,
-    known_positions,
-    position_kernel,
-)
+from gsparc.methods.confidence_scores import CHUNK, Evidence, gather, joined, known_positions, position_kernel
 from gsparc.methods.method import Method
 from gsparc.methods.risk_threshold import Promise
 from gsparc.methods.timing import machine_facts
@@ -59,27 +50,24 @@ def collect(
     return joined(parts), facts
 
 
-def store(path: str, dataset: dict[str, Any], split: dict[str, Any], how: Settled) -> Trusted:
+def store(
+    path: str,
+    dataset: dict[str, Any],
+    split: dict[str, Any],
+    promise: Promise,
+    kind: str,
+    spatial: bool,
+    seed: int,
+) -> Trusted:
     """Choose and calibrate on the checkpoint's own test rows, and keep it with the model."""
     run = open_files([path], dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     evidence = gather(method, data, fold, rows_of(fold, "test"))
-    used, found, _, _ = accept(evidence, how.promise, how.kind, how.spatial, how.seed)
-    stored = Trusted(
-        used, threshold_of(used, found), how.promise, known_positions(data, fold), position_kernel(data, fold)
-    )
+    used, found, _, _ = accept(evidence, promise, kind, spatial, seed)
+    threshold = threshold_of(used, found)
+    stored = Trusted(used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
     keep(path, stored)
     return stored
-
-
-@dataclass(frozen=True)
-class Settled:
-    """How a confidence and its threshold are chosen; see conf/calibration.yaml."""
-
-    promise: Promise
-    kind: str
-    spatial: bool
-    seed: int
 
 
 def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:
@@ -98,30 +86,24 @@ def figures(evidence: Evidence, found: list[Trial], promise: Promise) -> dict[st
     """Flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
     loss = bounded(evidence.error)
     facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": perfect_area(loss)}
-    for kind, score in evidence.scores.items():
-        curve = risk_coverage(score, loss)
-        facts |= {
-            f"confidence/{kind}/area": curve.area,
-            f"confidence/{kind}/risk_at_70": curve.at(0.7),
-            f"confidence/{kind}/rank_correlation": rank_correlation(score, loss),
-        }
-    bar = facts["confidence/distance/area"]
-    for kind in evidence.scores:
-        below = 1 - facts[f"confidence/{kind}/area"] / bar if bar > 0 else None  # nothing to save
-        facts[f"confidence/{kind}/area_below_distance"] = below
+    curves = {kind: risk_coverage(score, loss) for kind, score in evidence.scores.items()}
+    bar = curves["distance"].area
+    for kind, curve in curves.items():
+        own = {
+            "area": curve.area, "risk_at_70": curve.at(0.7),
+            "rank_correlation": rank_correlation(evidence.scores[kind], loss),
+            "area_below_distance": 1 - curve.area / bar if bar > 0 else None,  # nothing to save
+        }  # fmt: skip
+        facts |= {f"confidence/{kind}/{name}": value for name, value in own.items()}
     facts |= {f"promise/{name}": value for name, value in vars(promise).items()}
     for trial in found:
-        facts |= {
-            f"trial/{trial.how}/kind": trial.kind,
-            f"trial/{trial.how}/broken": trial.broken,
-            f"trial/{trial.how}/broken_low": None if trial.interval is None else trial.interval[0],
-            f"trial/{trial.how}/broken_high": None if trial.interval is None else trial.interval[1],
-            f"trial/{trial.how}/broken_of_all": trial.broken_of_all,
-            f"trial/{trial.how}/silent": trial.silent,
-            f"trial/{trial.how}/realised": trial.mean_realised,
-            f"trial/{trial.how}/coverage": float(trial.coverage.mean()),
-            f"trial/{trial.how}/draws": len(trial.realised),
-        }
+        low, high = trial.interval or (None, None)
+        came = {
+            "kind": trial.kind, "broken": trial.broken, "broken_low": low, "broken_high": high,
+            "broken_of_all": trial.broken_of_all, "silent": trial.silent, "realised": trial.mean_realised,
+            "coverage": float(trial.coverage.mean()), "draws": len(trial.realised),
+        }  # fmt: skip
+        facts |= {f"trial/{trial.how}/{name}": value for name, value in came.items()}
     return facts
 
 
@@ -144,19 +126,17 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts["seed"] = config.seed
     write_summary(run_dir / "summary.json", facts)
     draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
-    console = open_console()
-    for one in tables(facts, evidence, found):
-        console.print(one)
+    stored_lines = []
     if config.store:
-        how = Settled(promise, config.confidence, bool(config.spatial), int(config.seed))
+        how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:
-            stored = store(path, settings["dataset"], settings["split"], how)
+            stored = store(path, settings["dataset"], settings["split"], *how)
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             bound = "no threshold keeps the bound" if threshold is None else f"accepted from {threshold:.4g}"
-            console.print(f"{path}: confidence={stored.kind}, {bound}", highlight=False)
+            stored_lines.append(f"{path}: confidence={stored.kind}, {bound}")
         write_summary(run_dir / "summary.json", facts)
-    console.print(f"written to {run_dir}", highlight=False)
+    report(run_dir, *tables(facts, evidence, found), lines=stored_lines)
     return facts
 
 
@@ -170,13 +150,14 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
         [kind, *(shown(facts[f"confidence/{kind}/{key}"], form) for key, form in wanted.values())]
         for kind in evidence.scores
     ]
-    draws = [
-        [
+    draws = []
+    for trial in found:
+        low, high = trial.interval or (0.0, 0.0)
+        broken = "-" if trial.broken is None else f"{trial.broken:.1%}, {low:.0%} to {high:.0%}"
+        draws.append([
             trial.how, trial.kind, f"{trial.coverage.mean():.0%}", shown(trial.mean_realised, ".1%"),
-            _broken(trial), f"{trial.broken_of_all:.1%}", f"{trial.delta:.0%}", f"{trial.silent:.0%}",
-        ]
-        for trial in found
-    ]  # fmt: skip
+            broken, f"{trial.broken_of_all:.1%}", f"{trial.delta:.0%}", f"{trial.silent:.0%}",
+        ])  # fmt: skip
     numbers = ["accepted", "bad among them", "broken", "of all draws", "promised", "accepted nobody"]
     heading = f"{facts['dataset/name']}: {len(evidence)} positions of {facts['model/name']}"
     promise = f"at most {facts['promise/alpha']:.0%} worse than {facts['promise/limit_db']:g} dB"
@@ -184,10 +165,3 @@ def tables(facts: dict[str, Any], evidence: Evidence, found: list[Trial]) -> lis
         table(heading, ["confidence"], list(wanted), curves),
         table(promise, ["split", "confidence"], numbers, draws),
     ]
-
-
-def _broken(trial: Trial) -> str:
-    if trial.broken is None or trial.interval is None:
-        return "-"
-    low, high = trial.interval
-    return f"{trial.broken:.1%}, {low:.0%} to {high:.0%}"

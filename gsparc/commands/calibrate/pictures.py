@@ -8,21 +8,18 @@ import numpy as np
 
 from gsparc.commands.calibrate.curves import bounded, risk_coverage
 from gsparc.commands.calibrate.trial import Trial
-from gsparc.commands.output import panels, save
+from gsparc.evaluation.drawing import panels, save
 from gsparc.methods.confidence_scores import Evidence
 
 NAMES = {
-    "learned": "learned",
-    "expected": "expected error",
-    "distance": "distance to the nearest",
+    "learned": "learned", "expected": "expected error", "distance": "distance to the nearest",
     "gp_variance": "GP variance",
-}
+}  # fmt: skip
 
 
 def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> None:
     """Save both halves of the story as one PNG."""
-    figure, grid = panels(11, 4.2, 1, 2)
-    left, right = grid[0]
+    figure, ((left, right),) = panels(11, 4.2, 1, 2)
     loss = bounded(evidence.error)
     for kind, score in evidence.scores.items():
         curve = risk_coverage(score, loss)
@@ -32,7 +29,6 @@ def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> Non
     left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
     left.set_title(title)
     left.legend(fontsize=8)
-    left.grid(alpha=0.3)
     for trial, colour in zip(trials, ("tab:blue", "tab:orange"), strict=False):
         right.scatter(
             trial.coverage, trial.realised, s=9, alpha=0.4, color=colour,
@@ -45,10 +41,8 @@ def draw(evidence: Evidence, trials: list[Trial], title: str, path: Path) -> Non
         if not any(trial.coverage.any() for trial in trials):
             right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
         right.axhline(trials[0].alpha, color="black", linewidth=1)
-        right.set_title(
-            f"promise: at most {trials[0].alpha:.0%} bad, broken in at most {trials[0].delta:.0%}"
-        )
+        alpha, delta = trials[0].alpha, trials[0].delta
+        right.set_title(f"promise: at most {alpha:.0%} bad, broken in at most {delta:.0%}")
     right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
     right.legend(fontsize=8)
-    right.grid(alpha=0.3)
     save(figure, path)

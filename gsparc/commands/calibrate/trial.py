@@ -9,14 +9,7 @@ import numpy as np
 
 from gsparc.commands.calibrate.curves import bounded, risk_coverage
 from gsparc.methods.confidence_scores import Evidence
-from gsparc.methods.risk_threshold import (
-    Promise,
-    Threshold,
-    binomial_interval,
-    choose,
-    levels_of,
-    spread_out,
-)
+from gsparc.methods.risk_threshold import Promise, Threshold, binomial_interval, choose, levels_of, spread_out
 
 How = Literal["random", "spatial"]
 SHARES = (0.2, 0.4)  # of the positions that choose the kind and the levels, and that calibrate
@@ -48,14 +41,17 @@ class Trial:
         return float(np.isnan(self.realised).mean())
 
     @property
+    def _spoke(self) -> np.ndarray:
+        return self.realised[~np.isnan(self.realised)]
+
+    @property
     def broken(self) -> float | None:
         """Share of draws in which more than alpha were bad, of those that accepted anybody; None of none.
 
         The promise is delta of *all* draws (`broken_of_all`). Where most accept nobody, those that do are
         the ones that chance flattered, and this share is larger.
         """
-        spoke = self.realised[~np.isnan(self.realised)]
-        return float((spoke > self.alpha).mean()) if len(spoke) else None
+        return float((self._spoke > self.alpha).mean()) if len(self._spoke) else None
 
     @property
     def broken_of_all(self) -> float:
@@ -68,7 +64,7 @@ class Trial:
 
         They share their positions, so this is the least that chance allows for.
         """
-        spoke = self.realised[~np.isnan(self.realised)]
+        spoke = self._spoke
         return binomial_interval(int((spoke > self.alpha).sum()), len(spoke)) if len(spoke) else None
 
     @property
@@ -160,14 +156,9 @@ def _draw(
 
 
 def trials(
-    evidence: Evidence,
-    promise: Promise,
-    how: How,
-    draws: int,
-    kind: str = "auto",
-    apart_m: float = 0.0,
+    evidence: Evidence, promise: Promise, how: How, draws: int, kind: str = "auto", apart_m: float = 0.0,
     seed: int = 0,
-) -> Trial:
+) -> Trial:  # fmt: skip
     """Resample `draws` calibration sets.
 
     Args:

@@ -12,7 +12,7 @@ import matplotlib
 from matplotlib.artist import Artist
 
 from gsparc.commands.compare.table import SCORE, Row
-from gsparc.commands.output import logarithmic, panels, save
+from gsparc.evaluation.drawing import logarithmic, panels, save
 
 LEAST_S = 1e-3  # faster fits are drawn here
 MARKS = "osD^vP*X<>ph"
@@ -31,23 +31,20 @@ def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
             colour, mark = styles[name]
             own = sorted((r for r in here if r.method == name), key=lambda r: r.budget_s or 0)
             style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 7, "capsize": 2}
-            for axis, horizontal in ((line[0], "train_cpu_s"), (line[1], "query_ms")):
-                points = [r for r in own if getattr(r, horizontal) is not None]
+            for axis, horizontal in zip(line, ("train_cpu_s", "query_ms"), strict=True):
+                points = [
+                    (max(x, LEAST_S), r.score_db, r.spread_db or 0.0)
+                    for r in own
+                    if (x := getattr(r, horizontal)) is not None
+                ]
                 if points:
-                    axis.errorbar(
-                        [max(getattr(r, horizontal), LEAST_S) for r in points],
-                        [r.score_db for r in points],
-                        [r.spread_db or 0.0 for r in points],
-                        label=name,
-                        **style,
-                    )
+                    axis.errorbar(*zip(*points, strict=True), label=name, **style)
         line[0].set_ylabel(SCORE[here[0].figure])
         line[0].set_title(f"{dataset}, split {split}", loc="left", fontsize=10)
         line[0].set_xlabel("training of one model, processor time [s]")
         line[1].set_xlabel("one query, median [ms]")
         for axis in line:
             logarithmic(axis)
-            axis.grid(alpha=0.3)
         if not any(r.query_ms for r in here):
             line[1].set_visible(False)
     handles: dict[str, Artist] = {}

@@ -12,10 +12,10 @@ import numpy as np
 
 from gsparc.commands.compare.fitting import Filled
 from gsparc.commands.compare.latency import Latency
-from gsparc.commands.output import columns, shown
+from gsparc.commands.output import columns
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metrics import DECIDING, score_of
-from gsparc.evaluation.summary import BUSY, write_samples
+from gsparc.evaluation.summary import BUSY, shown, write_samples
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}

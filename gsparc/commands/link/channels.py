@@ -12,6 +12,8 @@ from torch import Tensor
 
 from gsparc.data.argos import FACTS
 from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.methods.confidence_scores import Evidence, expected_score, rivals
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.resource_grid import interpolated
 from gsparc.methods.uplink_method import SeparatesPaths
@@ -45,7 +47,7 @@ class Channels:
         """Some of the positions."""
         at = torch.from_numpy(index)
         return Channels(
-            self.true[at], self.predicted[at], self.variance[at], self.confidence[at], self.source
+            *(x[at] for x in (self.true, self.predicted, self.variance, self.confidence)), self.source
         )
 
 
@@ -62,7 +64,7 @@ def channels(
         ValueError: a frequency outside the measured band.
     """
     assert data.site.subcarriers_hz is not None
-    predicted, variance, confidence = [], [], []
+    parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
         if isinstance(method, SeparatesPaths) and batch.uplink is not None:
@@ -73,13 +75,11 @@ def channels(
             mean = interpolated(found.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
             found = Prediction(mean, found.confidence, found.variance)
         none = torch.full((len(batch),), torch.nan)
-        predicted.append(found.mean)
-        variance.append(none if found.variance is None else found.variance)
-        confidence.append(none if found.confidence is None else found.confidence)
+        variance, confidence = (none if x is None else x for x in (found.variance, found.confidence))
+        parts.append((found.mean, variance, confidence))
     true, source = truth(data, rows, frequency_hz)
-    return Channels(
-        true[:, antennas], torch.cat(predicted), torch.cat(variance), torch.cat(confidence), source
-    )
+    predicted, variance, confidence = map(torch.cat, zip(*parts, strict=True))
+    return Channels(true[:, antennas], predicted, variance, confidence, source)
 
 
 def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
@@ -89,6 +89,16 @@ def truth(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tup
         return _of_streets(data, rows, frequency_hz), "rays"
     measured = data.targets(rows)
     return interpolated(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
+
+
+def on_band(band: Channels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+    """Evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
+    power = band.true.abs().square().mean((1, 2))
+    error = (band.predicted - band.true).abs().square().mean((1, 2)) / power.clamp_min(1e-30)
+    said = Prediction(band.predicted, band.confidence, band.variance)
+    own = {"learned": band.confidence, "expected": expected_score(said)}
+    scores = {kind: s.double().numpy() for kind, s in own.items() if not s.isnan().any()}
+    return Evidence(rows, data.moving[rows], error.double().numpy(), scores | rivals(data, fold, rows))
 
 
 @lru_cache(maxsize=1)

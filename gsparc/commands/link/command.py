@@ -14,8 +14,7 @@ from rich.progress import Progress, TextColumn, TimeElapsedColumn
 
 from gsparc.commands.calibrate.trial import accept
 from gsparc.commands.link.adaptation import Band
-from gsparc.commands.link.channels import Channels, channels
-from gsparc.commands.link.evidence import on_band
+from gsparc.commands.link.channels import Channels, channels, on_band
 from gsparc.commands.link.pictures import draw_acceptance, draw_errors, draw_rates
 from gsparc.commands.link.pusch import RECEIVERS, Pusch, frequency_correlation
 from gsparc.commands.link.study import (
@@ -29,9 +28,8 @@ from gsparc.commands.link.study import (
     transmit,
 )
 from gsparc.commands.link.tables import tables
-from gsparc.commands.output import run_directory
+from gsparc.commands.output import report, run_directory
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, write_summary
@@ -80,9 +78,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     grid = channels(method, data, fold.test, centred(float(tones.mean()), spacing, count), one)
     evidence = on_band(grid, data, fold, fold.test)
     promise = Promise(**settings["promise"])
-    kind, threshold, test, aside = accept(
-        evidence, promise, config.confidence, config.spatial, int(config.seed)
-    )
+    how = config.confidence, config.spatial, int(config.seed)
+    kind, threshold, test, aside = accept(evidence, promise, *how)
     rows, score = fold.test[test], evidence.scores[kind][test]
     accepted = score >= threshold.value
     bad = promise.bad(evidence.error[test])
@@ -103,12 +100,11 @@ def task(config: DictConfig) -> dict[str, Any]:
     stated = bool(grid.variance.isfinite().all())
     if not stated:
         log.warning(
-            "%s states no error variance: rates are adapted as if its predictions were exact", method.name
+            "%s states no error variance: rates are adapted as if predictions were exact", method.name
         )
     facts["model/states_variance"] = stated
-    with Progress(
-        *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
-    ) as bar:
+    shown = *Progress.get_default_columns(), TimeElapsedColumn(), TextColumn("{task.fields[now]}")
+    with Progress(*shown) as bar:
         levels = settings["mcs"]["snr_db"]
         adapting = bar.add_task("rate adaptation", total=len(levels), now="")
         sure = aside[evidence.scores[kind][aside] >= threshold.value]
@@ -133,9 +129,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         drawn, trades = {}, {}
         for modulation, points in wanted.items():
             begun = time.perf_counter()
-            pusch = Pusch(
-                modulation, shape["blocks"], shape["spacing_khz"], known, shape["iterations"], receivers
-            )
+            form = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], receivers
+            pusch = Pusch(modulation, *form)
 
             def tick(now: str, modulation: str = modulation) -> None:
                 bar.update(sending, now=f"{modulation} {now}")
@@ -162,8 +157,5 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
     facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
     write_summary(run_dir / "summary.json", facts)
-    console = open_console()
-    for table in tables(facts, title, list(wanted), levels):
-        console.print(table)
-    console.print(f"written to {run_dir}", highlight=False)
+    report(run_dir, *tables(facts, title, list(wanted), levels))
     return facts

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsparc.commands.link.adaptation import Rates
 from gsparc.commands.link.study import Curve
-from gsparc.commands.output import panels, save
+from gsparc.evaluation.drawing import panels, save
 from gsparc.methods.risk_threshold import binomial_interval
 
 STYLES = {
@@ -26,39 +26,34 @@ STYLES = {
     "fallback": ("predicted, else LMMSE pilots, all", "tab:orange", "--"),
 }
 SHORT = {
-    "perfect": "k-o",
-    "lmmse": "g-o",
-    "predicted": "b-o",
-    "predicted_variance": "m--o",
-    "predicted_pilots": "C5-o",
-}
-NAMES = {
-    "predicted_variance": "predicted with its variance",
-    "predicted_pilots": "prediction corrected by pilots",
-}
+    "perfect": ("k-o", "perfect"), "lmmse": ("g-o", "lmmse"), "predicted": ("b-o", "predicted"),
+    "predicted_variance": ("m--o", "predicted with its variance"),
+    "predicted_pilots": ("C5-o", "prediction corrected by pilots"),
+}  # fmt: skip
+RATES = {
+    "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
+    "chosen_bps": ("b--o", "from the predicted one"),
+}  # fmt: skip
 LEAST_RATE = 3e-4
 
 
 def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path) -> None:
     """BLER above, BER below, a column a modulation; bars are 95 % intervals."""
-    figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn))
+    figure, axes = panels(5.6 * len(drawn), 8, 2, len(drawn), grid=False)
     for column, (modulation, curves) in enumerate(drawn.items()):
         for name, (label, colour, line) in STYLES.items():
             if name not in curves:
                 continue
-            curve = curves[name]
+            curve, style = curves[name], {"color": colour, "linestyle": line, "marker": "."}
             shown = np.maximum(curve.bler, LEAST_RATE)
-            bounds = [
-                binomial_interval(int(e), int(n)) for e, n in zip(curve.errors, curve.blocks, strict=True)
-            ]
-            low, high = np.maximum(np.array(bounds).T, LEAST_RATE)
-            axes[0, column].errorbar(
-                curve.ebno_db, shown, [np.maximum(shown - low, 0), np.maximum(high - shown, 0)],
-                color=colour, linestyle=line, marker=".", capsize=2, label=label, linewidth=1.2,
-            )  # fmt: skip
-            axes[1, column].plot(
-                curve.ebno_db, np.maximum(curve.ber, 1e-6), color=colour, linestyle=line, marker="."
+            counts = zip(curve.errors, curve.blocks, strict=True)
+            low, high = np.maximum(
+                np.array([binomial_interval(int(e), int(n)) for e, n in counts]).T, LEAST_RATE
             )
+            reach = [np.maximum(shown - low, 0), np.maximum(high - shown, 0)]
+            style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
+            axes[0, column].errorbar(curve.ebno_db, shown, reach, **style_above)
+            axes[1, column].plot(curve.ebno_db, np.maximum(curve.ber, 1e-6), **style)
         axes[0, column].set_title(f"{modulation.upper()}, {title}", fontsize=10)
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
         for row, what in enumerate(("block error rate", "bit error rate")):
@@ -70,23 +65,18 @@ def draw_errors(drawn: Mapping[str, Mapping[str, Curve]], title: str, path: Path
 
 def draw_rates(found: list[Rates], score: np.ndarray, title: str, path: Path) -> None:
     """Throughput over noise, and the confidence of right and wrong choices."""
-    figure, grid = panels(11, 4, 1, 2)
-    left, right = grid[0]
-    snr = [one.snr_db for one in found]
-    left.plot(snr, [one.oracle_bps.mean() / 1e6 for one in found], "k-o", label="from the true channel")
-    left.plot(snr, [one.best_bps.mean() / 1e6 for one in found], "k:", label="the most there is")
-    left.plot(snr, [one.chosen_bps.mean() / 1e6 for one in found], "b--o", label="from the predicted one")
+    figure, ((left, right),) = panels(11, 4, 1, 2)
+    for name, (style, label) in RATES.items():
+        mean = [getattr(one, name).mean() / 1e6 for one in found]
+        left.plot([one.snr_db for one in found], mean, style, label=label)
     left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput [Mbit/s]", title=title)
     left.legend()
-    left.grid(alpha=0.3)
     middle = found[len(found) // 2]
     miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
-    groups = [score[miss == value] for value in range(4)]
-    labels = [f"{name}\n(n={len(g)})" for name, g in zip(("0", "1", "2", "more"), groups, strict=True)]
-    present = [(label, g) for label, g in zip(labels, groups, strict=True) if len(g)]
-    right.boxplot([g for _, g in present], tick_labels=[label for label, _ in present])
+    groups = {name: score[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
+    present = {f"{name}\n(n={len(group)})": group for name, group in groups.items() if len(group)}
+    right.boxplot(list(present.values()), tick_labels=list(present))
     right.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
-    right.grid(alpha=0.3)
     save(figure, path)
 
 
@@ -98,10 +88,10 @@ def draw_acceptance(
     for axis, (modulation, trade) in zip(grid[0], found.items(), strict=True):
         for name, rates in trade.items():
             if name in SHORT:
-                axis.plot(trade["share"], rates, SHORT[name], label=NAMES.get(name, name))
+                style, label = SHORT[name]
+                axis.plot(trade["share"], rates, style, label=label)
         axis.axvline(threshold_share, color="grey", linestyle=":", label="accepted under the promise")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {float(trade['ebno_db']):g} dB")
         axis.legend(fontsize=8)
-        axis.grid(alpha=0.3)
     save(figure, path)

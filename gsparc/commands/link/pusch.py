@@ -55,46 +55,34 @@ class Pusch:
         iterations: int = 20,
         receivers: Sequence[str] = RECEIVERS,
     ) -> None:
-        from sionna.phy.nr import (
-            PUSCHConfig,
-            PUSCHLSChannelEstimator,
-            PUSCHReceiver,
-            PUSCHTransmitter,
-            TBDecoder,
-        )
+        from sionna.phy import nr
 
-        config = PUSCHConfig()
+        config = nr.PUSCHConfig()
         config.carrier.n_size_grid = blocks
         config.carrier.subcarrier_spacing = spacing_khz
         config.tb.mcs_table = 1
         config.tb.mcs_index = MODULATIONS[modulation]
         config.dmrs.additional_position = 1
-        self.transmitter = PUSCHTransmitter(config)
+        self.transmitter = nr.PUSCHTransmitter(config)
         self.grid = self.transmitter.resource_grid
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
         self._prior: tuple[Tensor, Tensor] | None = None
-        ls = PUSCHLSChannelEstimator(
-            self.grid,
-            config.dmrs.length,
-            config.dmrs.additional_position,
-            config.dmrs.num_cdm_groups_without_data,
-            interpolation_type="lin",
-        )
+        dmrs = config.dmrs
+        shape = dmrs.length, dmrs.additional_position, dmrs.num_cdm_groups_without_data
         estimators: dict[str, Estimator] = {
-            "ls": ls,
+            "ls": nr.PUSCHLSChannelEstimator(self.grid, *shape, interpolation_type="lin"),
             "lmmse": _Wiener(self.grid, correlation),
             "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
-            **{name: self._told(name) for name in ("perfect", "predicted", "predicted_variance")},
+            **{
+                name: lambda y, no, name=name: self._known[name]  # was told the channel beforehand
+                for name in ("perfect", "predicted", "predicted_variance")
+            },
         }
-        decoder = TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
+        decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
+        how = {"tb_decoder": decoder, "return_tb_crc_status": True}
         self.receivers = {
-            name: PUSCHReceiver(
-                self.transmitter,
-                channel_estimator=estimators[name],
-                tb_decoder=decoder,
-                return_tb_crc_status=True,
-            )
+            name: nr.PUSCHReceiver(self.transmitter, channel_estimator=estimators[name], **how)
             for name in receivers
         }
 
@@ -102,10 +90,6 @@ class Pusch:
     def pilot_share(self) -> float:
         """Share of a slot's resource elements that pilots occupy."""
         return float(self.grid.num_pilot_symbols) / float(self.grid.num_resource_elements)
-
-    def _told(self, name: str) -> Estimator:
-        """An estimator that was told the channel beforehand."""
-        return lambda y, no: self._known[name]
 
     def run(
         self,
@@ -122,8 +106,7 @@ class Pusch:
 
         no = ebnodb2no(ebno_db, self.bits, self.rate, self.grid)
         apply = ApplyOFDMChannel(add_awgn=True)
-        failed: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
-        wrong: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
+        failed, wrong = ({name: [] for name in self.receivers} for _ in range(2))
         for start in range(0, len(position), batch):
             at = torch.from_numpy(position[start : start + batch])
             scale = true[at].abs().square().mean(1).sqrt()[:, None]
@@ -140,12 +123,8 @@ class Pusch:
                 decoded, fine = receiver(received, no)
                 failed[name].append(~fine.bool().flatten().cpu().numpy())
                 wrong[name].append((decoded != bits).double().mean(-1).flatten().cpu().numpy())
-        return Blocks(
-            ebno_db,
-            position,
-            {name: np.concatenate(parts) for name, parts in failed.items()},
-            {name: np.concatenate(parts) for name, parts in wrong.items()},
-        )
+        joined = [{name: np.concatenate(x) for name, x in parts.items()} for parts in (failed, wrong)]
+        return Blocks(ebno_db, position, *joined)
 
     def _slots(self, channel: Tensor) -> Tensor:
         """(n, K) as [n, rx 1, rx_ant 1, tx 1, tx_ant 1, 14, K]."""

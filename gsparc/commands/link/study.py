@@ -13,11 +13,20 @@ from torch import Tensor
 from gsparc.commands.link.adaptation import Adaptation, Band, Rates, Rule
 from gsparc.commands.link.beams import LEAST, gain, loss_db
 from gsparc.commands.link.pusch import Blocks, Pusch
-from gsparc.commands.link.statistics import crossing
 from gsparc.methods.risk_threshold import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
 FALLBACK = "lmmse"
+
+
+def crossing(x: np.ndarray, rate: np.ndarray, target: float = 0.1) -> float | None:
+    """Where a falling curve (n,) first crosses `target`, linear in its logarithm; None if it never does."""
+    floor = np.maximum(rate, 1e-6)
+    for i in range(len(x) - 1):
+        if floor[i] > target >= floor[i + 1]:
+            share = np.log(floor[i] / target) / np.log(floor[i] / floor[i + 1])
+            return float(x[i] + share * (x[i + 1] - x[i]))
+    return None
 
 
 @dataclass(frozen=True)
@@ -51,26 +60,20 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
         loss = loss_db(there, guess).numpy()
         best = gain(there, there).mean()
         own = torch.maximum(gain(there, guess).mean(), LEAST * best)
-        facts |= {
-            f"beams/{count}/gain_db": float(10 * best.log10()),
-            f"beams/{count}/predicted_gain_db": float(10 * own.log10()),
-            f"beams/{count}/loss_db": float(10 * (best / own).log10()),
-            f"beams/{count}/loss_db_mean": float(loss.mean()),
-            f"beams/{count}/loss_db_max": float(loss.max()),
-            f"beams/{count}/share_losing_more_than_1_db": float((loss > 1).mean()),
-            f"beams/{count}/loss_db_accepted": float(loss[accepted].mean()) if accepted.any() else None,
-        }
-        for percent in (50, 90, 95, 99):
-            facts[f"beams/{count}/loss_db_p{percent}"] = float(np.quantile(loss, percent / 100))
+        here = {
+            "gain_db": float(10 * best.log10()), "predicted_gain_db": float(10 * own.log10()),
+            "loss_db": float(10 * (best / own).log10()),
+            "loss_db_mean": float(loss.mean()), "loss_db_max": float(loss.max()),
+            "share_losing_more_than_1_db": float((loss > 1).mean()),
+            "loss_db_accepted": float(loss[accepted].mean()) if accepted.any() else None,
+            **{f"loss_db_p{share}": float(np.quantile(loss, share / 100)) for share in (50, 90, 95, 99)},
+        }  # fmt: skip
+        facts |= {f"beams/{count}/{name}": value for name, value in here.items()}
     return facts
 
 
 def adapt(
-    band: Band,
-    aside: Band,
-    snr_db: list[float],
-    settings: Mapping[str, Any],
-    tick: Callable[[], None],
+    band: Band, aside: Band, snr_db: list[float], settings: Mapping[str, Any], tick: Callable[[], None]
 ) -> dict[Rule, list[Rates]]:
     """Rates of both rules at noise levels that put the median position at `snr_db`.
 
@@ -114,41 +117,33 @@ def rate_facts(found: Mapping[Rule, list[Rates]], accepted: np.ndarray, score: n
     facts: dict[str, Any] = {}
     for rule, ones in found.items():
         for one in ones:
-            level = f"mcs/{one.snr_db:.0f}dB"
-            facts |= _rates_of(one, level if rule == "expected" else f"{level}/{rule}", accepted, score)
+            room = f"mcs/{one.snr_db:.0f}dB" + ("" if rule == "expected" else f"/{rule}")
+            facts |= {f"{room}/{name}": value for name, value in _rates_of(one, accepted, score).items()}
     return facts
 
 
-def _rates_of(one: Rates, room: str, accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
-    miss = np.abs(one.chosen - one.oracle)
-    # Whoever is not accepted sends pilots, and chooses as the oracle does.
-    together = np.where(accepted, one.chosen_bps, one.oracle_bps)
+def _rates_of(one: Rates, accepted: np.ndarray, score: np.ndarray) -> dict[str, Any]:
+    chosen, oracle, miss = one.chosen_bps, one.oracle_bps, np.abs(one.chosen - one.oracle)
     facts: dict[str, Any] = {
-        f"{room}/oracle_mbps": one.oracle_bps.mean() / 1e6,
-        f"{room}/best_mbps": one.best_bps.mean() / 1e6,
-        f"{room}/chosen_mbps": one.chosen_bps.mean() / 1e6,
-        f"{room}/shortfall": _shortfall(one.chosen_bps, one.oracle_bps),
-        f"{room}/shortfall_best": _shortfall(one.chosen_bps, one.best_bps),
-        f"{room}/shortfall_with_fallback": _shortfall(together, one.oracle_bps),
-        f"{room}/exact": float((miss == 0).mean()),
-        f"{room}/off_by_more_than_2": float((miss > 2).mean()),
-        f"{room}/tbler": float(one.fails.mean()),
-        f"{room}/outage": float(one.outage.mean()),
-        f"{room}/care": one.care,
-    }
+        "oracle_mbps": oracle.mean() / 1e6, "best_mbps": one.best_bps.mean() / 1e6,
+        "chosen_mbps": chosen.mean() / 1e6,
+        "shortfall": _shortfall(chosen, oracle), "shortfall_best": _shortfall(chosen, one.best_bps),
+        # Whoever is not accepted sends pilots, and chooses as the oracle does.
+        "shortfall_with_fallback": _shortfall(np.where(accepted, chosen, oracle), oracle),
+        "exact": float((miss == 0).mean()), "off_by_more_than_2": float((miss > 2).mean()),
+        "tbler": float(one.fails.mean()), "outage": float(one.outage.mean()), "care": one.care,
+    }  # fmt: skip
     for share in (0.5, 0.7, 0.9):
         surest = score >= np.quantile(score, 1 - share)
-        short = _shortfall(one.chosen_bps[surest], one.oracle_bps[surest])
-        facts[f"{room}/shortfall_surest_{share:.0%}"] = short
+        facts[f"shortfall_surest_{share:.0%}"] = _shortfall(chosen[surest], oracle[surest])
     if np.isfinite(one.regret_bps).all():
-        facts |= _by_regret(one, room)
+        facts |= _by_regret(one)
     if accepted.any():
-        taken = one.chosen_bps[accepted]
         facts |= {
-            f"{room}/shortfall_accepted": _shortfall(taken, one.oracle_bps[accepted]),
-            f"{room}/shortfall_best_accepted": _shortfall(taken, one.best_bps[accepted]),
-            f"{room}/tbler_accepted": float(one.fails[accepted].mean()),
-            f"{room}/off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
+            "shortfall_accepted": _shortfall(chosen[accepted], oracle[accepted]),
+            "shortfall_best_accepted": _shortfall(chosen[accepted], one.best_bps[accepted]),
+            "tbler_accepted": float(one.fails[accepted].mean()),
+            "off_by_more_than_2_accepted": float((miss[accepted] > 2).mean()),
         }
     return facts
 
@@ -158,7 +153,7 @@ def _shortfall(taken: np.ndarray, oracle: np.ndarray) -> float | None:
     return float(1 - taken.mean() / oracle.mean()) if len(oracle) and oracle.mean() > 0 else None
 
 
-def _by_regret(one: Rates, room: str) -> dict[str, float | None]:
+def _by_regret(one: Rates) -> dict[str, float | None]:
     """`shortfall_calm_<share>`: of the positions whose choice is expected to miss least; `..._fallback`: of
     all positions when the others send pilots. What a rate needs to know is not how large an error is, but
     whether it crosses a step."""
@@ -168,20 +163,15 @@ def _by_regret(one: Rates, room: str) -> dict[str, float | None]:
         calm = np.zeros(len(order), bool)
         calm[order[: round(share * len(order))]] = True
         together = np.where(calm, one.chosen_bps, one.oracle_bps)
-        facts[f"{room}/shortfall_calm_{share:.0%}"] = _shortfall(one.chosen_bps[calm], one.oracle_bps[calm])
-        facts[f"{room}/shortfall_calm_{share:.0%}_fallback"] = _shortfall(together, one.oracle_bps)
+        facts[f"shortfall_calm_{share:.0%}"] = _shortfall(one.chosen_bps[calm], one.oracle_bps[calm])
+        facts[f"shortfall_calm_{share:.0%}_fallback"] = _shortfall(together, one.oracle_bps)
     return facts
 
 
 def transmit(
-    pusch: Pusch,
-    true: Tensor,
-    predicted: Tensor,
-    variance: Tensor,
-    levels: list[float],
-    sizes: tuple[int, int, int],
-    tick: Callable[[str], None],
-) -> list[Blocks]:
+    pusch: Pusch, true: Tensor, predicted: Tensor, variance: Tensor, levels: list[float],
+    sizes: tuple[int, int, int], tick: Callable[[str], None],
+) -> list[Blocks]:  # fmt: skip
     """Blocks at every Eb/N0: a few everywhere, all where curves fall; channels (P, K).
 
     Args:
@@ -194,87 +184,58 @@ def transmit(
     for level in levels:
         tick(f"{level:g} dB")
         some = pusch.run(true, predicted, variance, level, order[:coarse], batch)
-        falling = STEEP[0] < some.failed["perfect"].mean() < STEEP[1]
-        if fine > coarse and (falling or _floor(some)):
+        worst = max(
+            some.failed[name].mean() for name in ("perfect", "predicted")
+        )  # it may have an error floor
+        if fine > coarse and STEEP[0] < worst and some.failed["perfect"].mean() < STEEP[1]:
             rest = pusch.run(true, predicted, variance, level, order[coarse:fine], batch)
-            some = _joined(some, rest)
+            some = Blocks(
+                level, np.concatenate([some.position, rest.position]),
+                {name: np.concatenate([some.failed[name], rest.failed[name]]) for name in some.failed},
+                {name: np.concatenate([e, rest.bit_errors[name]]) for name, e in some.bit_errors.items()},
+            )  # fmt: skip
         found.append(some)
     return found
-
-
-def _floor(blocks: Blocks) -> bool:
-    """Whether only the predicted receivers still fail."""
-    return bool(blocks.failed["predicted"].mean() > STEEP[0] and blocks.failed["perfect"].mean() < STEEP[1])
-
-
-def _joined(first: Blocks, second: Blocks) -> Blocks:
-    return Blocks(
-        first.ebno_db,
-        np.concatenate([first.position, second.position]),
-        {name: np.concatenate([first.failed[name], second.failed[name]]) for name in first.failed},
-        {
-            name: np.concatenate([first.bit_errors[name], second.bit_errors[name]])
-            for name in first.bit_errors
-        },
-    )
 
 
 def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
     """Curves by name: each receiver on all and on accepted positions, prediction with fallback on all."""
     taken = [accepted[b.position] for b in found]
+
+    def curve(of: Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]) -> Curve:
+        failed, wrong = (
+            [of(getattr(b, what), t) for b, t in zip(found, taken, strict=True)]
+            for what in ("failed", "bit_errors")
+        )
+        bler, ber = (np.array([x.mean() if len(x) else np.nan for x in parts]) for parts in (failed, wrong))
+        errors, blocks = np.array([f.sum() for f in failed]), np.array([len(f) for f in failed])
+        return Curve(np.array([b.ebno_db for b in found]), bler, ber, errors, blocks)
+
     wanted: dict[str, Curve] = {}
     for name in found[0].failed:
-        failed, wrong = [b.failed[name] for b in found], [b.bit_errors[name] for b in found]
-        wanted[name] = _curve(found, failed, wrong)
-        wanted[f"{name}@accepted"] = _curve(
-            found,
-            [f[t] for f, t in zip(failed, taken, strict=True)],
-            [w[t] for w, t in zip(wrong, taken, strict=True)],
-        )
-    wanted["fallback"] = _curve(
-        found,
-        [np.where(t, b.failed["predicted"], b.failed[FALLBACK]) for b, t in zip(found, taken, strict=True)],
-        [
-            np.where(t, b.bit_errors["predicted"], b.bit_errors[FALLBACK])
-            for b, t in zip(found, taken, strict=True)
-        ],
-    )
+        wanted[name] = curve(lambda of, taken, name=name: of[name])
+        wanted[f"{name}@accepted"] = curve(lambda of, taken, name=name: of[name][taken])
+    wanted["fallback"] = curve(lambda of, taken: np.where(taken, of["predicted"], of[FALLBACK]))
     return wanted
-
-
-def _curve(found: list[Blocks], failed: list[np.ndarray], wrong: list[np.ndarray]) -> Curve:
-    return Curve(
-        np.array([b.ebno_db for b in found]),
-        np.array([f.mean() if len(f) else np.nan for f in failed]),
-        np.array([w.mean() if len(w) else np.nan for w in wrong]),
-        np.array([f.sum() for f in failed]),
-        np.array([len(f) for f in failed]),
-    )
 
 
 def pusch_facts(modulation: str, drawn: Mapping[str, Curve]) -> dict[str, Any]:
     """`pusch/<modulation>/<curve>/*`: rates with intervals, Eb/N0 at 10 %, and how far behind perfect."""
     facts: dict[str, Any] = {}
+    crossings = {name: crossing(curve.ebno_db, curve.bler) for name, curve in drawn.items()}
     for name, curve in drawn.items():
-        room = f"pusch/{modulation}/{name}"
-        at = crossing(curve.ebno_db, curve.bler)
-        reference = crossing(*_xy(drawn["perfect@accepted" if name.endswith("@accepted") else "perfect"]))
+        room, at = f"pusch/{modulation}/{name}", crossings[name]
+        reference = crossings["perfect@accepted" if name.endswith("@accepted") else "perfect"]
         facts[f"{room}/ebno_at_bler_0.1"] = at
         facts[f"{room}/behind_perfect_db"] = None if at is None or reference is None else at - reference
         for i, level in enumerate(curve.ebno_db):
+            bler, ber = (None if np.isnan(rate[i]) else float(rate[i]) for rate in (curve.bler, curve.ber))
             low, high = binomial_interval(int(curve.errors[i]), int(curve.blocks[i]))
-            facts |= {
-                f"{room}/{level:g}dB/bler": None if np.isnan(curve.bler[i]) else float(curve.bler[i]),
-                f"{room}/{level:g}dB/bler_low": low,
-                f"{room}/{level:g}dB/bler_high": high,
-                f"{room}/{level:g}dB/ber": None if np.isnan(curve.ber[i]) else float(curve.ber[i]),
-                f"{room}/{level:g}dB/blocks": int(curve.blocks[i]),
-            }
+            there = {
+                "bler": bler, "bler_low": low, "bler_high": high, "ber": ber, "blocks": int(curve.blocks[i])
+            }  # fmt: skip
+            facts |= {f"{room}/{level:g}dB/{key}": value for key, value in there.items()}
     return facts
-
-
-def _xy(curve: Curve) -> tuple[np.ndarray, np.ndarray]:
-    return curve.ebno_db, curve.bler
 
 
 def acceptance(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> dict[str, np.ndarray]:
@@ -284,11 +245,8 @@ def acceptance(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> di
     """
     rates = np.array([b.failed["perfect"].mean() for b in found])
     at = found[int(np.argmin(np.abs(np.log(np.maximum(rates, 1e-3) / 0.1))))]
-    curves = {name: np.full(len(shares), np.nan) for name in at.failed}
-    for i, share in enumerate(shares):
-        taken = score[at.position] >= np.quantile(score, 1 - share)
-        for name in curves:
-            curves[name][i] = at.failed[name][taken].mean()
+    surest = [score[at.position] >= np.quantile(score, 1 - share) for share in shares]
+    curves = {name: np.array([failed[t].mean() for t in surest]) for name, failed in at.failed.items()}
     return {"share": shares, "ebno_db": np.array(at.ebno_db), **curves}
 
 
@@ -297,12 +255,10 @@ def tradeoff(found: list[Blocks], score: np.ndarray, shares: np.ndarray) -> dict
     facts: dict[str, Any] = {}
     levels = np.array([b.ebno_db for b in found])
     for share in shares:
-        taken = [score[b.position] >= np.quantile(score, 1 - share) for b in found]
-
-        def at(name: str, taken: list[np.ndarray] = taken) -> float | None:
-            rates = [b.failed[name][t].mean() for b, t in zip(found, taken, strict=True)]
-            return crossing(levels, np.array(rates))
-
-        own, perfect = at("predicted"), at("perfect")
+        least = np.quantile(score, 1 - share)
+        own, perfect = (
+            crossing(levels, np.array([b.failed[name][score[b.position] >= least].mean() for b in found]))
+            for name in ("predicted", "perfect")
+        )
         facts[f"{share:.0%}/behind_db"] = None if own is None or perfect is None else own - perfect
     return facts

@@ -8,7 +8,7 @@ from typing import Any
 from rich.table import Table
 
 from gsparc.commands.link.pictures import STYLES
-from gsparc.commands.output import shown, table
+from gsparc.evaluation.summary import shown, table
 
 
 def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:

@@ -14,14 +14,13 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
 from gsparc.commands.context import context_of
-from gsparc.commands.output import columns, run_directory, shown, table
+from gsparc.commands.output import columns, report, run_directory
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.figure import draw
 from gsparc.commands.study.study import Row, Study, Variant
 from gsparc.data.load import load, split_for
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.summary import provenance, run_conditions, write_samples, write_summary
+from gsparc.evaluation.summary import provenance, run_conditions, shown, table, write_samples, write_summary
 from gsparc.methods.method import Method
 from gsparc.methods.registry import build, method_class
 from gsparc.methods.timing import ClockSettings, machine_facts
@@ -67,12 +66,8 @@ def task(config: DictConfig) -> list[Row]:
     write_samples(run_dir / "study.csv", columns(rows, Row))
     draw(rows, title, run_dir / "study.png")
     write_summary(run_dir / "summary.json", facts)
-    console = open_console()
-    console.print(table_of(rows, title))
-    for remark in run_conditions(facts):
-        console.print(remark, highlight=False)
     ratios = "" if study.base is None else f"ratios to {study.base!r}; "
-    console.print(f"{ratios}written to {run_dir}", highlight=False)
+    report(run_dir, table_of(rows, title), lines=run_conditions(facts), before=ratios)
     return rows
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsparc.commands.output import logarithmic, panels, save
 from gsparc.commands.study.study import Row
+from gsparc.evaluation.drawing import logarithmic, panels, save
 from gsparc.evaluation.metrics import lower_is_better
 
 
@@ -66,6 +66,5 @@ def draw(rows: Sequence[Row], title: str, path: Path) -> None:
             axes.set_yscale("log")
         elif lower_is_better(rows[0].figure):
             axes.invert_yaxis()
-        axes.grid(alpha=0.3)
     grid[0, 0].legend(fontsize=8)
     save(figure, path)

@@ -12,24 +12,23 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig
+from rich.table import Table
 
-from gsparc.commands.output import run_directory, table
+from gsparc.commands.output import report, run_directory
 from gsparc.commands.settings import plain
 from gsparc.commands.tradeoff.picture import Other, beaten_by, draw
-from gsparc.commands.tradeoff.sweep import candidate, sweep
+from gsparc.commands.tradeoff.sweep import Candidate, sweep
 from gsparc.data.files import platform_cache
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, Split
+from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import baseline
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.metrics import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of, score
-from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.evaluation.summary import provenance, table, write_samples, write_summary
 from gsparc.methods import checkpoint, stored_front
 from gsparc.methods.method import Method
-from gsparc.methods.pareto import Point, cost_of_halving, front
+from gsparc.methods.pareto import Point, cost_of_halving, front, worded
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import combinations, contributions, reduced
 from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
@@ -48,7 +47,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     settings = list(combinations(method, plain(config.grid), plain(config.singles)))
     threads = _threads(config.threads)
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
-    candidates = [candidate(reduced(method, s, measured), s, threads) for s in settings]
+    candidates = [Candidate(worded(s), s, reduced(method, s, measured), tuple(threads)) for s in settings]
     others = _others(config, run)
     places = data.moving[rows] + data.site.origin
     clocks = {name: Predictor(other, data.site).cycling(places) for name, (other, _) in others.items()}
@@ -80,7 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
-    _show(best, figure, facts, title, run_dir)
+    report(run_dir, _table(best, figure, title), lines=_slope(facts))
     for p in best:
         other = beaten_by(p, beside, figure)
         if other is not None:
@@ -91,16 +90,15 @@ def task(config: DictConfig) -> dict[str, Any]:
 def _threads(given: Sequence[int] | None) -> list[int]:
     found = sorted({1, torch.get_num_threads()}) if given is None else sorted({int(n) for n in given})
     cores = os.cpu_count() or 1
-    if not found or found[0] < 1 or found[-1] > cores:
-        raise ValueError(
-            f"threads={found}: numbers between 1 and the {cores} cores of this machine are needed"
-        )
-    return found
+    if found and found[0] >= 1 and found[-1] <= cores:
+        return found
+    raise ValueError(f"threads={found}: numbers between 1 and the {cores} cores of this machine are needed")
 
 
 def _others(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | None]]:
     """Baselines and the methods in other checkpoints, with the deciding figure of each."""
-    figure, fold, data = DECIDING[run.data.site.kind], run.split.folds[0], run.data
+    figure, data = DECIDING[run.data.site.kind], run.data
+    whole = Split("tradeoff", (run.split.folds[0],), "")
     cache = platform_cache() if config.cache is None else Path(config.cache)
     found: dict[str, tuple[Method, float | None]] = {}
     for name in config.baselines:
@@ -110,15 +108,10 @@ def _others(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | 
         method, other = checkpoint.load(path)
         if other.extra.get("split_sha256") not in (None, run.split.sha256):
             raise ValueError(f"peers: {path} was trained on another split than {config.ckpt}")
-        name = next(
-            n for n in (method.name, f"{method.name} ({Path(path).parent.name})", path) if n not in found
-        )
-        found[name] = (method, _scored(method, data, fold, config.eval_on)[figure])
+        names = (method.name, f"{method.name} ({Path(path).parent.name})", path)
+        name = next(name for name in names if name not in found)
+        found[name] = (method, score([method], data, whole, config.eval_on).figures()[figure])
     return found
-
-
-def _scored(method: Method, data: Measurements, fold: Fold, eval_on: str) -> dict[str, float | None]:
-    return score([method], data, Split("tradeoff", (fold,), ""), eval_on).figures()
 
 
 def _columns(
@@ -168,29 +161,27 @@ def _facts(
         f"test/{figure}": full.value(figure),
     }
     for number, p in enumerate(best, 1):
-        stem = f"front/{number}"
-        facts |= {f"{stem}/render_ms_p50": p.p50, f"{stem}/render_ms_p95": p.p95, f"{stem}/label": p.label}
-        facts |= {f"{stem}/{name}": value for name, value in p.figures.items()}
+        own = {"render_ms_p50": p.p50, "render_ms_p95": p.p95, "label": p.label, **p.figures}
+        facts |= {f"front/{number}/{name}": value for name, value in own.items()}
     for name, other in others.items():
         facts |= {f"baseline/{name}/{figure}": other.value, f"baseline/{name}/render_ms_p50": other.p50}
     return facts
 
 
-def _show(best: list[Point], figure: str, facts: dict[str, Any], title: str, run_dir: Path) -> None:
+def _table(best: list[Point], figure: str, title: str) -> Table:
     rows = []
     for p in best:
         gap, error = p.difference
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
         rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
-    console = open_console()
-    console.print(table(title, ["not beaten"], ["ms p50", "ms p95", figure, "difference to full"], rows))
-    slope = facts["tradeoff/per_halving"]
-    if slope is not None:
-        beaten = facts["tradeoff/front_beaten_by_others"]
-        rest = f" ({len(best) - beaten} that no baseline beats)" if beaten else ""
-        console.print(
-            f"{len(best)} points span {facts['tradeoff/span']:.1f} times in latency; each halving costs "
-            f"{slope:.2g} dB on average along the front{rest}",
-            highlight=False,
-        )
-    console.print(f"written to {run_dir}", highlight=False)
+    return table(title, ["not beaten"], ["ms p50", "ms p95", figure, "difference to full"], rows)
+
+
+def _slope(facts: dict[str, Any]) -> list[str]:
+    names = ("front", "span", "per_halving", "front_beaten_by_others")
+    count, span, slope, beaten = (facts[f"tradeoff/{name}"] for name in names)
+    rest = f" ({count - beaten} that no baseline beats)" if beaten else ""
+    text = (
+        f"{count} points span {span:.1f} times in latency; each halving costs {slope or 0:.2g} dB on average"
+    )
+    return [] if slope is None else [f"{text} along the front{rest}"]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsparc.commands.output import logarithmic, panels, save
+from gsparc.evaluation.drawing import logarithmic, panels, save
 from gsparc.evaluation.metrics import lower_is_better, score_of
 from gsparc.methods.pareto import Point
 
@@ -50,24 +50,21 @@ def draw(
         title: what was measured.
         path: PNG file.
     """
-    figure, grid = panels(11, 5.2, 1, 2, width_ratios=(1.5, 1))
-    axes, legend = grid[0]
+    figure, ((axes, legend),) = panels(11, 5.2, 1, 2, grid=False, width_ratios=(1.5, 1))
     value = [p.value(figure_name) for p in points]
     inside = [i for i in range(len(points)) if i not in on_front]
     axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
 
     x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]
     reach = [[0.0] * len(x), [points[i].p95 - points[i].p50 for i in on_front]]
-    axes.errorbar(
-        x, y, xerr=reach, fmt="o-", color="C0", capsize=2, lw=1, label="not beaten (to 95th percentile)"
-    )
-    for number, i in enumerate(on_front, 1):
-        axes.annotate(
-            str(number), (points[i].p50, value[i]), xytext=(-3, 6), textcoords="offset points", color="C0"
-        )
+    label = "not beaten (to 95th percentile)"
+    axes.errorbar(x, y, xerr=reach, fmt="o-", color="C0", capsize=2, lw=1, label=label)
+    near = {"textcoords": "offset points"}
+    for number, place in enumerate(zip(x, y, strict=True), 1):
+        axes.annotate(str(number), place, xytext=(-3, 6), color="C0", **near)
     for name, other in others.items():
         axes.scatter([other.p50], [other.value], marker="s", c="C1", s=28)
-        axes.annotate(name, (other.p50, other.value), xytext=(6, -4), textcoords="offset points", color="C1")
+        axes.annotate(name, (other.p50, other.value), xytext=(6, -4), color="C1", **near)
     logarithmic(axes)
     worst, best = min(y), max(y)  # far-off others would flatten the front
     if lower_is_better(figure_name):
@@ -77,11 +74,9 @@ def draw(
         axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
         below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
         if below:
-            axes.text(
-                0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, color="C1", fontsize=8
-            )
-    axes.set_xlabel("one query end to end, median [ms]")
-    axes.set_ylabel(NAMES.get(figure_name, figure_name))
+            said = f"below: {', '.join(below)}"
+            axes.text(0.01, 0.01, said, transform=axes.transAxes, color="C1", fontsize=8)
+    axes.set(xlabel="one query end to end, median [ms]", ylabel=NAMES.get(figure_name, figure_name))
     axes.grid(alpha=0.3, which="both")
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)

@@ -17,7 +17,7 @@ from gsparc.evaluation.evaluate import paired_differences
 from gsparc.evaluation.metrics import DECIDING
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods.method import Method, Prediction
-from gsparc.methods.pareto import Point, Settings, worded
+from gsparc.methods.pareto import Point, Settings
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import View
 from gsparc.methods.timing import Call, ClockSettings, interleaved
@@ -46,14 +46,9 @@ class Candidate:
 
 
 def sweep(
-    candidates: Sequence[Candidate],
-    data: Measurements,
-    fold: Fold,
-    *,
-    eval_on: str,
-    clock: ClockSettings,
+    candidates: Sequence[Candidate], data: Measurements, fold: Fold, *, eval_on: str, clock: ClockSettings,
     others: Mapping[str, Call],
-) -> tuple[list[Point], dict[str, np.ndarray]]:
+) -> tuple[list[Point], dict[str, np.ndarray]]:  # fmt: skip
     """Measure the candidates; the first is the full model, which the others are compared with.
 
     Args:
@@ -66,11 +61,10 @@ def sweep(
     Returns:
         A point per candidate and number of threads, and the times [ms] of `others`.
     """
-    figure = DECIDING[data.site.kind]
-    split = Split("tradeoff", (fold,), "")
+    figure, split = DECIDING[data.site.kind], Split("tradeoff", (fold,), "")
     scored: list[tuple[Scores, float]] = []
-    rows, whole = rows_of(fold, eval_on), None
-    places = data.moving[rows] + data.site.origin
+    whole = None
+    places = data.moving[rows_of(fold, eval_on)] + data.site.origin
     for number, candidate in enumerate(candidates):
         recorded = Recorded(candidate.method)
         there = score([recorded], data, split, eval_on)
@@ -130,8 +124,3 @@ def _difference(scores: Scores, full: Scores, figure: str) -> tuple[float | None
     found = paired_differences(scores, full, "full")
     stem = f"paired/full/{PAIRED.get(figure, figure)}"
     return found.get(stem), found.get(f"{stem}_se")
-
-
-def candidate(method: Method, settings: Settings, threads: Sequence[int], label: str = "") -> Candidate:
-    """A candidate called after its settings."""
-    return Candidate(label or worded(settings), settings, method, tuple(threads))
