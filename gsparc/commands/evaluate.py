@@ -8,7 +8,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.output import report, run_directory
+from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
@@ -67,5 +67,5 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    report(run_dir, results_table(facts, facts["model/name"], title, config.eval_on))
+    show(run_dir, results_table(facts, facts["model/name"], title, config.eval_on))
     return facts

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from rich.table import Table
+from rich.console import RenderableType
 
 from gsparc.evaluation.console import open_console
 
@@ -18,11 +18,11 @@ def run_directory() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def report(run_dir: Path, *shown: Table, lines: Iterable[str] = (), before: str = "") -> None:
+def show(run_dir: Path, *shown: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
     """What a command says at its end: tables, sentences, and `before` with where everything was written."""
     console = open_console()
-    for table in shown:
-        console.print(table)
+    for one in shown:
+        console.print(one)
     for line in (*lines, f"{before}written to {run_dir}"):
         console.print(line, highlight=False)
 

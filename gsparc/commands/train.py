@@ -17,14 +17,15 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands import cli
 from gsparc.commands.context import context_of
+from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.run import fit_and_score
+from gsparc.data.datamodule import DataModule
 from gsparc.data.files import platform_cache
 from gsparc.data.instantiate import suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Split, write_split
-from gsparc.evaluation.console import open_console
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.metrics import DECIDING, figure_names, score_of
 from gsparc.evaluation.open_runs import aligned
@@ -71,34 +72,21 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         ValueError: bad data, settings or checkpoint; one line each.
     """
     RunSettings.of(config)
-    _refuse_absent(config.ckpt_path)
-    _anchor(config)
-    module = datamodule(config.dataset)
-    if config.get("init_from") is not None:
-        module.measurements = _seen_from(config.init_from, module.measurements)
+    module = _data(config)
     data = module.measurements
     objective_of(config, data.site.kind)  # refused now, not after the training
-    split = split_for(plain(config.split), data)
-    _refuse_empty(split)
-    write_split(run_dir / "split.json", split, len(data), data.site.sha256)
-    config_yaml = OmegaConf.to_yaml(config, resolve=True)
+    split = _split(config, data, run_dir / "split.json")
     count = len(split.folds)
     folders = [run_dir] if count == 1 else [run_dir / f"fold{number}" for number in range(count)]
     files = tuple(folder / "model.ckpt" for folder in folders)
     resumes = [_resume(config, number, count) for number in range(count)]
-    unfitted = build(config.model)
-    _refuse_start(config, unfitted)
-    if any(resumes) and not unfitted.resumable:
-        raise ValueError(f"ckpt_path: {unfitted.name} trains in one piece; start again without ckpt_path")
-    for guess in unfitted.guesses:
-        log.info("guess: %s", guess)
+    _check_model(config, any(resumes))
+    yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        _note_unused_trainer(method)
-        for note in report.notes:
-            log.info("%s", note)
+        _tell(method, report)
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
-        checkpoint.save(files[number], method, config_yaml, extra)
+        checkpoint.save(files[number], method, yaml, extra)
 
     with _loggers(config) as loggers:
         fitted = fit_and_score(
@@ -114,38 +102,52 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         facts = {**found.facts, **provenance(), "seed": int(config.seed)}
         for logger in loggers:
             logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
-    draw_predictions(
-        methods[0],
-        data,
-        split.folds[0],
-        f"{data.site.name}: test rows of {methods[0].name}",
-        run_dir / "test.png",
-    )
+    title = f"{data.site.name}: test rows of {methods[0].name}"
+    draw_predictions(methods[0], data, split.folds[0], title, run_dir / "test.png")
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_summary(run_dir / "summary.json", facts)
     return facts, Objects(methods, files, data, split, found)
 
 
-def _anchor(config: DictConfig) -> None:
-    """Data paths become absolute, so that a checkpoint finds its data from any folder."""
-    for key in ("root", "file"):
+def _data(config: DictConfig) -> DataModule:
+    """The data, in the coordinates and units of the model that training starts from, if there is one."""
+    path, start = config.ckpt_path, config.get("init_from")
+    if path is not None and not Path(path).exists():  # before anything is read or simulated
+        raise ValueError(f"ckpt_path={path}: no such file")
+    for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         if not OmegaConf.is_missing(config.dataset, key) and config.dataset.get(key):
             config.dataset[key] = str(Path(config.dataset[key]).resolve())
+    module = datamodule(config.dataset)
+    if start is not None:
+        try:
+            module.measurements = aligned(module.measurements, checkpoint.read(start).site)
+        except ValueError as error:
+            raise ValueError(f"init_from={start}: {error}") from None
+    return module
 
 
-def _refuse_empty(split: Split) -> None:
+def _split(config: DictConfig, data: Measurements, file: Path) -> Split:
+    """The folds, written to `file`; none without rows to learn from or to test on."""
+    split = split_for(plain(config.split), data)
     for number, fold in enumerate(split.folds):
         if len(fold.train) < LEAST_ROWS or not len(fold.test):
             raise ValueError(
                 f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
                 f"rows; at least {LEAST_ROWS} and 1 are needed"
             )
+    write_split(file, split, len(data), data.site.sha256)
+    return split
 
 
-def _refuse_absent(path: str | None) -> None:
-    """Before anything is read or simulated: there is nothing to go on with."""
-    if path is not None and not Path(path).exists():
-        raise ValueError(f"ckpt_path={path}: no such file")
+def _check_model(config: DictConfig, resumed: bool) -> None:
+    """Say what the model guesses; refuse weights to start from, or a resume, where they mean nothing."""
+    method = build(config.model)
+    if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
+        raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
+    if resumed and not method.resumable:
+        raise ValueError(f"ckpt_path: {method.name} trains in one piece; start again without ckpt_path")
+    for guess in method.guesses:
+        log.info("guess: %s", guess)
 
 
 def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
@@ -163,32 +165,17 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     return own if own.exists() else None
 
 
-def _seen_from(path: str, data: Measurements) -> Measurements:
-    """`data` in the local coordinates and units of the model that training starts from."""
-    try:
-        return aligned(data, checkpoint.read(path).site)
-    except ValueError as error:
-        raise ValueError(f"init_from={path}: {error}") from None
-
-
-def _refuse_start(config: DictConfig, method: Method) -> None:
-    """Weights to start from mean nothing to a method without any."""
-    if config.get("init_from") is not None and not isinstance(method, TrainsByGradient):
-        raise ValueError(f"init_from: {method.name} does not train by gradient; start without it")
-
-
-def _note_unused_trainer(method: Method) -> None:
-    """Say so when options of the Trainer were asked for and the method had no use for them."""
-    if isinstance(method, TrainsByGradient) and method.trainer_options():
-        return
-    said = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
-    unused = [o for o in said if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]
-    log.log(
-        logging.WARNING if unused else logging.DEBUG,
-        "%s does not train by gradient: trainer options (%s) are not used",
-        method.name,
-        ", ".join(unused) or "accelerator, devices, precision, max_steps, ...",
-    )
+def _tell(method: Method, report: FitReport) -> None:
+    """What the fit found, and whether options of the Trainer were asked for and not used."""
+    if not (isinstance(method, TrainsByGradient) and method.trainer_options()):
+        said = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
+        unused = [o for o in said if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]
+        options = ", ".join(unused) or "accelerator, devices, precision, max_steps, ..."
+        level = logging.WARNING if unused else logging.DEBUG
+        text = "%s does not train by gradient: trainer options (%s) are not used"
+        log.log(level, text, method.name, options)
+    for note in report.notes:
+        log.info("%s", note)
 
 
 @contextmanager
@@ -227,15 +214,12 @@ def task(config: DictConfig) -> float:
     Returns:
         The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned.
     """
-    run_dir = Path(HydraConfig.get().runtime.output_dir)
+    run_dir = run_directory()
     facts, objects = train(config, run_dir)
     figure = objective_of(config, objects.data.site.kind)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    console = open_console()
-    console.print(results_table(facts, facts["model/name"], title, config.eval_on))
-    for remark in remarks(facts, config.eval_on):
-        console.print(remark, highlight=False)
-    console.print(f"written to {run_dir}", highlight=False)
+    shown = results_table(facts, facts["model/name"], title, config.eval_on)
+    show(run_dir, shown, lines=remarks(facts, config.eval_on))
     value = facts[f"{config.eval_on}/{figure}"]
     if value is None:
         raise ValueError(f"objective={config.eval_on}/{figure}: these data and baselines do not tell it")

@@ -14,8 +14,7 @@ from gsparc import load
 from gsparc.commands.link.adaptation import Rates
 from gsparc.commands.link.beams import gain, loss_db
 from gsparc.commands.link.channels import truth
-from gsparc.commands.link.statistics import crossing
-from gsparc.commands.link.study import beam_facts, rate_facts
+from gsparc.commands.link.study import beam_facts, crossing, rate_facts
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.resource_grid import centred, interpolated, resource_grid

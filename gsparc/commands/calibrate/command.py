@@ -12,7 +12,7 @@ from rich.table import Table
 from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.commands.calibrate.pictures import draw
 from gsparc.commands.calibrate.trial import How, Trial, accept, divisible, trials
-from gsparc.commands.output import report, run_directory
+from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.argos import published_figures, published_normalisation
 from gsparc.data.schema import Measurements
@@ -136,7 +136,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             bound = "no threshold keeps the bound" if threshold is None else f"accepted from {threshold:.4g}"
             stored_lines.append(f"{path}: confidence={stored.kind}, {bound}")
         write_summary(run_dir / "summary.json", facts)
-    report(run_dir, *tables(facts, evidence, found), lines=stored_lines)
+    show(run_dir, *tables(facts, evidence, found), lines=stored_lines)
     return facts
 
 

@@ -9,12 +9,11 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gsparc.data.instantiate import targets
+from gsparc.data.instantiate import find, targets
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -40,10 +39,6 @@ class Contender:
     reserve_s: float = 0.0
     only_longest: bool = False
     timed_only: bool = False
-
-    def serves(self, kind: str) -> bool:
-        """Whether data of this kind can be predicted."""
-        return not self.kinds or kind in self.kinds
 
     def overrides(self, budget_s: float | None, seed: int | None) -> list[str]:
         """Overrides of train.yaml for one cell."""
@@ -105,10 +100,6 @@ class Budget:
     seeds: tuple[int, ...]
     splits: tuple[str, ...] = ()
 
-    def given(self, split: str) -> bool:
-        """Whether methods get it under this split."""
-        return not self.splits or split in self.splits
-
 
 def plan(
     problems: Sequence[tuple[str, str, str]],
@@ -127,10 +118,10 @@ def plan(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    able = {(d, s): [m for m in methods.values() if m.serves(kind)] for d, s, kind in problems}
-    cells = [
-        Cell(*problem, m.name, None, None) for problem, those in able.items() for m in those if not m.budget
-    ]
+    able = {
+        (d, s): [m for m in methods.values() if not m.kinds or kind in m.kinds] for d, s, kind in problems
+    }
+    cells = [Cell(*there, m.name, None, None) for there, those in able.items() for m in those if not m.budget]
     longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
     for turn in range(turns):  # first seeds of all budgets before second ones
@@ -140,7 +131,7 @@ def plan(
                     Cell(*problem, m.name, budget.seconds, budget.seeds[turn])
                     for m in those
                     if m.budget
-                    and budget.given(problem[1])
+                    and (not budget.splits or problem[1] in budget.splits)
                     and not (m.only_longest and (turn > 0 or budget.seconds < longest))
                 ]
     for pattern in only:
@@ -170,14 +161,8 @@ def code_version(model: Mapping[str, Any]) -> str:
     That is every class it names, their bases, and what these import from their own packages. The shared
     ground (rasterizer, loaders, metrics) is not part of it: having changed that, start with an empty folder.
     """
-    classes = [
-        getattr(import_module(module), name)
-        for path in targets(model)
-        for module, _, name in [path.rpartition(".")]
-    ]
-    open_ends = {
-        base.__module__ for cls in classes for base in cls.__mro__ if base.__module__.startswith("gsparc.")
-    } - {"gsparc.methods.method"}
+    named = {base.__module__ for path in targets(model) for base in find(path).__mro__}
+    open_ends = {name for name in named if name.startswith("gsparc.")} - {"gsparc.methods.method"}
     sources: dict[str, str] = {}
     while open_ends:
         name = open_ends.pop()
@@ -188,8 +173,7 @@ def code_version(model: Mapping[str, Any]) -> str:
         sources[name], imported = _program(file, file.stat().st_mtime_ns)
         package = name.rpartition(".")[0]
         open_ends |= {m for m in imported if m.rpartition(".")[0] == package}
-    text = json.dumps(sources, sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return hashlib.sha256(json.dumps(sources, sort_keys=True).encode()).hexdigest()[:12]
 
 
 @functools.cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -15,27 +16,24 @@ from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsparc.commands.compare import figure, table
-from gsparc.commands.compare.cells import Budget, Cell, contenders, plan
+from gsparc.commands.compare.cells import Budget, contenders, plan
 from gsparc.commands.compare.fitting import (
     Filled,
     Prepared,
     Problem,
     fill,
-    kept_in,
     load_problems,
     prepare,
     stored_problems,
 )
 from gsparc.commands.compare.latency import Latency, latencies
-from gsparc.commands.output import run_directory
+from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
-from gsparc.evaluation.console import one_line, open_console
-from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.console import one_line
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
 
 log = logging.getLogger(__name__)
-
-FREE_S = 5.0  # guessed for a method without a budget, until one was seen
 
 
 def task(config: DictConfig) -> list[table.Row]:
@@ -44,10 +42,11 @@ def task(config: DictConfig) -> list[table.Row]:
     run_dir = run_directory()
     settings = plain(config)
     methods = contenders(settings["methods"])
-    kept = kept_in(settings["cells"], platform_cache())
+    folder = settings["cells"]
+    kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     problems = _problems(settings, kept)
     budgets = [
-        Budget(float(b["seconds"]), tuple(int(s) for s in b["seeds"]), tuple(b.get("splits") or ()))
+        Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
     wanted = plan([(r.dataset, r.split, r.kind) for r in problems], methods, budgets, settings["only"])
@@ -57,7 +56,7 @@ def task(config: DictConfig) -> list[table.Row]:
         for c in wanted
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
-    filled = fill_all(prepared, by_name, bool(settings["train"]), limit_s)
+    filled = fill_all(prepared, bool(settings["train"]), limit_s)
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     timed = _timed(filled, by_name, kept, bool(settings["latency"]))
@@ -100,69 +99,38 @@ def _may_match(pattern: str, dataset: str, split: str) -> bool:
     return True
 
 
-def fill_all(
-    prepared: Sequence[Prepared],
-    problems: Mapping[tuple[str, str], Problem],
-    train: bool = True,
-    limit_s: float | None = None,
-) -> list[Filled]:
+def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | None = None) -> list[Filled]:
     """Find or fill one cell after another, saying how far it is and how long it will take.
 
-    A cell that cannot be filled is said and left out; the others go on.
+    A cell that cannot be filled is said and left out; the others go on. One that is not tried keeps what was
+    measured with earlier program text.
     """
     filled: list[Filled] = []
-    open_cells = [p for p in prepared if p.found() is None and _problem(p.cell, problems).data is not None]
-    log.info("%d cells, %d of them are there", len(prepared), sum(p.found() is not None for p in prepared))
-    started = time.monotonic()
-    left = sum(_expected_s(p.cell, problems) for p in open_cells) if train else 0.0
+    missing = [one for one in prepared if one.found() is None]
+    log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(missing))
+    started, left = time.monotonic(), sum(one.expected_s for one in missing)
     for number, one in enumerate(prepared, 1):
         found = one.found()
-        problem = _problem(one.cell, problems)
-        if found is None and train and problem.data is not None:
-            expected = _expected_s(one.cell, problems)
-            if limit_s is not None and time.monotonic() - started + expected > limit_s:
+        if found is None and train and one.problem.data is not None:
+            if limit_s is not None and time.monotonic() - started + one.expected_s > limit_s:
                 log.warning("max_hours: %s is not started", one.cell)
-                filled += _earlier(one, problems)
-                continue
-            log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
-            left -= expected
-            try:
-                found = fill(one, problem)
-            except (ValueError, RuntimeError) as error:
-                log.warning("%s cannot be filled: %s", one.cell, one_line(error))
-                continue
-            score = (
-                f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB"
-                if found.scored()
-                else "-"
-            )
-            log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
-        filled += [found] if found is not None else _earlier(one, problems)
+            else:
+                log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
+                left -= one.expected_s
+                try:
+                    found = fill(one)
+                except (ValueError, RuntimeError) as error:
+                    log.warning("%s cannot be filled: %s", one.cell, one_line(error))
+                    continue
+                score = f"{table.score_db(one.problem.kind, found.facts):.2f} dB" if found.scored() else "-"
+                log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
+        found = found or one.found_earlier()
+        filled += [found] if found else []
     return filled
 
 
-def _problem(cell: Cell, problems: Mapping[tuple[str, str], Problem]) -> Problem:
-    return problems[cell.dataset, cell.split]
-
-
-def _earlier(one: Prepared, problems: Mapping[tuple[str, str], Problem]) -> list[Filled]:
-    """What was measured with earlier program text, where nothing newer is there."""
-    found = one.found_earlier(_problem(one.cell, problems))
-    return [] if found is None else [found]
-
-
-def _expected_s(cell: Cell, problems: Mapping[tuple[str, str], Problem]) -> float:
-    """Seconds a cell will take: its budget on every fold, and something for scoring [s]."""
-    problem = _problem(cell, problems)
-    folds = 0 if problem.folds is None else len(problem.folds.folds)
-    return folds * ((cell.budget_s or FREE_S) + 2.0)
-
-
 def _timed(
-    filled: Sequence[Filled],
-    problems: Mapping[tuple[str, str], Problem],
-    kept: Path,
-    measure: bool,
+    filled: Sequence[Filled], problems: Mapping[tuple[str, str], Problem], kept: Path, measure: bool
 ) -> dict[str, dict[str, Latency]]:
     """Latencies by dataset and method: measured now on the first split that is there, or as kept."""
     found: dict[str, dict[str, Latency]] = {}
@@ -198,7 +166,7 @@ def report(
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
     page = table.markdown(blocks, ours, only_timed)
-    table.write_csv(rows, run_dir / "compare.csv")
+    write_samples(run_dir / "compare.csv", columns(rows, table.Row))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
     figure.draw(rows, run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}
@@ -206,11 +174,8 @@ def report(
         stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"
         facts[f"{stem}/first"] = block.rows[0].method
         for row in block.rows:
-            facts[f"{stem}/{row.method}/score_db"] = row.score_db
-            facts[f"{stem}/{row.method}/train_s"] = row.train_s
-            facts[f"{stem}/{row.method}/query_ms_p50"] = row.query_ms
+            own = {"score_db": row.score_db, "train_s": row.train_s, "query_ms_p50": row.query_ms}
+            facts |= {f"{stem}/{row.method}/{name}": value for name, value in own.items()}
     write_summary(run_dir / "summary.json", facts)
-    console = open_console()
-    console.print(Markdown(page))
-    console.print(f"written to {run_dir}", highlight=False)
+    show(run_dir, Markdown(page))
     return rows

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -33,6 +32,7 @@ from gsparc.methods.timing import machine_facts
 log = logging.getLogger(__name__)
 
 RESULT = "cell.json"
+FREE_S = 5.0  # guessed for a method without a budget
 EARLIER = "measured at commit"  # among the facts of a result of earlier program text
 
 
@@ -133,12 +133,19 @@ class Filled:
 
 @dataclass(frozen=True)
 class Prepared:
-    """A cell, composed but not yet trained."""
+    """A cell of a problem, composed but not yet trained."""
 
     cell: Cell
+    problem: Problem
     config: DictConfig
     folder: Path
     scored: bool = True
+
+    @property
+    def expected_s(self) -> float:
+        """Seconds it will take: its budget on every fold, and something for scoring [s]; 0 without data."""
+        folds = self.problem.folds
+        return 0.0 if folds is None else len(folds.folds) * ((self.cell.budget_s or FREE_S) + 2.0)
 
     def found(self) -> Filled | None:
         """The kept result, if there is a whole one."""
@@ -148,22 +155,20 @@ class Prepared:
             return None
         return Filled(self.cell, self.folder, facts)
 
-    def found_earlier(self, problem: Problem) -> Filled | None:
+    def found_earlier(self) -> Filled | None:
         """The latest result of other program text or settings for this cell, the same data and split.
 
         Published results outlive the code they were measured with; a table must say so, not lose them.
         """
         stem = self.folder.name.rpartition("-")[0]
         same: dict[str, Any] = {"seed": self.cell.seed, "budget_s": self.cell.budget_s}
-        same |= dict(zip(("dataset/sha256", "split/sha256"), problem.hashes, strict=True))
-        found = []
-        for file in self.folder.parent.glob(f"{stem}-*/{RESULT}"):
-            facts = json.loads(file.read_text(encoding="utf-8"))
-            if all(facts.get(name) == value for name, value in same.items()):
-                found.append((facts.get("made") or "", file.parent, facts))
+        same |= dict(zip(("dataset/sha256", "split/sha256"), self.problem.hashes, strict=True))
+        files = self.folder.parent.glob(f"{stem}-*/{RESULT}")
+        every = {file.parent: json.loads(file.read_text(encoding="utf-8")) for file in files}
+        found = {path: f for path, f in every.items() if all(f.get(k) == v for k, v in same.items())}
         if not found:
             return None
-        _, folder, facts = max(found, key=lambda entry: entry[0])
+        folder, facts = max(found.items(), key=lambda item: item[1].get("made") or "")
         return Filled(self.cell, folder, {**facts, EARLIER: str(facts.get("git"))[:8]})
 
 
@@ -176,17 +181,17 @@ def prepare(
     trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
     name = key(whole["model"], trainer, *problem.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
-    return Prepared(cell, config, folder, not contender.timed_only)
+    return Prepared(cell, problem, config, folder, not contender.timed_only)
 
 
-def fill(prepared: Prepared, problem: Problem) -> Filled:
+def fill(prepared: Prepared) -> Filled:
     """Train on every fold, score on the test rows, write checkpoints and then the result.
 
     Raises:
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
-    config, folder, (data, split) = prepared.config, prepared.folder, problem.present()
+    config, folder, (data, split) = prepared.config, prepared.folder, prepared.problem.present()
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
@@ -214,8 +219,3 @@ def fill(prepared: Prepared, problem: Problem) -> Filled:
     facts |= dataset_facts(data) | split_facts(split) | machine_facts() | provenance()
     write_summary(folder / RESULT, facts)  # last: a cell without it does not count
     return Filled(prepared.cell, folder, facts)
-
-
-def kept_in(folder: str | None, cache: Path) -> Path:
-    """Where cells live: the folder asked for, else the platform's cache."""
-    return Path(os.path.expanduser(folder)) if folder else cache / "comparison"

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gsparc.commands.compare.fitting import Filled
 from gsparc.commands.compare.latency import Latency
-from gsparc.commands.output import columns
 from gsparc.data.schema import Kind
 from gsparc.evaluation.metrics import DECIDING, score_of
-from gsparc.evaluation.summary import BUSY, shown, write_samples
+from gsparc.evaluation.summary import BUSY, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
@@ -76,20 +74,14 @@ def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -
     `timed` holds latencies by dataset and method, of the dataset's first split and shown there alone: models
     of fewer measurements answer faster.
     """
-    filled = [one for one in filled if one.scored()]
-
-    def group(one: Filled) -> tuple[str, str, float, str]:
-        cell = one.cell
-        return cell.dataset, cell.split, cell.budget_s or 0.0, cell.method
-
-    problems = list(dict.fromkeys((one.cell.dataset, one.cell.split) for one in filled))
-    arranged = sorted(
-        filled, key=lambda one: (problems.index((one.cell.dataset, one.cell.split)), *group(one))
-    )
+    groups: dict[tuple[str, str, float, str], list[Filled]] = {}
+    for cell, one in ((one.cell, one) for one in filled if one.scored()):
+        groups.setdefault((cell.dataset, cell.split, cell.budget_s or 0.0, cell.method), []).append(one)
+    problems = list(dict.fromkeys((dataset, split) for dataset, split, *_ in groups))
     first = dict(reversed(problems))
     return [
-        _row(list(same), timed.get(dataset, {}).get(method) if split == first[dataset] else None)
-        for (dataset, split, _, method), same in groupby(arranged, group)
+        _row(groups[key], timed.get(key[0], {}).get(key[3]) if key[1] == first[key[0]] else None)
+        for key in sorted(groups, key=lambda key: (problems.index(key[:2]), *key))
     ]
 
 
@@ -136,11 +128,10 @@ def blocks(found: Sequence[Row]) -> list[Block]:
     """One per dataset, split and budget; methods without a budget stand in each."""
     result = []
     for (dataset, split), group in groupby(found, lambda r: (r.dataset, r.split)):
-        here = list(group)
-        free = [r for r in here if r.budget_s is None]
+        here = sorted(group, key=lambda r: r.budget_s is not None)
         budgets: list[float | None] = [*sorted({r.budget_s for r in here if r.budget_s is not None})]
         for budget in budgets or [None]:
-            members = free + [r for r in here if budget is not None and r.budget_s == budget]
+            members = [r for r in here if r.budget_s in (None, budget)]
             result.append(Block(dataset, split, budget, tuple(sorted(members, key=lambda r: -r.score_db))))
     return result
 
@@ -167,15 +158,11 @@ def remarks(block: Block, ours: str) -> list[str]:
     close = [r for r in block.rows if r.score_db >= first.score_db - CLOSE_DB and r.query_ms is not None]
     if close:
         quick = min(close, key=lambda r: r.query_ms or np.inf)
-        found.append(
-            f"fastest within {CLOSE_DB} dB of the first: {quick.method}, {quick.query_ms:.3g} ms a query"
-        )
-    old = {r.method: r.earlier for r in block.rows if r.earlier}
+        near = f"fastest within {CLOSE_DB} dB of the first"
+        found.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
+    old = ", ".join(f"{r.method} ({r.earlier})" for r in block.rows if r.earlier)
     if old:
-        found.append(
-            "measured before the program or its settings were last changed (at commit): "
-            + ", ".join(f"{method} ({commits})" for method, commits in old.items())
-        )
+        found.append(f"measured before the program or its settings were last changed (at commit): {old}")
     loads = [r.load for r in block.rows if r.load is not None and r.budget_s is not None]
     if loads and max(loads) > BUSY:
         found.append(
@@ -215,8 +202,3 @@ def _page(block: Block, ours: str) -> str:
         bold = row.method == ours
         lines.append("| " + " | ".join(f"**{c}**" if bold else c for c in cells) + " |")
     return "\n".join([f"### {block.title}", "", *lines, "", *(f"- {r}" for r in remarks(block, ours))])
-
-
-def write_csv(found: Sequence[Row], path: Path) -> None:
-    """One line per row, every column."""
-    write_samples(path, columns(found, Row))

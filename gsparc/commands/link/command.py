@@ -28,7 +28,7 @@ from gsparc.commands.link.study import (
     transmit,
 )
 from gsparc.commands.link.tables import tables
-from gsparc.commands.output import report, run_directory
+from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.open_runs import open_files
@@ -157,5 +157,5 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_acceptance(trades, float(accepted.mean()), run_dir / "acceptance.png")
     facts |= {**machine_facts(), **provenance(), "time/total_s": time.perf_counter() - started}
     write_summary(run_dir / "summary.json", facts)
-    report(run_dir, *tables(facts, title, list(wanted), levels))
+    show(run_dir, *tables(facts, title, list(wanted), levels))
     return facts

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
 from gsparc.commands.context import context_of
-from gsparc.commands.output import columns, report, run_directory
+from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.figure import draw
 from gsparc.commands.study.study import Row, Study, Variant
@@ -67,7 +67,7 @@ def task(config: DictConfig) -> list[Row]:
     draw(rows, title, run_dir / "study.png")
     write_summary(run_dir / "summary.json", facts)
     ratios = "" if study.base is None else f"ratios to {study.base!r}; "
-    report(run_dir, table_of(rows, title), lines=run_conditions(facts), before=ratios)
+    show(run_dir, table_of(rows, title), lines=run_conditions(facts), before=ratios)
     return rows
 
 

@@ -14,7 +14,7 @@ import torch
 from omegaconf import DictConfig
 from rich.table import Table
 
-from gsparc.commands.output import report, run_directory
+from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import plain
 from gsparc.commands.tradeoff.picture import Other, beaten_by, draw
 from gsparc.commands.tradeoff.sweep import Candidate, sweep
@@ -79,7 +79,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
-    report(run_dir, _table(best, figure, title), lines=_slope(facts))
+    show(run_dir, _table(best, figure, title), lines=_slope(facts))
     for p in best:
         other = beaten_by(p, beside, figure)
         if other is not None:

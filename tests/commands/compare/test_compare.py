@@ -40,8 +40,8 @@ def test_kept_timings_stand_where_models_are_not_here(tmp_path, caplog):
 def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path):
     """Published cells would vanish from the table with every edit of a method."""
     cell = Cell("toy", "random", "gp", None, None)
-    prepared = Prepared(cell, None, tmp_path / "toy-random-gp-today")
     problem = Problem("toy", "random", "spectrum", ("d", "s"))
+    prepared = Prepared(cell, problem, None, tmp_path / "toy-random-gp-today")
     facts = {
         "seed": None, "budget_s": None, "git": "0123456789",
         "dataset/kind": "spectrum", "dataset/sha256": "d", "split/sha256": "s",
@@ -52,10 +52,10 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
         (tmp_path / name / "cell.json").write_text(json.dumps({**facts, **changes}))
 
     write("toy-random-gp-other", **{"dataset/sha256": "e"})
-    assert prepared.found() is None and prepared.found_earlier(problem) is None
+    assert prepared.found() is None and prepared.found_earlier() is None
     write("toy-random-gp-old", made="2026-01-01")
     write("toy-random-gp-newer", made="2026-01-02", git="abcdefghijk")
-    found = prepared.found_earlier(problem)
+    found = prepared.found_earlier()
     assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
     write("toy-random-gp-today")
     assert prepared.found().earlier is None
