@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import time
 from pathlib import Path
@@ -26,8 +25,6 @@ from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
 
-log = logging.getLogger(__name__)
-
 
 def campaign(config: DictConfig) -> Campaign:
     """The campaign that a composed configuration describes.
@@ -37,17 +34,11 @@ def campaign(config: DictConfig) -> Campaign:
     """
     settings = plain(config)
     return Campaign(
-        scene_from_config(settings["scene"]),
-        _effects(settings["effects"]),
-        Sampling(**settings["sampling"]),
-        SpectrumSettings(**settings["spectrum"]),
-        CsiSettings(**settings["csi"]),
-        shard=int(settings["shard"]),
-        check=int(settings["check"]),
-        check_seed=int(settings["check_seed"]),
-        weakest_db=float(settings["weakest_db"]),
-        measurement=str(settings["measurement"]),
-    )
+        scene_from_config(settings["scene"]), _effects(settings["effects"]), Sampling(**settings["sampling"]),
+        SpectrumSettings(**settings["spectrum"]), CsiSettings(**settings["csi"]),
+        shard=int(settings["shard"]), check=int(settings["check"]), check_seed=int(settings["check_seed"]),
+        weakest_db=float(settings["weakest_db"]), measurement=str(settings["measurement"]),
+    )  # fmt: skip
 
 
 def _effects(config: dict[str, Any]) -> Effects | AutoSettings:

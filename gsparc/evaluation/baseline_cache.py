@@ -57,11 +57,8 @@ def baseline(
     # The same data may be in another model's local coordinates and units.
     frame = f"{data.site.origin.tolist()} {data.site.target_scale}"
     key = hashlib.sha256(f"{data.site.sha256} {split.sha256} {frame}".encode()).hexdigest()[:24]
-    folder = (
-        None
-        if cache is None
-        else Path(cache) / f"baselines-v{CACHE_VERSION}" / key / (f"{name}-train" if unseen else name)
-    )
+    folder = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key
+    folder = folder and folder / (f"{name}-train" if unseen else name)
     methods, seconds = [], []
     for number, fold in enumerate(split.folds):
         found = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
@@ -82,7 +79,8 @@ def baseline(
     if scores is None:
         scores = score(methods, data, split, eval_on)
         if folder is not None:
-            _store_scores(folder / f"{eval_on}.npz", scores)
+            with whole_file(folder / f"{eval_on}.npz") as partial, partial.open("wb") as file:
+                np.savez(file, allow_pickle=False, **scores.arrays())
     return Fitted(tuple(methods), scores, tuple(seconds))
 
 
@@ -106,11 +104,6 @@ def _stored_scores(path: Path) -> Scores | None:
     except Exception as error:  # whatever a damaged archive raises: it is only a cache
         log.warning("cached results are unusable and computed again: %s (%s)", path, error)
         return None
-
-
-def _store_scores(path: Path, scores: Scores) -> None:
-    with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez(file, allow_pickle=False, **scores.arrays())
 
 
 def mean_seconds(seconds: Sequence[float]) -> float:

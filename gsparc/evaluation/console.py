@@ -8,13 +8,7 @@ import re
 from importlib import import_module
 from pathlib import Path
 
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    InstantiationException,
-    MissingConfigException,
-    OverrideParseException,
-)
+from hydra import errors
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
@@ -36,26 +30,28 @@ def open_console() -> Console:
 
 def one_line(error: BaseException) -> str:
     """What went wrong and what to do, on one line; a misspelt key or choice gets the nearest right name."""
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file and error.options:
+    if isinstance(error, errors.MissingConfigException) and error.missing_cfg_file and error.options:
         group, _, choice = str(error.missing_cfg_file).partition("/")
         if group == "hydra":  # hydra/sweeper/optuna
             part, _, choice = choice.rpartition("/")
             there = ", ".join(error.options)
             return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
         return f"{group}={choice}: no such choice{suggest(choice, _choices(group) or list(error.options))}"
-    if isinstance(error, OverrideParseException):
+    if isinstance(error, errors.OverrideParseException):
         return f"{error.override}: not understood; write KEY=VALUE, KEY=[a,b], or \"KEY='any text'\""
-    if isinstance(error, ConfigCompositionException) and isinstance(error.__cause__, OmegaConfBaseException):
+    if isinstance(error, errors.ConfigCompositionException) and isinstance(
+        error.__cause__, OmegaConfBaseException
+    ):
         return _override(error, error.__cause__)
     if isinstance(error, MissingMandatoryValue):
         key = str(error.full_key or str(error).rpartition(" ")[2])
         return f"{key} is not set; give {key}=..."
-    if isinstance(error, InstantiationException) and error.__cause__ is not None:
+    if isinstance(error, errors.InstantiationException) and error.__cause__ is not None:
         where = re.search(r"full_key: (\S+)", str(error))
         if isinstance(error.__cause__, SettingError) and where:
             return f"{where[1]}.{error.__cause__}"
         return _argument(str(error)) or one_line(error.__cause__)
-    if isinstance(error, HydraException):
+    if isinstance(error, errors.HydraException):
         return " ".join(str(error).split())
     if isinstance(error, OmegaConfBaseException) and error.full_key:
         return f"{error.full_key}: {_first(error)}"
@@ -92,10 +88,8 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
     if not full or cause.parent_node is None or "not" not in str(cause):
         return f"{_first(error)} {_first(cause)}"
     known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
-    prefix, _, key = full.rpartition(".")
-    hint = suggest(key, known).replace(
-        "did you mean '", f"did you mean '{prefix}." if prefix else "did you mean '"
-    )
+    prefix, dot, key = full.rpartition(".")
+    hint = suggest(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
     return f"{full}: no such setting{hint}"
 
 

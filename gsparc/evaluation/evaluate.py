@@ -14,16 +14,9 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline, mean_seconds
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score
+from gsparc.methods import timing
 from gsparc.methods.method import Method
-from gsparc.methods.timing import (
-    COPY,
-    ClockSettings,
-    cycling,
-    interleaved,
-    machine_facts,
-    peak_memory,
-    reference_copy,
-)
+from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved
 
 REFERENCE = "gp"  # differences are paired with it
 BATCH = 64
@@ -81,24 +74,19 @@ def evaluate(
     facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
     for name, other in others.items():
-        facts |= {f"baseline/{name}/{k}": v for k, v in other.scores.figures().items()}
-        facts[f"baseline/{name}/skill"] = _skill(other.scores, others)
-        facts[f"baseline/{name}/train_s"] = mean_seconds(other.train_s)
+        own = {**other.scores.figures(), "skill": _skill(other.scores, others)}
+        own["train_s"] = mean_seconds(other.train_s)
+        facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:
         facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
-    facts |= {
-        "time/train_s": None if seconds is None else mean_seconds(seconds),
-        "time/train_total_s": None if seconds is None else float(sum(seconds)),
-    }
+    facts["time/train_s"] = None if seconds is None else mean_seconds(seconds)
+    facts["time/train_total_s"] = None if seconds is None else float(sum(seconds))
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
-    facts |= machine_facts()
+    facts |= timing.machine_facts()
     facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock)
-    facts |= {
-        "model/name": methods[0].name,
-        "model/num_gaussians": methods[0].size(),
-        "model/effects": methods[0].effects,
-    }
-    facts |= dataset_facts(data) | split_facts(split) | peak_memory()
+    first = methods[0]
+    facts |= {"model/name": first.name, "model/num_gaussians": first.size(), "model/effects": first.effects}
+    facts |= dataset_facts(data) | split_facts(split) | timing.peak_memory()
     return Evaluation(facts, _columns(scores, others, data))
 
 
@@ -132,7 +120,7 @@ def latencies(
     """
     clock = clock or ClockSettings()
     singles = cycling(methods, _queries(data, rows, 1))
-    one = interleaved({**singles, COPY: reference_copy()}, clock)
+    one = interleaved({**singles, COPY: timing.reference_copy()}, clock)
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
     quick = {name: m for name, m in methods.items() if np.median(one[name]) * BATCH < SLOWEST_BATCH_MS}
     many = interleaved(cycling(quick, _queries(data, rows, BATCH)), fewer)
@@ -148,27 +136,25 @@ def latencies(
     }
     for name in methods:
         room = "time" if name == OWN else f"baseline/{name}"
-        facts[f"{room}/render_ms_p50"] = float(np.median(one[name]))
-        facts[f"{room}/render_ms_p95"] = float(np.quantile(one[name], 0.95))
+        p50, p95 = float(np.median(one[name])), float(np.quantile(one[name], 0.95))
+        facts |= {
+            f"{room}/render_ms_p50": p50,
+            f"{room}/render_ms_p95": p95,
+            f"{room}/ratio_to_copy": p50 / copy_ms,
+        }
         together = float(np.median(many[name])) / BATCH if name in quick else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
-        facts[f"{room}/ratio_to_copy"] = float(np.median(one[name])) / copy_ms
     return facts
 
 
 def dataset_facts(data: Measurements) -> dict[str, Any]:
     """`dataset/*`."""
-    site = data.site
+    names = ("name", "kind", "sha256", "stand_in", "convergence_error")
+    seconds = data.provenance.get("simulate_s")
     return {
-        "dataset/name": site.name,
-        "dataset/kind": site.kind,
-        "dataset/sha256": site.sha256,
-        "dataset/stand_in": site.stand_in,
-        "dataset/convergence_error": site.convergence_error,
+        **{f"dataset/{name}": getattr(data.site, name) for name in names},
         "dataset/rows": len(data),
-        "dataset/simulate_s": float(data.provenance["simulate_s"])
-        if "simulate_s" in data.provenance
-        else None,
+        "dataset/simulate_s": None if seconds is None else float(seconds),
     }
 
 
@@ -206,16 +192,10 @@ def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -
     world = data.moving[scores.row] + data.site.origin
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     columns: dict[str, Any] = {
-        "fold": scores.fold,
-        "row": scores.row,
-        "name": [names[i] for i in scores.row],
-        "x_m": world[:, 0],
-        "y_m": world[:, 1],
-        "z_m": world[:, 2],
-        "confidence": scores.confidence,
-        "variance": scores.variance,
-        **scores.samples,
-    }
+        "fold": scores.fold, "row": scores.row, "name": [names[i] for i in scores.row],
+        "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
+        "confidence": scores.confidence, "variance": scores.variance, **scores.samples,
+    }  # fmt: skip
     for name, other in others.items():
         columns |= {f"baseline/{name}/{k}": v for k, v in paired_values(other.scores.samples).items()}
     return columns

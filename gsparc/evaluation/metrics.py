@@ -54,12 +54,9 @@ class SampleMetric(Metric):
             ValueError: shapes differ, or a prediction is not finite.
         """
         if prediction.shape != target.shape:
-            raise ValueError(
-                f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)} must have one shape"
-            )
-        if not torch.isfinite(
-            torch.view_as_real(prediction) if prediction.is_complex() else prediction
-        ).all():
+            shapes = f"prediction {tuple(prediction.shape)} and target {tuple(target.shape)}"
+            raise ValueError(f"{shapes} must have one shape")
+        if not torch.isfinite(prediction).all():
             raise ValueError("a prediction holds NaN or Inf; it is not scored")
         for name, value in self._score(prediction.detach().cpu(), target.detach().cpu(), mask).items():
             getattr(self, name).append(torch.as_tensor(value, dtype=torch.float64))
@@ -109,10 +106,7 @@ class SpectrumMetrics(SampleMetric):
         return {
             "ssim": _mean(samples["ssim"]),
             "ssim_median": _median(samples["ssim"]),
-            "ssim_gauss": _mean(samples["ssim_gauss"]),
-            "psnr_db": _mean(samples["psnr_db"]),
-            "mse": _mean(samples["mse"]),
-            "mae": _mean(samples["mae"]),
+            **{name: _mean(samples[name]) for name in ("ssim_gauss", "psnr_db", "mse", "mae")},
             "nmse": _ratio(samples["mse"], samples["target_power"]),
             "samples": len(samples["mse"]),
         }

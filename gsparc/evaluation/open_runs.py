@@ -80,15 +80,13 @@ def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | 
 
 def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     """The folds the checkpoints were trained on: all of them in order, or those each file names."""
-    if all("fold" in one.extra for one in stored):
-        numbers = [int(one.extra["fold"]) for one in stored]
-    else:
-        numbers = list(range(len(stored)))
-        if len(stored) != len(split.folds):
-            raise ValueError(
-                f"split={split.name} has {len(split.folds)} folds: "
-                f"give as many checkpoints in their order, ckpt=[fold0.ckpt,fold1.ckpt,...]"
-            )
+    named = all("fold" in one.extra for one in stored)
+    numbers = [int(one.extra["fold"]) if named else index for index, one in enumerate(stored)]
+    if not named and len(stored) != len(split.folds):
+        raise ValueError(
+            f"split={split.name} has {len(split.folds)} folds: "
+            f"give as many checkpoints in their order, ckpt=[fold0.ckpt,fold1.ckpt,...]"
+        )
     if any(number >= len(split.folds) for number in numbers):
         raise ValueError(f"fold {max(numbers)} was trained, split={split.name} has {len(split.folds)} folds")
     return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
@@ -98,9 +96,8 @@ def _warn_if_seen(stored: checkpoint.Stored, data: Measurements, split: Split) -
     """A test set that differs from the one kept apart in training may hold rows the model has learned."""
     before = stored.extra.get("split_sha256")
     if data.site.sha256 != stored.site.sha256:
-        log.warning(
-            "%s was trained on other data than %s (content hashes differ)", stored.path, data.site.name
-        )
+        text = "%s was trained on other data than %s (content hashes differ)"
+        log.warning(text, stored.path, data.site.name)
     elif before not in (None, split.sha256):
         log.warning("%s was trained on another split: its test rows may have been TRAINED on", stored.path)
 
@@ -124,23 +121,17 @@ def aligned(data: Measurements, site: Site) -> Measurements:
     if not shift.any() and own.target_scale == site.target_scale:
         return data
     rescale = own.target_scale / site.target_scale
+    there = replace(
+        own, origin=site.origin, box=own.box + shift, static_position=site.static_position,
+        target_scale=site.target_scale,
+    )  # fmt: skip
     return replace(
-        data,
-        site=replace(
-            own,
-            origin=site.origin,
-            box=own.box + shift,
-            static_position=site.static_position,
-            target_scale=site.target_scale,
-        ),
-        tx=data.tx + shift,
-        rx_position=data.rx_position + shift,
-        target=_times(data.target, rescale),
-        uplink=None if data.uplink is None else _times(data.uplink, rescale),
-        noise_variance=None if data.noise_variance is None else _times(data.noise_variance, rescale**2),
-    )
+        data, site=there, tx=data.tx + shift, rx_position=data.rx_position + shift,
+        target=_times(data.target, rescale), uplink=_times(data.uplink, rescale),
+        noise_variance=_times(data.noise_variance, rescale**2),
+    )  # fmt: skip
 
 
-def _times(values: np.ndarray, factor: float) -> np.ndarray:
-    """Values in another unit, of the same type."""
-    return values if factor == 1 else (values * factor).astype(values.dtype)
+def _times(values: Any, factor: float) -> Any:
+    """An array in another unit, of the same type."""
+    return values if values is None or factor == 1 else (values * factor).astype(values.dtype)

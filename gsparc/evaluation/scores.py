@@ -79,12 +79,12 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     """
     if len(methods) != len(split.folds):
         raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
-    parts = []
-    for number, (method, fold) in enumerate(zip(methods, split.folds, strict=True)):
-        rows = rows_of(fold, eval_on)
+    every = [rows_of(fold, eval_on) for fold in split.folds]
+    confidence: list[np.ndarray] = []
+    variance: list[np.ndarray] = []
+    samples = []
+    for method, rows in zip(methods, every, strict=True):
         metric = metrics_for(data.site.kind, data.site.target_scale)
-        confidence: list[np.ndarray] = []
-        variance: list[np.ndarray] = []
         for start in range(0, len(rows), CHUNK):
             batch = data.batch(rows[start : start + CHUNK])
             prediction = method.answer(batch)
@@ -92,15 +92,11 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
             for values, given in ((confidence, prediction.confidence), (variance, prediction.variance)):
                 none = np.full(len(batch), np.nan)
                 values.append(none if given is None else given.detach().cpu().double().numpy())
-        samples = metric.compute()
-        parts.append(
-            (np.full(len(rows), number), rows, samples, np.concatenate(confidence), np.concatenate(variance))
-        )
-    folds, rows, samples, confidence, variance = zip(*parts, strict=True)
+        samples.append(metric.compute())
     return Scores(
         kind=data.site.kind,
-        fold=np.concatenate(folds),
-        row=np.concatenate(rows),
+        fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),
+        row=np.concatenate(every),
         samples={name: np.concatenate([s[name] for s in samples]) for name in samples[0]},
         confidence=np.concatenate(confidence),
         variance=np.concatenate(variance),

@@ -54,12 +54,8 @@ def resolve(
     coherent = settings.response
     choice = "backprojection" if coherent.carrier else "sphere" if spectra and static else "uniform"
     init = decide("init", settings.field.init, choice, "carrier phase" if coherent.carrier else why)
-    encoding = decide(
-        "encoding.kind",
-        emission.encoding.kind,
-        "fourier" if emission.hidden else "kernel",
-        f"hidden={emission.hidden}",
-    )
+    choice = "fourier" if emission.hidden else "kernel"
+    encoding = decide("encoding.kind", emission.encoding.kind, choice, f"hidden={emission.hidden}")
     possible = (coherent.carrier or (spectra and static)) and not emission.hidden and encoding == "kernel"
     started = possible if warm_start == AUTO else bool(warm_start)
     if warm_start == AUTO:

@@ -38,15 +38,12 @@ class GsparcCheckpointIO(CheckpointIO):
     """
 
     def __init__(self, method: Method, config_yaml: str, marks: Mapping[str, Any]) -> None:
-        self.method = method
-        self.config_yaml = config_yaml
-        self.marks = dict(marks)
+        self.method, self.config_yaml, self.marks = method, config_yaml, dict(marks)
 
     def save_checkpoint(self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         """Write atomically."""
-        checkpoint.save(
-            Path(path), self.method, self.config_yaml, extra={"trainer": trainer_state, **self.marks}
-        )
+        extra = {"trainer": trainer_state, **self.marks}
+        checkpoint.save(Path(path), self.method, self.config_yaml, extra)
 
     def load_checkpoint(
         self, path: Any, map_location: Any = None, weights_only: bool | None = None

@@ -29,7 +29,6 @@ from gsparc.training.time_budget import Budget, Stretched
 SECONDS = "time/learning_s"
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 
-
 # What conf/trainer/cpu.yaml says, for callers from Python.
 DEFAULTS = partial(
     L.Trainer,
@@ -86,17 +85,14 @@ class _Stopped(BaseException):
 class StopBetweenSteps(L.Callback):
     """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
 
-    On several devices it does not wait: the checkpoint before is what is left.
-
-    A second interrupt does not wait, and leaves the checkpoint before.
+    On several devices it does not wait, nor does a second one: the checkpoint before is what is left.
 
     Args:
         file: the checkpoint written when stopped.
     """
 
     def __init__(self, file: Path) -> None:
-        self.file = file
-        self.requested = False
+        self.file, self.requested = file, False
 
     def setup(self, trainer: L.Trainer, module: Any, stage: str) -> None:
         """Every process that trains is as quiet as the first."""
@@ -128,11 +124,7 @@ class StopBetweenSteps(L.Callback):
 
 
 def run_stage(
-    module: GaussianModule,
-    data: Measurements,
-    fold: Fold,
-    context: FitContext,
-    checkpoints: CheckpointIO,
+    module: GaussianModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO
 ) -> float:
     """Train `module` on `fold.train`, watching `fold.val`; returns the seconds spent learning [s].
 
@@ -173,7 +165,12 @@ def run_stage(
         enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
         **options,
     )
-    _refuse_whole_programs(trainer)
+    # Processes of several devices must end with training: tests and files are the work of one.
+    if trainer.world_size > 1 and not isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
+        raise ValueError(
+            "trainer.strategy: on several devices this would run the whole program once per device; "
+            "say trainer=ddp, or a strategy ddp_spawn* or ddp_fork*"
+        )
     try:
         with stop.listening():
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
@@ -186,15 +183,6 @@ def run_stage(
     finally:
         batches.trainer = None  # which holds the optimizer's state
     return float(trainer.callback_metrics[SECONDS])
-
-
-def _refuse_whole_programs(trainer: L.Trainer) -> None:
-    """Several devices train in processes that end with training: tests and files are the work of one."""
-    if trainer.world_size > 1 and not isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
-        raise ValueError(
-            "trainer.strategy: on several devices this would run the whole program once per device; "
-            "say trainer=ddp, or a strategy ddp_spawn* or ddp_fork*"
-        )
 
 
 def _last_line(error: ProcessException) -> str:

@@ -64,21 +64,12 @@ class GaussianModule(L.LightningModule):
     """
 
     def __init__(
-        self,
-        model: GaussianModel,
-        loss: LossSettings,
-        optimizer: OptimizerSettings,
-        total_steps: int,
-        run_dir: Path,
-        pace: Pace | None = None,
-    ) -> None:
+        self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings, total_steps: int,
+        run_dir: Path, pace: Pace | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
-        self.model = model
-        self.loss = loss
-        self.rates = optimizer
-        self.total_steps = total_steps
-        self.run_dir = run_dir
-        self.pace = pace
+        self.model, self.loss, self.rates = model, loss, optimizer
+        self.total_steps, self.run_dir, self.pace = total_steps, run_dir, pace
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
         self.log_every = 1  # steps; a figure costs as much as a kernel to log
@@ -124,16 +115,15 @@ class GaussianModule(L.LightningModule):
         mean = self._render(batch).mean
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
-        size = len(batch)
+        size, figures = len(batch), {}
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
-        if self.model.site.kind == "spectrum":
-            if holds_window(mean):
-                self.log("val/ssim_gauss", ssim(mean, batch.target).mean(), batch_size=size, prog_bar=True)
-            self.log(
-                "val/psnr_db", (-10 * error.clamp_min(1e-12).log10()).mean(), batch_size=size, prog_bar=True
-            )
+        if self.model.site.kind != "spectrum":
+            figures["val/mse"] = error.mean()
         else:
-            self.log("val/mse", error.mean(), batch_size=size, prog_bar=True)
+            if holds_window(mean):
+                figures["val/ssim_gauss"] = ssim(mean, batch.target).mean()
+            figures["val/psnr_db"] = (-10 * error.clamp_min(1e-12).log10()).mean()
+        self.log_dict(figures, batch_size=size, prog_bar=True)
         # Dashboards get the seconds beside every figure too.
         self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
 

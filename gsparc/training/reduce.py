@@ -74,12 +74,10 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     raster = model.settings.raster
     factor = float(settings.get("cutoff", 1))
     raster = replace(
-        raster,
-        projection=settings.get("projection", raster.projection),
+        raster, projection=settings.get("projection", raster.projection),
         low_pass=raster.low_pass / stride**2,  # as wide as before on the sky
-        alpha_cutoff=raster.alpha_cutoff * factor,
-        relative_cutoff=raster.relative_cutoff * factor,
-    )
+        alpha_cutoff=raster.alpha_cutoff * factor, relative_cutoff=raster.relative_cutoff * factor,
+    )  # fmt: skip
     model.settings = replace(model.settings, raster=raster)
     if "keep" in settings:
         share, total = float(settings["keep"]), len(model.gaussians)
@@ -161,18 +159,14 @@ def teach(few: GaussianModel, whole: GaussianModel, receiver: Tensor) -> None:
     entries = grid.height * grid.width * len(whole.gaussians)
     fitting = [s for s in (1, 2, 3, 4, 5) if grid.width % s == 0 and entries <= MOST_WEIGHTS * s**2]
     grid = coarser(grid, fitting[0]) if fitting else grid
-    wanted = _weights_of(whole, rx, grid) @ _readout(whole)
+    wanted = _weights_of(whole, rx, grid)
+    wanted = wanted @ torch.cat([whole.emission.weight2.squeeze(-1), whole.emission.bias2], 1)
     own = _weights_of(few, rx, grid)
     gram = own.mT @ own
     gram.diagonal().add_(RIDGE * gram.diagonal().mean() + 1e-12)
     found = torch.linalg.solve(gram, own.mT @ wanted)
     few.emission.weight2.copy_(found[:, :-1, None])
     few.emission.bias2.copy_(found[:, -1:])
-
-
-def _readout(model: GaussianModel) -> Tensor:
-    """(N, width + 1)."""
-    return torch.cat([model.emission.weight2.squeeze(-1), model.emission.bias2], 1)
 
 
 def _weights_of(model: GaussianModel, rx: Pose, grid: SphereGrid) -> Tensor:

@@ -77,15 +77,10 @@ class LearnedField(Method):
         guesses: Sequence[str] = (),
     ) -> None:
         check_arguments(locals(), warm_start=switch("auto"), refit=switch())
-        self.settings = ModelSettings(
-            field, emission, attenuation, raster, response or ResponseSettings(), confidence
-        )
-        self.loss = loss
-        self.rates = optimizer
-        self.name = name
-        self.warm_start = warm_start
-        self.refit = refit
-        self.guesses = tuple(guesses)
+        response = response or ResponseSettings()
+        self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
+        self.loss, self.rates, self.name = loss, optimizer, name
+        self.warm_start, self.refit, self.guesses = warm_start, refit, tuple(guesses)
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
@@ -110,41 +105,33 @@ class LearnedField(Method):
         for reason in reasons:
             log.info("%s", reason)
         resumed = None if context.resume is None else interrupted(context.resume)
-        stage = "train" if resumed is None else str(resumed.extra.get("stage", "train"))
-        seconds, confidence, self._billed_s = 0.0, None, 0.0
-        if resumed is not None:
-            seconds = float(resumed.extra.get("earlier_s", 0.0))
+        marks = {} if resumed is None else resumed.extra
+        stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
+        self._billed_s = 0.0
         if stage == "train":
             seconds += self._stage("train", data, fold, context, seconds)
             self._calibrate(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
         if self.refit and len(fold.val):
-            confidence = self.fitted().confidence
             every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
-            seconds += self._stage("refit", data, every, again, seconds, confidence)
+            seconds += self._stage("refit", data, every, again, seconds, self.fitted().confidence)
         self._frozen = None
         return FitReport(seconds)
 
     def _stage(
-        self,
-        stage: str,
-        data: Measurements,
-        fold: Fold,
-        context: FitContext,
-        earlier_s: float,
+        self, stage: str, data: Measurements, fold: Fold, context: FitContext, earlier_s: float,
         confidence: Confidence | None = None,
-    ) -> float:
+    ) -> float:  # fmt: skip
         """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
         folder, resume = context.run_dir, context.resume
         L.seed_everything(context.seed, verbose=False)
-        started = time.perf_counter()
+        started, spent = time.perf_counter(), 0.0
         assert self.choices is not None
         if context.init_from is not None and resume is None and stage == "train":
             self._start_from(data.site, context.init_from)
-            spent = 0.0
         elif resume is None:
             start = prepare(
                 InitTask(
@@ -161,7 +148,6 @@ class LearnedField(Method):
             self._billed_s = start.billed_s
         else:
             self.restore(data.site, checkpoint.read(resume).state)
-            spent = 0.0
         if confidence is not None:
             self.fitted().confidence = confidence.requires_grad_(False)
         prepared = time.perf_counter() - started + spent
@@ -232,10 +218,8 @@ class LearnedField(Method):
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         model = self.fitted()
         if len(tx) > QUERY_CHUNK:
-            parts = [
-                self.predict(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
-                for i in range(0, len(tx), QUERY_CHUNK)
-            ]
+            chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
+            parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
             confidence = None if parts[0].confidence is None else torch.cat([p.confidence for p in parts])  # type: ignore[misc]
             return Prediction(torch.cat([p.mean for p in parts]), confidence)
         frozen = self._frozen_view(rx)

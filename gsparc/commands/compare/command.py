@@ -122,7 +122,11 @@ def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | 
                 except (ValueError, RuntimeError) as error:
                     log.warning("%s cannot be filled: %s", one.cell, one_line(error))
                     continue
-                score = f"{table.score_db(one.problem.kind, found.facts):.2f} dB" if found.scored() else "-"
+                score = (
+                    f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB"
+                    if found.scored()
+                    else "-"
+                )
                 log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
         found = found or one.found_earlier()
         filled += [found] if found else []

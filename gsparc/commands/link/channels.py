@@ -46,9 +46,8 @@ class Channels:
     def of(self, index: np.ndarray) -> Channels:
         """Some of the positions."""
         at = torch.from_numpy(index)
-        return Channels(
-            *(x[at] for x in (self.true, self.predicted, self.variance, self.confidence)), self.source
-        )
+        rest = self.variance[at], self.confidence[at], self.source
+        return Channels(self.true[at], self.predicted[at], *rest)
 
 
 def channels(

@@ -74,10 +74,7 @@ class Pusch:
             "ls": nr.PUSCHLSChannelEstimator(self.grid, *shape, interpolation_type="lin"),
             "lmmse": _Wiener(self.grid, correlation),
             "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
-            **{
-                name: lambda y, no, name=name: self._known[name]  # was told the channel beforehand
-                for name in ("perfect", "predicted", "predicted_variance")
-            },
+            **{name: self._told(name) for name in ("perfect", "predicted", "predicted_variance")},
         }
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
@@ -90,6 +87,10 @@ class Pusch:
     def pilot_share(self) -> float:
         """Share of a slot's resource elements that pilots occupy."""
         return float(self.grid.num_pilot_symbols) / float(self.grid.num_resource_elements)
+
+    def _told(self, name: str) -> Estimator:
+        """An estimator that was told the channel beforehand."""
+        return lambda y, no: self._known[name]
 
     def run(
         self,
@@ -106,7 +107,8 @@ class Pusch:
 
         no = ebnodb2no(ebno_db, self.bits, self.rate, self.grid)
         apply = ApplyOFDMChannel(add_awgn=True)
-        failed, wrong = ({name: [] for name in self.receivers} for _ in range(2))
+        failed: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
+        wrong: dict[str, list[np.ndarray]] = {name: [] for name in self.receivers}
         for start in range(0, len(position), batch):
             at = torch.from_numpy(position[start : start + batch])
             scale = true[at].abs().square().mean(1).sqrt()[:, None]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -61,7 +62,12 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
         value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
         if value is not None and ms is not None:
             axes.scatter([ms], [value], marker="s", s=16, c="0.5")
-            how = {"xytext": (4, -3), "textcoords": "offset points", "fontsize": 7, "color": "0.4"}
+            how: dict[str, Any] = {
+                "xytext": (4, -3),
+                "textcoords": "offset points",
+                "fontsize": 7,
+                "color": "0.4",
+            }
             axes.annotate(base, (ms, value), **how)
             points.append((float(ms), float(value)))
     for columns in fronts:
