@@ -11,24 +11,19 @@ of this size needed, plus headroom; if it needs more, its images and gradients a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextlib import nullcontext
 from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, cuda_library, validation
+from gsparc.ops import _native, calls, validation
 from gsparc.ops.geometry import Gaussians
-from gsparc.ops.networks import Layers
-from gsparc.ops.operators import Buffers, Poses, check_memory, contiguous, empty_like, plan_tensors
+from gsparc.ops.operators import Buffers, Poses, check_memory, contiguous, kernel
 from gsparc.ops.settings import KernelSettings
 
 BYTES_PER_ENTRY = 36  # entries and what sorting them takes
 MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
-
-libraries: dict[str, cuda_library.Library] = {}
-"""By device type; tests put the host shim under "cpu"."""
 
 _capacities: dict[tuple, int] = {}
 
@@ -47,30 +42,11 @@ def _capturing(tensor: Tensor) -> bool:
     return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
 
 
-def call_for(like: Tensor, tensors: Sequence[Tensor | None], **numbers: Any) -> cuda_library.Call:
-    """A call in the precision and on the device of `like`; `numbers` are fields of `Call`."""
-    call = cuda_library.Call(twice=like.dtype == torch.float64, device=like.device.index or 0, **numbers)
-    call.tensors[: len(tensors)] = [0 if t is None else t.data_ptr() for t in tensors]
-    return call
-
-
-def run(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> None:
-    """Call a kernel with addresses of tensors and scratch memory, on the stream of `like`'s device."""
-    library, device = libraries[like.device.type], like.device
-    call = call_for(like, tensors, **numbers)
-    with torch.cuda.device(device) if like.is_cuda else nullcontext():
-        needed = library.run(name, call)
-        scratch = torch.empty(needed, dtype=torch.uint8, device=device)
-        call.scratch = scratch.data_ptr()
-        call.stream = torch.cuda.current_stream(device).cuda_stream if like.is_cuda else 0
-        library.run(name, call)
-
-
 @cache
 def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) -> Tensor:
     """Sines and cosines of the grid's rows and columns, kept for good: captured graphs hold their address."""
-    library = libraries[device.type]
-    call = call_for(torch.empty(0, dtype=dtype), (), settings=settings)
+    library = calls.libraries[device.type]
+    call = calls.call_for(torch.empty(0, dtype=dtype), settings=settings)
     numbers = torch.empty(library.run("tables", call), dtype=dtype)
     call.tensors[0] = numbers.data_ptr()
     library.run("tables", call)
@@ -84,39 +60,38 @@ def capacity_of(buffers: Buffers, poses: int, settings: KernelSettings) -> int:
 
 def run_on_plan(
     name: str,
+    *tensors: Tensor | None,
     buffers: Buffers,
     gaussians: Gaussians,
     poses: Poses,
     settings: KernelSettings,
-    *tensors: Tensor | None,
-    **numbers: Any,
+    sizes: Sequence[int] = (),
 ) -> None:
     """Call a kernel that reads a plan (`read_view`), Gaussians and poses, then `tensors`."""
     means, count = gaussians.means, len(poses.positions)
-    entries = buffers.entries if buffers.entries.numel() else None
+    entries, capacity = None, 0
+    if buffers.entries.numel():
+        entries, capacity = buffers.entries, capacity_of(buffers, count, settings)
     view = (_tables(means.device, means.dtype, settings), *buffers[:5], buffers.starts[-1:], entries)
-    numbers = {"capacity": capacity_of(buffers, count, settings), **numbers}
-    sizes = {"poses": count, "count": len(means), "settings": settings}
-    run(name, means, *view, *contiguous((*gaussians, *poses)), *tensors, **sizes, **numbers)
+    inputs = contiguous((*gaussians, *poses, *tensors))
+    calls.run(name, means, *view, *inputs, sizes=(count, len(means), capacity, *sizes), settings=settings)
 
 
-def plan(
-    gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings
-) -> tuple[Buffers, Tensor, Tensor, Tensor]:
-    """`gsparc::plan`."""
+@kernel("plan", "cuda")
+def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings) -> Any:
     means, count, n = gaussians.means, len(poses.positions), len(gaussians.means)
     if count * n >= MOST_PAIRS:
         raise MemoryError(
             f"{count} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
         )
-    buffers, means2d, radii, visible = plan_tensors(means, count, settings.height, 0)
+    buffers, means2d, radii, visible = out
     starts = count * tiles(settings) + 1
     if n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
         return Buffers(*zeros, buffers.entries.new_zeros(starts)), means2d, radii, visible
     verdict = means.new_empty(2, dtype=torch.int64)
-    outputs = (*contiguous([ids]), means2d, radii, visible, verdict)
-    run_on_plan("plan", buffers, gaussians, poses, settings, *outputs, capacity=0)
+    view = {"gaussians": gaussians, "poses": poses, "settings": settings}
+    run_on_plan("plan", ids, means2d, radii, visible, verdict, buffers=buffers, **view)
     key = (count, n, settings)
     if _capturing(means):
         if key not in _capacities:
@@ -128,7 +103,7 @@ def plan(
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
     buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))
-    run_on_plan("bin", buffers, gaussians, poses, settings)
+    run_on_plan("bin", buffers=buffers, **view)
     return buffers, means2d, radii, visible
 
 
@@ -140,119 +115,48 @@ def _by_gaussian(features: Tensor, poses: Poses) -> Tensor:
     return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
 
 
-def composite(
-    means2d: Tensor,
-    gaussians: Gaussians,
-    features: Tensor,
-    poses: Poses,
-    buffers: Buffers,
-    settings: KernelSettings,
-) -> tuple[Tensor, Tensor]:
-    """`gsparc::composite`."""
-    samples, _, channels = features.shape
-    image = features.new_empty(samples, channels, settings.height, settings.width)
-    transmittance = features.new_empty(len(poses.positions), settings.height, settings.width)
-    rows = _by_gaussian(features, poses)
-    tensors = (rows, image, transmittance)
-    run_on_plan("composite", buffers, gaussians, poses, settings, *tensors, channels=rows.shape[2])
-    return image, transmittance
+@kernel("composite", "cuda")
+def _composite(out: Any, means2d: Tensor, features: Tensor, **view: Any) -> None:
+    rows = _by_gaussian(features, view["poses"])
+    run_on_plan("composite", rows, *out, sizes=rows.shape[2:], **view)
 
 
-def composite_backward(
+@kernel("composite_backward", "cuda")
+def _composite_backward(
+    out: Any,
     grad_image: Tensor,
     grad_transmittance: Tensor | None,
     image: Tensor,
     transmittance: Tensor,
-    gaussians: Gaussians,
     features: Tensor,
-    poses: Poses,
-    buffers: Buffers,
-    settings: KernelSettings,
-) -> tuple[Gaussians, Tensor, Tensor]:
-    """`gsparc::composite_backward`."""
-    count, (samples, n, channels) = len(poses.positions), features.shape
-    rows = _by_gaussian(features, poses)
-    width, entries = rows.shape[2], capacity_of(buffers, count, settings)
-    check_memory(entries, features.element_size() * (_native.MOMENTS + width))
-    grads, grad_rows = empty_like(gaussians), torch.empty_like(rows)
-    grad_means2d = features.new_empty(count, n, 2)
-    images = contiguous((image, transmittance, grad_image, grad_transmittance))
-    tensors = (rows, *images, *grads, grad_rows, grad_means2d)
+    **view: Any,
+) -> Any:
+    count, (samples, n, channels) = len(view["poses"].positions), features.shape
+    rows = _by_gaussian(features, view["poses"])
+    entries = capacity_of(view["buffers"], count, view["settings"])
+    check_memory(entries, features.element_size() * (_native.MOMENTS + rows.shape[2]))
+    grads, _, grad_means2d = out
+    grad_rows = torch.empty_like(rows)
+    images = (image, transmittance, grad_image, grad_transmittance)
     if n > 0:
-        run_on_plan(
-            "composite_backward", buffers, gaussians, poses, settings, *tensors, channels=rows.shape[2]
-        )
+        tensors = (rows, *images, *grads, grad_rows, grad_means2d)
+        run_on_plan("composite_backward", *tensors, sizes=rows.shape[2:], **view)
     if count == 1:
         grad_rows = grad_rows.reshape(n, samples, channels).permute(1, 0, 2).contiguous()
     return grads, grad_rows, grad_means2d
 
 
-def weights(
-    gaussians: Gaussians, poses: Poses, buffers: Buffers, settings: KernelSettings
-) -> tuple[Tensor, Tensor]:
-    """`gsparc::weights`."""
-    sums = gaussians.means.new_empty(len(poses.positions), len(gaussians.means), 2)
+@kernel("weights", "cuda")
+def _weights(out: Any, **view: Any) -> Any:
+    sums = out[0].new_empty(*out[0].shape, 2)
     if sums.numel():
-        run_on_plan("weights", buffers, gaussians, poses, settings, sums, None, None)
+        run_on_plan("weights", sums, None, None, **view)
     return sums[..., 0].clone(), sums[..., 1].clone()
 
 
-def weights_backward(
-    grad_seen: Tensor,
-    grad_total: Tensor,
-    gaussians: Gaussians,
-    poses: Poses,
-    buffers: Buffers,
-    settings: KernelSettings,
-) -> Gaussians:
-    """`gsparc::weights_backward`."""
-    entries = capacity_of(buffers, len(poses.positions), settings)
-    check_memory(entries, gaussians.means.element_size() * (_native.MOMENTS + 1))
-    grads = empty_like(gaussians)
-    tensors = (*contiguous((grad_seen, grad_total)), *grads)
-    if len(gaussians.means) > 0:
-        run_on_plan("weights_backward", buffers, gaussians, poses, settings, *tensors, channels=1)
-    return grads
-
-
-def _sizes(encoded: Tensor, layers: Layers) -> dict[str, int]:
-    count, inputs, hidden = layers.weight1.shape
-    sizes = {"samples": len(encoded), "count": count, "channels": layers.weight2.shape[2]}
-    return {**sizes, "inputs": inputs, "hidden": hidden}
-
-
-def networks(encoded: Tensor, layers: Layers) -> Tensor:
-    """`gsparc::networks`."""
-    out = encoded.new_empty(len(encoded), len(layers.weight1), layers.weight2.shape[2])
-    if out.numel():
-        run("networks", encoded, *contiguous((encoded, *layers)), out, **_sizes(encoded, layers))
-    return out
-
-
-def networks_backward(slope: Tensor, encoded: Tensor, layers: Layers) -> Layers:
-    """`gsparc::networks_backward`."""
-    grads = Layers(*(layer.new_zeros(layer.shape) for layer in layers))
-    tensors = (*contiguous((encoded, *layers, slope)), *grads)
-    if slope.numel():
-        run("networks_backward", encoded, *tensors, **_sizes(encoded, layers))
-    return grads
-
-
-def similarity(
-    prediction: Tensor, target: Tensor, taps: Sequence[float], stability: Sequence[float], slope: bool
-) -> tuple[Tensor, Tensor | None]:
-    """`gsparc::similarity` (ValueError: a window that is not symmetric, or wider than the kernels take)."""
-    half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
-    radius = len(half) - 1
-    if radius > _native.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
-        most = 2 * _native.MOST_RADIUS + 1
-        raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
-    rows, columns = height - 2 * radius, width - 2 * radius
-    blocks = -(-rows // _native.SIMILARITY_HEIGHT) * -(-columns // _native.SIMILARITY_WIDTH)
-    sums = prediction.new_empty(samples, blocks)
-    slopes = torch.empty_like(prediction, memory_format=torch.contiguous_format) if slope else None
-    inputs = [prediction.contiguous(), target.contiguous(), target.mean(dim=(-2, -1))]
-    sizes = {"samples": samples, "height": height, "width": width, "radius": radius}
-    if samples:
-        run("similarity", prediction, *inputs, sums, slopes, window=(*stability, *half), **sizes)
-    return sums.sum(1) / (rows * columns), slopes
+@kernel("weights_backward", "cuda")
+def _weights_backward(out: Any, grad_seen: Tensor, grad_total: Tensor, **view: Any) -> None:
+    entries = capacity_of(view["buffers"], len(view["poses"].positions), view["settings"])
+    check_memory(entries, out.means.element_size() * (_native.MOMENTS + 1))
+    if len(out.means) > 0:
+        run_on_plan("weights_backward", grad_seen, grad_total, *out, sizes=(1,), **view)

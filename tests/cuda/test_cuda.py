@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 
 import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
-from gsparc.ops import Optics, SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
+from gsparc.ops import (
+    Optics,
+    SphereGrid,
+    calls,
+    cuda_kernels,
+    freeze,
+    make_plan,
+    networks,
+    operators,
+    rasterize,
+    similarity,
+)
 from gsparc.ops.settings import kernel_settings
 from gsparc.training.losses import _Kernel, _written_out
 
@@ -37,9 +47,7 @@ def test_order_of_the_threads_does_not_matter(where):
     """A missing barrier shows when a block's threads run in the opposite order; on a GPU, run it twice."""
     scene = crowd(200).to(torch.float32)
     first = render(scene, poses(3), GRIDS["hemisphere"])
-    turned = (
-        cuda_kernels.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
-    )
+    turned = calls.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
     turned(1)
     second = render(scene, poses(3), GRIDS["hemisphere"])
     turned(0)
@@ -121,7 +129,7 @@ def test_similarity_of_flat_images_stays_finite(where):
 def test_windows_that_the_kernel_does_not_take_are_refused(where, taps):
     images = torch.rand(1, 20, 20)
     with pytest.raises(ValueError, match="symmetric and has at most 11 taps"):
-        cuda_kernels.similarity(images, images, taps, (1e-4, 9e-4), True)
+        similarity.similarity_op(images, images, taps, [1e-4, 9e-4], True)
 
 
 def test_more_positions_than_a_grid_has_rows(where):
@@ -201,10 +209,3 @@ def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
         image.sum().backward()
     with pytest.raises(MemoryError, match="footprint entries need"):
         make_plan(*model, origin(), GRIDS["patch"])
-
-
-def test_call_has_the_layout_of_the_kernels(where):
-    assert (
-        ctypes.sizeof(cuda_kernels.cuda_library.Call)
-        == 14 * 4 + (2 * 4 + 4 + 4 + 10 * 8) + 8 * 8 + 32 * 8 + 2 * 8
-    )
