@@ -54,7 +54,7 @@ def call_for(
     settings: KernelSettings | None = None,
 ) -> Call:
     """A call in the precision and on the device of `like`; the caller keeps the tensors alive."""
-    call = Call(like.dtype == torch.float64, torch.get_num_threads(), like.device.index or 0)
+    call = Call(like.dtype == torch.float64, torch.get_num_threads(), max(like.get_device(), 0))
     call.sizes[: len(sizes)] = sizes
     call.numbers[: len(numbers)] = numbers
     addresses = [0 if t is None else t.data_ptr() for t in tensors]
@@ -70,10 +70,10 @@ def run(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int
     Sizes, numbers and tensors are in the order in which the kernel reads them; tensors are contiguous. On
     a GPU the kernel has scratch memory and runs on torch's current stream.
     """
-    call, device = call_for(like, *tensors, **numbers), like.device
-    if device.type == "cpu" and "cpu" not in libraries:
+    call = call_for(like, *tensors, **numbers)
+    if not like.is_cuda and "cpu" not in libraries:
         return getattr(built.kernels(), name)(ctypes.addressof(call))
-    library = libraries[device.type]
+    device, library = like.device, libraries[like.device.type]
     with torch.cuda.device(device) if like.is_cuda else nullcontext():
         scratch = torch.empty(library.run(name, call), dtype=torch.uint8, device=device)
         call.scratch = scratch.data_ptr()

@@ -36,7 +36,7 @@ class Poses(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """A plan as the CPU kernels lay it out (cuda_kernels.py says what differs there).
+    """A plan as the CPU kernels lay it out (cuda.py says what differs there).
 
     Attributes:
         records: (P, N, RECORD) footprints, by depth.
@@ -302,6 +302,12 @@ def view_of(plan: Plan) -> tuple[Any, ...]:
     """The last arguments of an operator on a plan."""
     settings = kernel_settings(plan.grid, plan.optics)
     return plan.pose.position, plan.pose.rotation, *plan.buffers, packed(settings)
+
+
+def kernel_view(plan: Plan, gaussians: Gaussians) -> dict[str, Any]:
+    """A plan as kernels receive it (`kernel`): buffers, gaussians, poses and settings."""
+    poses, settings = Poses(plan.pose.position, plan.pose.rotation), kernel_settings(plan.grid, plan.optics)
+    return {"buffers": Buffers(*plan.buffers), "gaussians": gaussians, "poses": poses, "settings": settings}
 
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:

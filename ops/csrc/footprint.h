@@ -10,7 +10,7 @@
 #include <math.h>
 
 #ifndef GSPARC_HD
-#define GSPARC_HD inline
+#define GSPARC_HD inline __attribute__((always_inline))
 #endif
 #ifndef GSPARC_ISA
 #define GSPARC_ISA baseline

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsparc.ops import backends, calls, cuda, cuda_kernels, cuda_library, operators
+from gsparc.ops import backends, calls, cuda, cuda_library, operators
 
 HERE = Path(__file__).parent
 KEPT = HERE.parents[1] / "build" / "shim"
@@ -70,6 +70,6 @@ def serving(where: str) -> Iterator[cuda_library.Library]:
         patch.setattr(backends, "_cuda", lambda: cuda)
         if where == "gpu":
             patch.setattr(calls, "run", on_gpu(calls.run))
-        cuda_kernels._tables.cache_clear()
+        cuda._tables.cache_clear()
         yield kernels
-    cuda_kernels._tables.cache_clear()
+    cuda._tables.cache_clear()

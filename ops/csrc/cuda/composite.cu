@@ -368,26 +368,7 @@ template <class S> int64_t weigh(const Call& call) {
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" {
-
-int64_t gsparc_composite(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return composite<decltype(zero)>(*call); });
-}
-
-int64_t gsparc_composite_backward(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return backward<decltype(zero)>(*call, false); });
-}
-
-int64_t gsparc_weights(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return weigh<decltype(zero)>(*call); });
-}
-
-int64_t gsparc_weights_backward(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return backward<decltype(zero)>(*call, true); });
-}
-
-}  // extern "C"
+GSPARC_ENTRY(composite, composite<S>(call))
+GSPARC_ENTRY(composite_backward, backward<S>(call, false))
+GSPARC_ENTRY(weights, weigh<S>(call))
+GSPARC_ENTRY(weights_backward, backward<S>(call, true))

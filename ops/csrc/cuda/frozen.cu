@@ -112,7 +112,4 @@ template <class S> int64_t thaw(const Call& call) {
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" int64_t gsparc_thaw(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return thaw<decltype(zero)>(*call); });
-}
+GSPARC_ENTRY(thaw, thaw<S>(call))

@@ -290,32 +290,25 @@ template <class S> int64_t bin(const Call& call) {
     return steps.result();
 }
 
+// Fills the grid's tables (host memory); with none, returns how many numbers they hold.
+template <class S> int64_t tables(const Call& call) {
+    const auto settings = in_precision<S>(call.settings);
+    S* const numbers = Reader(call).next<S>();
+    if (!numbers) return table_size(settings);
+    fill_tables(settings, numbers);
+    return 0;
+}
+
 }  // namespace
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" {
-
 // Each call first with scratch 0: returns the bytes of scratch it needs. Then 0, or minus a CUDA error.
-int64_t gsparc_plan(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return plan<decltype(zero)>(*call); });
-}
+GSPARC_ENTRY(plan, plan<S>(call))
+GSPARC_ENTRY(bin, bin<S>(call))
+GSPARC_ENTRY(tables, tables<S>(call))
 
-int64_t gsparc_bin(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return bin<decltype(zero)>(*call); });
-}
-
-// Fills the grid's tables (host memory); with none, returns how many numbers they hold.
-int64_t gsparc_tables(const gsparc::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) -> int64_t {
-        using S = decltype(zero);
-        if (call->tensors[0]) fill_tables(gsparc::in_precision<S>(call->settings), reinterpret_cast<S*>(uintptr_t(call->tensors[0])));
-        return call->tensors[0] ? 0 : table_size(gsparc::in_precision<S>(call->settings));
-    });
-}
+extern "C" {
 
 // Whether the driver can run these kernels on the call's device; `built_for` and `driver` receive the CUDA versions of
 // the build and of the driver.

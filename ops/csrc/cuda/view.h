@@ -79,3 +79,14 @@ template <class F> int64_t with_scalar(const Call& call, F run) {
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
+
+// `gsparc_NAME`, called by Python: `result` of a `call` of scalars S.
+#define GSPARC_ENTRY(name, result)                               \
+    extern "C" int64_t gsparc_##name(const gsparc::Call* at) {   \
+        using namespace gsparc::GSPARC_ISA;                      \
+        const gsparc::Call& call = *at;                          \
+        return with_scalar(call, [&](auto zero) -> int64_t {     \
+            using S = decltype(zero);                            \
+            return result;                                       \
+        });                                                      \
+    }
