@@ -46,7 +46,7 @@ def channels(
         )
     tones = [first_hz, step_hz]
     single = gains.dtype in (torch.float32, torch.float64)
-    if single and built.kernels() is not None and "channels" in KERNELS[gains.device.type]:
+    if single and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
         return channels_op(gains, steering, delays, tones, subcarriers)
     return summed(gains, steering, delays, tones, subcarriers)
 

@@ -39,8 +39,8 @@ template <class F> inline void with_switches(int projection, bool hides, int cha
     with_projection(projection, [&](auto p) { hides ? most(p, Constant<bool, true>()) : most(p, Constant<bool, false>()); });
 }
 
-// Calls run(P, kHides, kChannels, lines, stage, task, batch, memory) for every strip of a plan, in parallel. The memory
-// has `vectors` for each tile and as many more, of nothing in particular.
+// Calls run(P, kHides, kChannels, lines, stage, task, batch, memory) for every strip of a plan, in parallel. The memory is
+// uninitialised: so many `vectors` for each tile, and for one tile more.
 template <class S, class F>
 void each_strip(const ViewArgs<S>& a, const S* features, int samples, int channels, int vectors, F run) {
     with_switches(a.settings.projection, a.model.extinctions, Lines<S>::per_pose(a.plan, samples, channels), [&](auto projection, auto hides, auto constant) {
