@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
-from torch.library import custom_op
 
-from gsparc.ops import built
+from gsparc.ops import built, calls
+from gsparc.ops.operators import KERNELS, contiguous, kernel, operator
 
 
 def channels(
@@ -45,7 +46,7 @@ def channels(
         )
     tones = [first_hz, step_hz]
     single = gains.dtype in (torch.float32, torch.float64)
-    if gains.device.type == "cpu" and single and built.kernels() is not None:
+    if single and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
         return channels_op(gains, steering, delays, tones, subcarriers)
     return summed(gains, steering, delays, tones, subcarriers)
 
@@ -64,44 +65,38 @@ def summed(
     return torch.view_as_real(torch.einsum("bn,na,nk->bak", *weights, factor).contiguous())
 
 
-@custom_op("gsparc::channels", mutates_args=(), device_types="cpu")
+@operator
 def channels_op(
     gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float], subcarriers: int
 ) -> Tensor:
     """`channels` by the CPU kernel."""
-    out = gains.new_empty(gains.shape[0], steering.shape[1], subcarriers, 2)
-    _run("channels", tones, subcarriers, gains.contiguous(), steering.contiguous(), delays.contiguous(), out)
-    return out
-
-
-@channels_op.register_fake
-def _(gains, steering, delays, tones, subcarriers):
     return gains.new_empty(gains.shape[0], steering.shape[1], subcarriers, 2)
 
 
-@custom_op("gsparc::channels_backward", mutates_args=(), device_types="cpu")
+@operator
 def channels_backward_op(
     slope: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Sequence[float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Gradients of gains, steering and delays for the gradient `slope` (B, A, K, 2) of the channels."""
-    inputs = [tensor.contiguous() for tensor in (gains, steering, delays)]
-    grads = [torch.empty_like(tensor) for tensor in inputs]
-    _run("channels_backward", tones, slope.shape[2], *inputs, None, slope.contiguous(), *grads)
-    return grads[0], grads[1], grads[2]
+    return gains.new_empty(gains.shape), steering.new_empty(steering.shape), delays.new_empty(delays.shape)
 
 
-@channels_backward_op.register_fake
-def _(slope, gains, steering, delays, tones):
-    return tuple(tensor.new_empty(tensor.shape) for tensor in (gains, steering, delays))
-
-
-def _run(name: str, tones: Sequence[float], subcarriers: int, gains: Tensor, *rest: Tensor | None) -> None:
-    steering = rest[0]
-    assert steering is not None
+@kernel("channels", "cpu")
+def _channels(
+    out: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Any, subcarriers: int
+) -> None:
     sizes = (*gains.shape[:2], steering.shape[1], subcarriers)
-    tensors = [0 if tensor is None else tensor.data_ptr() for tensor in (gains, *rest)]
-    kernel = getattr(built.kernels(), name)
-    kernel(gains.dtype == torch.float64, sizes, tones, torch.get_num_threads(), tensors)
+    inputs = contiguous((gains, steering, delays))
+    calls.run("channels", gains, *inputs, out, sizes=sizes, numbers=tones)
+
+
+@kernel("channels_backward", "cpu")
+def _channels_backward(
+    out: Any, slope: Tensor, gains: Tensor, steering: Tensor, delays: Tensor, tones: Any
+) -> None:
+    sizes = (*gains.shape[:2], steering.shape[1], slope.shape[2])
+    inputs = contiguous((gains, steering, delays, slope))
+    calls.run("channels_backward", gains, *inputs, *out, sizes=sizes, numbers=tones)
 
 
 def _setup(ctx, inputs, output):

@@ -1,54 +1,201 @@
-"""The `cuda` backend: CUDA kernels for the operators, and frozen views."""
+"""The `cuda` backend: the operators on CUDA tensors by the CUDA kernels, and frozen views.
+
+A plan's buffers have the shapes of the CPU's, with contents of their own: records, boxes and entries go by
+Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
+tiles' starts (P tiles + 1), then for each entry its Gaussian and its slot.
+
+Inside a captured CUDA graph nothing may synchronise, so a plan has room for as many entries as earlier plans
+of this size needed, plus headroom; if it needs more, its images and gradients are NaN.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, cuda_kernels, cuda_library, operators
-from gsparc.ops.geometry import Gaussians, SphereGrid
-from gsparc.ops.operators import Buffers, Poses, check_memory, composite, make_plan, mean_weights
+from gsparc.ops import _native, calls, cuda_library, validation
+from gsparc.ops.geometry import Gaussians
+from gsparc.ops.operators import (
+    Buffers,
+    Poses,
+    check_memory,
+    composite,
+    contiguous,
+    kernel,
+    kernel_view,
+    make_plan,
+    mean_weights,
+    thaw,
+)
 from gsparc.ops.plan import Plan
-from gsparc.ops.settings import kernel_settings
+from gsparc.ops.settings import KernelSettings
 
 __all__ = ["composite", "freeze", "load", "make_plan", "mean_weights", "thaw"]
+
+BYTES_PER_ENTRY = 36  # entries and what sorting them takes
+MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
+
+_capacities: dict[tuple, int] = {}
 
 
 def load() -> None:
     """Build or find the kernels and let them serve CUDA tensors (cuda_library.LibraryUnavailable)."""
-    if "cuda" not in cuda_kernels.libraries:
-        cuda_kernels.libraries["cuda"] = cuda_library.load()
-        operators.KERNELS["cuda"] = cuda_kernels
+    if "cuda" not in calls.libraries:
+        calls.libraries["cuda"] = cuda_library.load()
+
+
+def tiles(settings: KernelSettings) -> int:
+    """Tiles of one pose's image."""
+    return -(-settings.height // _native.TILE_HEIGHT) * -(-settings.width // _native.TILE_WIDTH)
+
+
+def _with_headroom(entries: int) -> int:
+    """Capacity of a captured plan where the largest plan so far had so many entries."""
+    return entries + entries // 4 + 1024
+
+
+def _capturing(tensor: Tensor) -> bool:
+    return tensor.is_cuda and torch.cuda.is_current_stream_capturing()
+
+
+@cache
+def _tables(device: torch.device, dtype: torch.dtype, settings: KernelSettings) -> Tensor:
+    """Sines and cosines of the grid's rows and columns, kept for good: captured graphs hold their address."""
+    library = calls.libraries[device.type]
+    call = calls.call_for(torch.empty(0, dtype=dtype), settings=settings)
+    numbers = torch.empty(library.run("tables", call), dtype=dtype)
+    call.tensors[0] = numbers.data_ptr()
+    library.run("tables", call)
+    return numbers.to(device)
+
+
+def capacity_of(buffers: Buffers, poses: int, settings: KernelSettings) -> int:
+    """How many entries a plan has room for."""
+    return (buffers.entries.numel() - poses * tiles(settings) - 1) // 2
+
+
+def run_on_plan(
+    name: str,
+    *tensors: Tensor | None,
+    buffers: Buffers,
+    gaussians: Gaussians,
+    poses: Poses,
+    settings: KernelSettings,
+    sizes: Sequence[int] = (),
+) -> None:
+    """Call a kernel that reads a plan (`read_view`), Gaussians and poses, then `tensors`."""
+    means, count = gaussians.means, len(poses.positions)
+    entries, capacity = None, 0
+    if buffers.entries.numel():
+        entries, capacity = buffers.entries, capacity_of(buffers, count, settings)
+    view = (_tables(means.device, means.dtype, settings), *buffers[:5], buffers.starts[-1:], entries)
+    inputs = contiguous((*gaussians, *poses, *tensors))
+    calls.run(name, means, *view, *inputs, sizes=(count, len(means), capacity, *sizes), settings=settings)
+
+
+@kernel("plan", "cuda")
+def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings) -> Any:
+    means, count, n = gaussians.means, len(poses.positions), len(gaussians.means)
+    if count * n >= MOST_PAIRS:
+        raise MemoryError(
+            f"{count} poses of {n} Gaussians are too many for a plan: take fewer poses at a time"
+        )
+    buffers, means2d, radii, visible = out
+    starts = count * tiles(settings) + 1
+    if n == 0:
+        zeros = [buffer.zero_() for buffer in buffers[:-1]]
+        return Buffers(*zeros, buffers.entries.new_zeros(starts)), means2d, radii, visible
+    verdict = means.new_empty(2, dtype=torch.int64)
+    view = {"gaussians": gaussians, "poses": poses, "settings": settings}
+    run_on_plan("plan", ids, means2d, radii, visible, verdict, buffers=buffers, **view)
+    key = (count, n, settings)
+    if _capturing(means):
+        if key not in _capacities:
+            raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
+        capacity = _with_headroom(_capacities[key])
+    else:
+        status, capacity = verdict.tolist()
+        validation.raise_for_status(status)
+        _capacities[key] = max(capacity, _capacities.get(key, 0))
+    check_memory(capacity, BYTES_PER_ENTRY)
+    buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))
+    run_on_plan("bin", buffers=buffers, **view)
+    return buffers, means2d, radii, visible
+
+
+def _by_gaussian(features: Tensor, poses: Poses) -> Tensor:
+    """Features (B, N, C) as (P, N, K) with the K channels of a pose side by side."""
+    if len(poses.positions) != 1:
+        return features.contiguous()
+    samples, n, channels = features.shape
+    return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
+
+
+@kernel("composite", "cuda")
+def _composite(out: Any, means2d: Tensor, features: Tensor, **view: Any) -> None:
+    rows = _by_gaussian(features, view["poses"])
+    run_on_plan("composite", rows, *out, sizes=rows.shape[2:], **view)
+
+
+@kernel("composite_backward", "cuda")
+def _composite_backward(
+    out: Any,
+    grad_image: Tensor,
+    grad_transmittance: Tensor | None,
+    image: Tensor,
+    transmittance: Tensor,
+    features: Tensor,
+    **view: Any,
+) -> Any:
+    count, (samples, n, channels) = len(view["poses"].positions), features.shape
+    rows = _by_gaussian(features, view["poses"])
+    entries = capacity_of(view["buffers"], count, view["settings"])
+    check_memory(entries, features.element_size() * (_native.MOMENTS + rows.shape[2]))
+    grads, _, grad_means2d = out
+    grad_rows = torch.empty_like(rows)
+    images = (image, transmittance, grad_image, grad_transmittance)
+    if n > 0:
+        tensors = (rows, *images, *grads, grad_rows, grad_means2d)
+        run_on_plan("composite_backward", *tensors, sizes=rows.shape[2:], **view)
+    if count == 1:
+        grad_rows = grad_rows.reshape(n, samples, channels).permute(1, 0, 2).contiguous()
+    return grads, grad_rows, grad_means2d
+
+
+@kernel("weights", "cuda")
+def _weights(out: Any, **view: Any) -> Any:
+    sums = out[0].new_empty(*out[0].shape, 2)
+    if sums.numel():
+        run_on_plan("weights", sums, None, None, **view)
+    return sums[..., 0].clone(), sums[..., 1].clone()
+
+
+@kernel("weights_backward", "cuda")
+def _weights_backward(out: Any, grad_seen: Tensor, grad_total: Tensor, **view: Any) -> None:
+    entries = capacity_of(view["buffers"], len(view["poses"].positions), view["settings"])
+    check_memory(entries, out.means.element_size() * (_native.MOMENTS + 1))
+    if len(out.means) > 0:
+        run_on_plan("weights_backward", grad_seen, grad_total, *out, sizes=(1,), **view)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Order (V,) of the visible Gaussians; tiles' starts and ends, each entry's rank and 32 weights."""
-    settings, poses = kernel_settings(plan.grid, plan.optics), Poses(plan.pose.position, plan.pose.rotation)
-    means, buffers, tiles = gaussians.means, Buffers(*plan.buffers), cuda_kernels.tiles(settings)
-    capacity = cuda_kernels.capacity_of(buffers, 1, settings)
+    view, means = kernel_view(plan, gaussians), gaussians.means
+    buffers, settings = view["buffers"], view["settings"]
+    capacity = capacity_of(buffers, 1, settings)
     pixels = _native.TILE_WIDTH * _native.TILE_HEIGHT
     check_memory(capacity, pixels * means.element_size())
     blocks = means.new_zeros(capacity, pixels)
-    starts = buffers.entries[: tiles + 1].clone()
+    starts = buffers.entries[: tiles(settings) + 1].clone()
     ends = starts[:-1].clone()
     if len(means) > 0:
-        cuda_kernels.run_on_plan("weights", buffers, gaussians, poses, settings, None, blocks, ends)
+        run_on_plan("weights", None, blocks, ends, **view)
     order = buffers.order[0, : int(buffers.shown[0])].to(torch.int64)
     rank_of = order.new_zeros(len(means))
     rank_of[order] = torch.arange(len(order), device=order.device)
-    of_entries = buffers.entries[tiles + 1 : tiles + 1 + capacity].to(torch.int64)
+    of_entries = buffers.entries[len(starts) : len(starts) + capacity].to(torch.int64)
     return order, (starts, ends, rank_of[of_entries].to(torch.int32), blocks)
-
-
-def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
-    """Image (K, H, W) of features (V, K) in the order of `freeze`, in its precision (TypeError)."""
-    if features.dtype != buffers[3].dtype:
-        raise TypeError(f"features are {features.dtype}, this view was frozen in {buffers[3].dtype}")
-    features = features.contiguous()
-    image = features.new_empty(features.shape[1], grid.height, grid.width)
-    if image.numel():
-        channels, height, width = image.shape
-        cuda_kernels.run(
-            *("thaw", features, *buffers, features, image), channels=channels, height=height, width=width
-        )
-    return image

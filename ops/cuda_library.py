@@ -14,11 +14,10 @@ import shutil
 import subprocess
 import time
 from pathlib import Path
-from typing import Any, get_type_hints
 
 import torch
 
-from gsparc.ops.settings import KernelSettings
+from gsparc.ops.calls import Call
 
 SOURCES = Path(__file__).parent / "csrc"
 FLAGS = ("-std=c++17", "-O3", "-fmad=false", "--expt-relaxed-constexpr", "-Xcompiler=-fPIC", "-shared", "-t0")
@@ -27,34 +26,6 @@ LOG = logging.getLogger(__name__)
 
 class LibraryUnavailable(RuntimeError):
     """The CUDA kernels are not available; the message says why in one line."""
-
-
-_C_TYPES: dict[type, Any] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: ctypes.c_double}
-
-
-class _Settings(ctypes.Structure):
-    """`KernelSettings<double>` of csrc/layout.h."""
-
-    _fields_ = tuple((name, _C_TYPES[kind]) for name, kind in get_type_hints(KernelSettings).items())
-
-
-_NUMBERS = (
-    *("twice", "poses", "count", "samples", "channels", "capacity", "device", "height", "width"),
-    *("inputs", "hidden", "radius", "built_for", "driver"),
-)
-
-
-class Call(ctypes.Structure):
-    """One call into the library; `Call` of csrc/cuda/view.h."""
-
-    _fields_ = (
-        *((name, ctypes.c_int32) for name in _NUMBERS),
-        ("settings", _Settings),
-        ("window", ctypes.c_double * 8),
-        ("tensors", ctypes.c_uint64 * 32),
-        ("scratch", ctypes.c_uint64),
-        ("stream", ctypes.c_uint64),
-    )
 
 
 class Library:
@@ -151,7 +122,7 @@ def library_path(*architectures: str) -> Path:
 def fingerprint(*also: str) -> str:
     """Hash of the sources and of `also`, such as compiler flags."""
     digest = hashlib.sha256(repr(also).encode())
-    for source in sorted([*SOURCES.glob("*.h"), *(SOURCES / "cuda").glob("*")]):
+    for source in sorted([*SOURCES.glob("*.h"), *SOURCES.glob("projection/*"), *SOURCES.glob("cuda/*")]):
         digest.update(source.name.encode() + source.read_bytes())
     return digest.hexdigest()[:16]
 

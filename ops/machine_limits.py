@@ -5,15 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native
-from gsparc.ops.cpu_kernels import addresses
+from gsparc.ops import calls
 from gsparc.ops.plan import Plan
 from gsparc.ops.settings import kernel_settings
 
 
 def exponentials(tasks: int) -> int:
     """Accumulate exponentials over a row of pixels in torch's threads; returns how many were evaluated."""
-    return _native.mark_exponentials(tasks, torch.get_num_threads())
+    return calls.run("mark_exponentials", torch.empty(0), sizes=(tasks,))
 
 
 def copy(source: Tensor, target: Tensor) -> int:
@@ -25,8 +24,7 @@ def copy(source: Tensor, target: Tensor) -> int:
     size = source.numel() * source.element_size()
     if not source.is_contiguous() or not target.is_contiguous() or size != target.nbytes:
         raise ValueError("copying needs two contiguous tensors of the same size")
-    _native.mark_copy(source.data_ptr(), target.data_ptr(), size, torch.get_num_threads())
-    return 2 * size
+    return 2 * calls.run("mark_copy", source, source, target, numbers=(size,))
 
 
 def pairs(plan: Plan) -> int:
@@ -37,6 +35,5 @@ def pairs(plan: Plan) -> int:
     """
     if plan.backend != "cpu":
         raise ValueError(f"pairs are counted in plans of the cpu backend, this one is of {plan.backend!r}")
-    double, settings = plan.means2d.dtype == torch.float64, kernel_settings(plan.grid, plan.optics)
-    sizes = (plan.num_poses, plan.num_gaussians, torch.get_num_threads())
-    return _native.mark_pairs(double, *sizes, settings, addresses(*plan.buffers))
+    sizes, settings = (plan.num_poses, plan.num_gaussians), kernel_settings(plan.grid, plan.optics)
+    return calls.run("mark_pairs", plan.means2d, *plan.buffers, sizes=sizes, settings=settings)

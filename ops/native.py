@@ -1,56 +1,112 @@
-"""The `cpu` backend: C++ kernels for the operators, and frozen views."""
+"""The `cpu` backend: the operators on CPU tensors by the C++ kernels, and frozen views."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from gsparc.ops import _native, cpu_kernels, operators
-from gsparc.ops.cpu_kernels import addresses
-from gsparc.ops.geometry import Gaussians, SphereGrid
+from gsparc.ops import _native, calls, validation
+from gsparc.ops.geometry import Gaussians
 from gsparc.ops.operators import (
     Buffers,
+    Poses,
     check_memory,
     composite,
     contiguous,
+    kernel,
+    kernel_view,
     make_plan,
     mean_weights,
     strips,
+    thaw,
 )
 from gsparc.ops.plan import Plan
-from gsparc.ops.settings import kernel_settings
+from gsparc.ops.settings import KernelSettings
 
 __all__ = ["composite", "freeze", "instruction_set", "make_plan", "mean_weights", "thaw"]
 
-operators.KERNELS["cpu"] = cpu_kernels
+
+def run_on_plan(
+    name: str,
+    *tensors: Tensor | None,
+    buffers: Buffers,
+    gaussians: Gaussians,
+    poses: Poses,
+    settings: KernelSettings,
+    sizes: Sequence[int] = (),
+) -> int:
+    """Call a kernel that begins with `ViewArgs` of csrc/layout.h, then `tensors`."""
+    inputs = contiguous((*gaussians, *poses, *tensors))
+    counts = (len(poses.positions), len(gaussians.means), *sizes)
+    return calls.run(name, gaussians.means, *buffers, *inputs, sizes=counts, settings=settings)
+
+
+@kernel("plan", "cpu")
+def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings) -> Any:
+    (buffers, *screen), means = out, gaussians.means
+    tensors = (*contiguous((*gaussians, *poses, ids)), *buffers[:-1], *screen)
+    sizes = (len(poses.positions), len(means))
+    validation.raise_for_status(calls.run("plan", means, *tensors, sizes=sizes, settings=settings))
+    entries = int(buffers.starts[-1])
+    check_memory(entries, 4)
+    buffers = buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))
+    calls.run("entries", means, *buffers, sizes=sizes, settings=settings)
+    return buffers, *screen
+
+
+@kernel("composite", "cpu")
+def _composite(out: Any, features: Tensor, means2d: Tensor, **view: Any) -> None:
+    run_on_plan("composite", features, *out, sizes=features.shape[::2], **view)
+
+
+@kernel("composite_backward", "cpu")
+def _composite_backward(
+    out: Any,
+    grad_image: Tensor,
+    grad_transmittance: Tensor | None,
+    image: Tensor,
+    transmittance: Tensor,
+    features: Tensor,
+    **view: Any,
+) -> None:
+    samples, _, channels = features.shape
+    shared = len(view["poses"].positions) == 1
+    per_entry = _native.MOMENTS + (samples * channels if shared else channels)
+    check_memory(len(view["buffers"].entries), features.element_size() * per_entry)
+    grads, *rest = out
+    tensors = (features, image, transmittance, grad_image, grad_transmittance, *grads, *rest)
+    run_on_plan("composite_backward", *tensors, sizes=(samples, channels), **view)
+
+
+@kernel("weights", "cpu")
+def _weights(out: Any, **view: Any) -> None:
+    run_on_plan("weights", *out, **view)
+
+
+@kernel("weights_backward", "cpu")
+def _weights_backward(out: Any, grad_seen: Tensor, grad_total: Tensor, **view: Any) -> None:
+    entries = view["buffers"].entries
+    check_memory(len(entries), out.means.element_size() * _native.MOMENTS)
+    run_on_plan("weights_backward", grad_seen, grad_total, *out, **view)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Order (V,) of the visible Gaussians, and the weights alpha T as blocks of pixels; see frozen.h."""
-    means, settings = gaussians.means, kernel_settings(plan.grid, plan.optics)
-    inputs = [*plan.buffers, *contiguous((*gaussians, plan.pose.position, plan.pose.rotation))]
-    head = (means.dtype == torch.float64, len(means), torch.get_num_threads(), settings)
+    view = kernel_view(plan, gaussians)
+    run, order = partial(run_on_plan, "freeze", **view), view["buffers"].order
     counts = torch.zeros(strips(plan.grid.height) + 1, dtype=torch.int64)
-    lanes = _native.freeze(*head, addresses(*inputs, counts, None, None))
+    lanes = run(counts, None, None)
     starts = counts.cumsum(0)
     size = int(starts[-1])
-    check_memory(size, 8 + lanes * means.element_size())
-    heads, weights = torch.empty(size, 2, dtype=torch.int32), means.new_empty(size, lanes)
+    check_memory(size, 8 + lanes * gaussians.means.element_size())
+    heads, weights = torch.empty(size, 2, dtype=torch.int32), gaussians.means.new_empty(size, lanes)
     if size > 0:
-        _native.freeze(*head, addresses(*inputs, starts, heads, weights))
-    buffers = Buffers(*plan.buffers)
-    return buffers.order[0, : int(buffers.shown[0])].to(torch.int64), (starts, heads, weights)
-
-
-def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
-    """Image (K, H, W) of features (V, K) in the order of `freeze`, in its precision (TypeError)."""
-    if features.dtype != buffers[2].dtype:
-        raise TypeError(f"features are {features.dtype}, this view was frozen in {buffers[2].dtype}")
-    features = features.contiguous()
-    image = features.new_empty(features.shape[1], grid.height, grid.width)
-    double, threads = features.dtype == torch.float64, torch.get_num_threads()
-    _native.thaw(double, *image.shape, threads, addresses(*buffers, features, image))
-    return image
+        run(starts, heads, weights)
+    return order[0, : int(view["buffers"].shown[0])].to(torch.int64), (starts, heads, weights)
 
 
 def instruction_set() -> str:

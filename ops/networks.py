@@ -7,8 +7,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends, built
-from gsparc.ops.operators import empty_like, operator
+from gsparc.ops import backends, built, calls
+from gsparc.ops.operators import contiguous, empty_like, kernel, operator
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
@@ -27,7 +27,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         fits = encoded.dtype == torch.float32
         fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
-        backends.named(encoded.device.type)  # its kernels are then in the table
+        backends.named(encoded.device.type)  # loads its kernels
         return networks_op(encoded, weight1, bias1, weight2, bias2)
     return products(encoded, weight1, bias1, weight2, bias2)
 
@@ -61,6 +61,26 @@ def networks_op(encoded: Tensor, layers: Layers) -> Tensor:
 def networks_backward_op(slope: Tensor, encoded: Tensor, layers: Layers) -> Layers:
     """Gradients of the layers for the gradient `slope` (B, N, C) of the outputs."""
     return empty_like(layers)
+
+
+@kernel("networks", "cpu", "cuda")
+def _networks(out: Tensor, encoded: Tensor, layers: Layers) -> None:
+    if out.numel():
+        calls.run("networks", encoded, *contiguous((encoded, *layers)), out, sizes=_sizes(encoded, layers))
+
+
+@kernel("networks_backward", "cpu", "cuda")
+def _networks_backward(out: Layers, slope: Tensor, encoded: Tensor, layers: Layers) -> None:
+    if slope.numel():
+        tensors = (*contiguous((encoded, *layers, slope)), *out)
+        calls.run("networks_backward", encoded, *tensors, sizes=_sizes(encoded, layers))
+    else:
+        for gradient in out:
+            gradient.zero_()
+
+
+def _sizes(encoded: Tensor, layers: Layers) -> tuple[int, ...]:
+    return len(encoded), *layers.weight1.shape, layers.weight2.shape[2]
 
 
 def _setup(ctx, inputs, output):

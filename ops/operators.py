@@ -1,7 +1,7 @@
 """The rasterizer's operators `gsparc::...`, each signature stated once: names, shapes and gradients.
 
-An operator is a function that returns empty tensors of the right shapes, which is also its fake. What
-computes it on a device is the function of the same name and parameters in that device's module of `KERNELS`.
+An operator is a function that returns empty tensors of the right shapes, which is also its fake. What fills
+them on a device is a function marked with `kernel`.
 """
 
 from __future__ import annotations
@@ -9,21 +9,20 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
-from types import ModuleType
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, TypeVar, get_type_hints
 
 import torch
 from torch import Tensor
 from torch.library import CustomOpDef, custom_op
 
-from gsparc.ops import built
+from gsparc.ops import built, calls
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
 
-KERNELS: dict[str, ModuleType] = {}
-"""Modules of kernels by type of device; each backend adds its own when it is loaded."""
+KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
+"""What computes an operator, by type of device and name; see `kernel`."""
 
 MEMORY_BOUND = 8 * 2**30
 """Bytes that one call may need for entries and gradient slots [B]; more is refused before it is allocated."""
@@ -37,7 +36,7 @@ class Poses(NamedTuple):
 
 
 class Buffers(NamedTuple):
-    """A plan as the CPU kernels lay it out (cuda_kernels.py says what differs there).
+    """A plan as the CPU kernels lay it out (cuda.py says what differs there).
 
     Attributes:
         records: (P, N, RECORD) footprints, by depth.
@@ -113,8 +112,10 @@ def operator(shapes: Callable[..., Any]) -> CustomOpDef:
         return [make(flat[first:last]) if make else flat[first] for make, first, last in groups]
 
     def compute(*flat: Any) -> Any:
-        kernel = getattr(KERNELS[flat[0].device.type], name)
-        return _outputs(kernel(*grouped(flat)), flat[0])
+        values = grouped(flat)
+        out = shapes(*values)
+        own = KERNELS[flat[0].device.type][name](out, **dict(zip(hints, values, strict=True)))
+        return _outputs(out if own is None else own, flat[0])
 
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = [inspect.Parameter(key, kind, annotation=hint) for key, hint in arguments.items()]
@@ -127,6 +128,24 @@ def operator(shapes: Callable[..., Any]) -> CustomOpDef:
     defined = custom_op(f"gsparc::{name}", compute, mutates_args=())
     defined.register_fake(lambda *flat: _outputs(shapes(*grouped(flat)), flat[0]))
     return defined
+
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def kernel(name: str, *devices: str) -> Callable[[_Function], _Function]:
+    """Mark what computes operator `name` on types of device.
+
+    It receives the operator's empty outputs, then the operator's arguments by name. It fills the outputs, or
+    returns others in their place.
+    """
+
+    def mark(function: _Function) -> _Function:
+        for device in devices:
+            KERNELS[device][name] = function
+        return function
+
+    return mark
 
 
 def layout() -> Any:
@@ -145,8 +164,8 @@ def empty_like(tensors: Any) -> Any:
 
 
 def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
-    """Detached, contiguous tensors, as kernels read them."""
-    return [None if tensor is None else tensor.detach().contiguous() for tensor in tensors]
+    """Contiguous tensors, as kernels read them."""
+    return [t if t is None or t.is_contiguous() else t.detach().contiguous() for t in tensors]
 
 
 def plan_tensors(
@@ -172,7 +191,8 @@ def plan_op(
     gaussians: Gaussians, ids: Tensor | None, poses: Poses, settings: KernelSettings
 ) -> tuple[Buffers, Tensor, Tensor, Tensor]:
     """Plan, means2d (P, N, 2), radii and visible (P, N); opacities: the larger of opacity and extinction."""
-    count = torch.library.get_ctx().new_dynamic_size()
+    tracing = torch.library.get_ctx()  # otherwise the kernel will know
+    count = tracing.new_dynamic_size() if tracing else 0
     return plan_tensors(gaussians.means, poses.positions.shape[0], settings.height, count)
 
 
@@ -284,6 +304,12 @@ def view_of(plan: Plan) -> tuple[Any, ...]:
     return plan.pose.position, plan.pose.rotation, *plan.buffers, packed(settings)
 
 
+def kernel_view(plan: Plan, gaussians: Gaussians) -> dict[str, Any]:
+    """A plan as kernels receive it (`kernel`): buffers, gaussians, poses and settings."""
+    poses, settings = Poses(plan.pose.position, plan.pose.rotation), kernel_settings(plan.grid, plan.optics)
+    return {"buffers": Buffers(*plan.buffers), "gaussians": gaussians, "poses": poses, "settings": settings}
+
+
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     return composite_op(means2d, *gaussians, features, *view_of(plan))
@@ -293,6 +319,17 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
     seen, total = weights_op(*gaussians, *view_of(plan))
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
+
+
+def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
+    """Image (K, H, W) of features (V, K) in the order of `freeze`, in its precision (TypeError)."""
+    if features.dtype != buffers[-1].dtype:
+        raise TypeError(f"features are {features.dtype}, this view was frozen in {buffers[-1].dtype}")
+    features = features.contiguous()
+    image = features.new_empty(features.shape[1], grid.height, grid.width)
+    if image.numel():
+        calls.run("thaw", features, *buffers, features, image, sizes=image.shape)
+    return image
 
 
 def check_memory(entries: int, bytes_each: int) -> None:

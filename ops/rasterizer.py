@@ -9,8 +9,9 @@ from gsparc.ops import backends, validation
 from gsparc.ops.frozen import FrozenPlan
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
+from gsparc.ops.projection import Projection
 from gsparc.ops.results import Raster, Weights
-from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics, Projection
+from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics
 
 
 def make_plan(

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from gsparc.ops.geometry import Pose, SphereGrid
-from gsparc.ops.settings import ALPHA_MAX, HORIZON_COSINE, SHORTEST_QUATERNION, Optics
+from gsparc.ops.projection import PROJECTIONS
+from gsparc.ops.settings import ALPHA_MAX, SHORTEST_QUATERNION, Optics
 
 
 @dataclass(frozen=True)
@@ -85,13 +86,8 @@ def project(
     elevation = torch.atan2(n[:, 2], horizontal)
     azimuth = torch.where(on_axis[:, 0], 0.0, torch.atan2(n[:, 1], torch.where(on_axis[:, 0], 1.0, n[:, 0])))
 
-    if optics.projection == "tangent":
-        to_column = torch.full_like(distance, 1 / grid.elevation_step)
-        # The footprint is the same in any frame of the plane: this one is carried along without turning, so
-        # that float32 loses nothing to the turn of east and north, which is infinite at the pole.
-        east, north = (e.detach() - n * (n * e.detach()).sum(-1, keepdim=True) for e in (east, north))
-    else:
-        to_column = 1 / ((horizontal**2 + grid.elevation_step**2).sqrt() * grid.azimuth_step)
+    frame = PROJECTIONS[optics.projection].frame
+    to_column, east, north = frame(n, east, north, horizontal, grid)
     to_row = 1 / grid.elevation_step
 
     axes = pose.rotation.mT @ rotation_matrices(quats)
@@ -133,38 +129,12 @@ def project(
     )
 
 
-def _offsets(
-    seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Offsets (N, H W) of every pixel from every centre in columns and rows [px], and whether it is in front.
+def footprints(seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor) -> Tensor:
+    """The Gaussians' shapes G (N, H W), 1 at their centres, 0 where a pixel does not face them.
 
     `shift` (N, 2) [px] moves the footprints; it is zero and carries the screen-space gradient.
     """
-    dtype, device = seen.distance.dtype, seen.distance.device
-    if optics.projection == "equirect":
-        center = seen.center + shift
-        column = torch.arange(grid.width, dtype=dtype, device=device) - center[:, :1]
-        row = torch.arange(grid.height, dtype=dtype, device=device) - center[:, 1:]
-        turn = 2 * torch.pi / grid.azimuth_step
-        column = column - turn * torch.round(column.detach() / turn)
-        size = (-1, grid.height, grid.width)
-        p, q = column[:, None, :].expand(size).flatten(1), row[:, :, None].expand(size).flatten(1)
-        return p, q, torch.ones_like(p, dtype=torch.bool)
-    u = grid.directions(dtype).to(device).flatten(0, 1)
-    cosine = seen.direction @ u.mT
-    facing = cosine > HORIZON_COSINE
-    cosine = torch.where(facing, cosine, 1.0)
-    p, q = (seen.east @ u.mT) / cosine, (seen.north @ u.mT) / cosine
-    # Moving the centre by d along the sphere moves the offset by -(d + q (q . d)) (gnomonic projection).
-    d = shift * grid.elevation_step
-    along = d[:, :1] * p + d[:, 1:] * q
-    p, q = p - (d[:, :1] + p * along), q - (d[:, 1:] + q * along)
-    return p / grid.elevation_step, q / grid.elevation_step, facing
-
-
-def footprints(seen: Projected, grid: SphereGrid, optics: Optics, shift: Tensor) -> Tensor:
-    """The Gaussians' shapes G (N, H W), 1 at their centres, 0 where a pixel does not face them."""
-    p, q, facing = _offsets(seen, grid, optics, shift)
+    p, q, facing = PROJECTIONS[optics.projection].offsets(seen, grid, shift)
     _, k12, k22 = (entry[:, None] for entry in seen.covariance.unbind(-1))
     # The quadratic form completed to squares: no cancellation along a needle. Roots first: the slope of
     # k22 / det overflows in float32 long before theirs.

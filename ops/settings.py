@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from gsparc.ops.geometry import SphereGrid
-
-Projection = Literal["equirect", "tangent"]
+from gsparc.ops.projection import HORIZON_COSINE, PROJECTIONS, Projection
 
 FARTHEST = 1e6
 """Largest coordinate of a Gaussian [m]; ops see local coordinates, float32 no squares of 1e19."""
@@ -24,10 +23,6 @@ ALPHA_MAX = 0.99
 
 FAINTEST = 1e-30
 """A Gaussian whose alphas add up to less has a visible share without a gradient: 1 / sum is no float32."""
-
-HORIZON_COSINE = 0.01
-"""`tangent` only: pixels more than 89.4 degrees from a Gaussian's direction never see it (the tangent plane
-ends at 90 degrees, and float32 has lost two digits of the offset before that)."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +73,8 @@ class Optics:
     cutoff: Cutoff = IMAGE_CUTOFF
 
     def __post_init__(self) -> None:
-        if self.projection not in ("equirect", "tangent"):
-            raise ValueError(f"projection is 'equirect' or 'tangent', got {self.projection!r}")
+        if self.projection not in PROJECTIONS:
+            raise ValueError(f"projection is {' or '.join(map(repr, PROJECTIONS))}, got {self.projection!r}")
         if not self.low_pass >= 0.0 or not self.near > 0.0:
             raise ValueError(f"low_pass >= 0 and near > 0 are needed, got {self.low_pass} and {self.near}")
 
@@ -89,8 +84,8 @@ class KernelSettings(NamedTuple):
 
     height: int
     width: int
+    projection: int
     periodic: bool
-    tangent: bool
     compensate: bool
     relative: bool
     first_elevation: float
@@ -111,8 +106,8 @@ def kernel_settings(grid: SphereGrid, optics: Optics) -> KernelSettings:
     return KernelSettings(
         height=grid.height,
         width=grid.width,
+        projection=list(PROJECTIONS).index(optics.projection),
         periodic=grid.periodic,
-        tangent=optics.projection == "tangent",
         compensate=optics.compensate,
         relative=optics.cutoff.relative,
         first_elevation=grid.first_elevation,

@@ -7,17 +7,15 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends, built
-from gsparc.ops.operators import KERNELS, operator
+from gsparc.ops import built, calls
+from gsparc.ops.operators import kernel, layout, operator
 
 
 def served(images: Tensor) -> bool:
     """Whether a kernel supports these images: float32, on a device whose kernels are loaded."""
-    if images.dtype != torch.float32:
-        return False
-    if images.device.type == "cpu" and built.kernels() is not None:
-        backends.named("cpu")  # its kernels are then in the table
-    return images.device.type in KERNELS
+    device = images.device.type
+    loaded = device in calls.libraries or (device == "cpu" and built.kernels() is not None)
+    return images.dtype == torch.float32 and loaded
 
 
 @operator
@@ -27,5 +25,46 @@ def similarity_op(
     """Similarity (B,) of float32 images (B, H, W), and its gradient by the prediction (empty unless `slope`).
 
     `taps` is one axis of a separable, symmetric window of odd length, `stability` the constants C1 and C2.
+    A GPU takes no window that is not symmetric or too wide (ValueError).
     """
     return prediction.new_empty(prediction.shape[0]), prediction.new_empty(prediction.shape if slope else 0)
+
+
+@kernel("similarity", "cpu")
+def _cpu(
+    out: tuple[Tensor, Tensor],
+    prediction: Tensor,
+    target: Tensor,
+    taps: Sequence[float],
+    stability: Sequence[float],
+    slope: bool,
+) -> None:
+    value, slopes = out
+    window, images = torch.tensor(taps, dtype=torch.float32), (prediction.contiguous(), target.contiguous())
+    tensors = (window, *images, value, slopes if slope else None)
+    sizes = (*prediction.shape, len(taps) // 2)
+    calls.run("similarity", prediction, *tensors, sizes=sizes, numbers=stability)
+
+
+@kernel("similarity", "cuda")
+def _cuda(
+    out: tuple[Tensor, Tensor],
+    prediction: Tensor,
+    target: Tensor,
+    taps: Sequence[float],
+    stability: Sequence[float],
+    slope: bool,
+) -> tuple[Tensor, Tensor]:
+    half, (samples, height, width) = list(taps)[: len(taps) // 2 + 1], prediction.shape
+    radius, known = len(half) - 1, layout()
+    if radius > known.MOST_RADIUS or list(taps) != [*half, *half[-2::-1]]:
+        most = 2 * known.MOST_RADIUS + 1
+        raise ValueError(f"the window is symmetric and has at most {most} taps, got {list(taps)}")
+    rows, columns = height - 2 * radius, width - 2 * radius
+    blocks = -(-rows // known.SIMILARITY_HEIGHT) * -(-columns // known.SIMILARITY_WIDTH)
+    sums = prediction.new_empty(samples, blocks)
+    inputs = (prediction.contiguous(), target.contiguous(), target.mean(dim=(-2, -1)))
+    if samples:
+        tensors, sizes = (*inputs, sums, out[1] if slope else None), (samples, height, width, radius)
+        calls.run("similarity", prediction, *tensors, sizes=sizes, numbers=(*stability, *half))
+    return sums.sum(1) / (rows * columns), out[1]

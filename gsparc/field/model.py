@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +17,7 @@ from gsparc.field.emission import Emission, EmissionSettings
 from gsparc.field.encoding import PositionEncoding, Prior
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
-from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Raster, SphereGrid
+from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
 
@@ -48,7 +47,7 @@ class RasterSettings:
     """How footprints become pixels.
 
     Attributes:
-        projection: `equirect` (the paper; inexact near the pole) or `tangent`.
+        projection: see `gsparc.ops.settings.Optics`.
         low_pass: variance added to every footprint [px^2].
         compensate: keep a footprint's energy under the low-pass.
         alpha_cutoff: smallest alpha that counts in images.
@@ -56,7 +55,7 @@ class RasterSettings:
         backend: `reference`, `cpu`, `cuda`; null chooses by device.
     """
 
-    projection: Literal["equirect", "tangent"] = "tangent"
+    projection: Projection = "tangent"
     low_pass: float = 0.3
     compensate: bool = True
     alpha_cutoff: float = 1 / 255

@@ -8,15 +8,31 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+template <class S> struct CompositeBackwardArgs : CompositeArgs<S> {
+    const S *grad_image, *grad_transmittance;    // as above; the second may be null
+    S *means, *quats, *scales, *opacities, *extinctions, *grad_features, *screen;  // gradients; screen (P, N, 2)
+    CompositeBackwardArgs(const Call& call, Reader& in) : CompositeArgs<S>(call, in) {
+        in.read(grad_image, grad_transmittance, means, quats, scales, opacities, extinctions, grad_features, screen);
+    }
+};
+
+template <class S> struct WeightBackwardArgs : ViewArgs<S> {
+    const S *grad_visible_sum, *grad_total;      // (P, N)
+    S *means, *quats, *scales, *opacities, *extinctions;
+    WeightBackwardArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) {
+        in.read(grad_visible_sum, grad_total, means, quats, scales, opacities, extinctions);
+    }
+};
+
 // A cell holds what one tile needs: transmittance, what is still to come, upstream gradient per channel.
-template <class S, bool kTangent, bool kHides, int kChannels>
-void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch,
-                              S* cells, S* sums_memory, S* moments, S* feature_slots) {
+template <class P, class S, bool kHides, int kChannels>
+void composite_backward_strip(const CompositeBackwardArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch,
+                              S* cells, S* moments, S* feature_slots) {
     constexpr int n = Lanes<S>::n;
-    const CompositeArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.settings.height, task);
     const int k_count = kChannels ? kChannels : channels_of(a), cell = (2 + k_count) * n;
     const Vec<S> alpha_max = splat(a.settings.alpha_max), floor = splat(a.settings.transmittance_min);
+    S* const sums_memory = cells + int64_t(stage.tiles) * cell;
     const int64_t pixels = int64_t(a.settings.height) * a.settings.width;
     fill(cells, int64_t(stage.tiles) * cell, S(0));
     for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
@@ -25,22 +41,22 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>&
         for (int k = 0; k < k_count; ++k) {
             const int64_t at = (int64_t(strip.pose) * k_count + k) * pixels + pixel;
             g += n;
-            for (int j = 0; j < count; ++j) g[j] = b.grad_image[at + j], behind[j] += g[j] * a.image[at + j];
+            for (int j = 0; j < count; ++j) g[j] = a.grad_image[at + j], behind[j] += g[j] * a.image[at + j];
         }
         const int64_t at = strip.pose * pixels + pixel;
-        if (b.grad_transmittance)
-            for (int j = 0; j < count; ++j) behind[j] += b.grad_transmittance[at + j] * a.transmittance[at + j];
+        if (a.grad_transmittance)
+            for (int j = 0; j < count; ++j) behind[j] += a.grad_transmittance[at + j] * a.transmittance[at + j];
     });
     const Lights<S> lights = {cells, cell, floor};
-    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
+    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
         Vec<S> feature[kChannels ? kChannels : 1], local[kChannels ? kChannels : 1];
         for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]), local[k] = splat(S(0));
         if (!kChannels) fill(sums_memory, int64_t(k_count) * n, S(0));
-        MomentSums<S, kTangent, kHides> sums;
+        MomentSums<S, P, kHides> sums;
         for (; hit < end; ++hit) {
             S* mine = cells + int64_t(*hit) * cell;
-            typename Shape<S, kTangent>::Seen seen;
+            typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(mine);
             const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
             const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
@@ -64,22 +80,22 @@ void composite_backward_strip(const CompositeBackwardArgs<S>& b, const Lines<S>&
         sums.write(moments + slot * kMoments, S(kOffset));
         for (int k = 0; k < k_count; ++k) feature_slots[slot * k_count + k] = sum<S>(kChannels ? local[k] : load(sums_memory + k * n));
     };
-    sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
+    sweep<P>(strip, a.plan, stage, lines, batch, lights, visit);
 }
 
 // Adds the slots of each Gaussian and chains them into its parameters; poses are added in order.
-template <class S>
-void chain(const PlanView<S>& plan, const Model<S>& model, const KernelSettings<S>& settings, int threads, const S* moments, S* means, S* quats,
-           S* scales, S* opacities, S* extinctions, S* screen) {
+template <class P, class S, class Args> void chain(const Args& a, const S* moments, S* screen) {
+    const PlanView<S>& plan = a.plan;
+    const Model<S>& model = a.model;
     Buffer<int32_t> rank_of(int64_t(plan.poses) * plan.count);
     auto invert = [&](int pose, int) {
         const int64_t base = int64_t(pose) * plan.count;
         for (int rank = 0; rank < plan.count; ++rank) rank_of[base + plan.order[base + rank]] = rank;
     };
-    parallel_for(plan.poses, threads, invert);
+    parallel_for(plan.poses, a.threads, invert);
     constexpr int chunk = 256, n = Pack<S>::n;
     static_assert(chunk % n == 0, "a chunk is whole lanes");
-    const KernelSettings<Pack<S>> wide = widened(settings);
+    const auto wide = in_precision<Pack<S>>(a.settings);
     auto run = [&](int task, int) {
         const int64_t end = int64_t(task + 1) * chunk < plan.count ? int64_t(task + 1) * chunk : plan.count;
         for (int64_t i = int64_t(task) * chunk; i < end; i += n) {
@@ -105,10 +121,10 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const KernelSettings<
                 Pack<S> shift[2] = {S(0), S(0)};
                 if (!nothing) {
                     const Stand<S> stand(model, pose);
-                    const Footprint<Pack<S>> f = project(g, stand.position, stand.rotation, wide);
+                    const Footprint<Pack<S>> f = project<P>(g, stand.position, stand.rotation, wide);
                     Pack<S> m[kMoments];
                     for (int c = 0; c < kMoments; ++c) m[c] = load(sums[c]);
-                    const Gradients<Pack<S>> one = project_backward<Pack<S>>(f, {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]},
+                    const Gradients<Pack<S>> one = project_backward<P, Pack<S>>(f, {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]},
                                                                              opacity, extinction, stand.rotation, wide);
                     const Which<S> counts = Pack<S>(load(seen)) > 0;
                     const Pack<S> none = S(0);
@@ -119,32 +135,25 @@ void chain(const PlanView<S>& plan, const Model<S>& model, const KernelSettings<
                 }
                 if (screen) scatter_rows(shift, 2, some, screen + 2 * (int64_t(pose) * plan.count + i));
             }
-            scatter_rows(total, 3, some, means + 3 * i);
-            scatter_rows(total + 3, 4, some, quats + 4 * i);
-            scatter_rows(total + 7, 3, some, scales + 3 * i);
-            scatter_rows(total + 10, 1, some, opacities + i);
-            if (extinctions) scatter_rows(total + 11, 1, some, extinctions + i);
+            scatter_rows(total, 3, some, a.means + 3 * i);
+            scatter_rows(total + 3, 4, some, a.quats + 4 * i);
+            scatter_rows(total + 7, 3, some, a.scales + 3 * i);
+            scatter_rows(total + 10, 1, some, a.opacities + i);
+            if (a.extinctions) scatter_rows(total + 11, 1, some, a.extinctions + i);
         }
     };
-    parallel_for((plan.count + chunk - 1) / chunk, threads, run);
+    parallel_for((plan.count + chunk - 1) / chunk, a.threads, run);
 }
 
-template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
-    const CompositeArgs<S>& a = b.forward;
+template <class S> int64_t composite_backward(const Call& call) {
+    Reader in(call);
+    const CompositeBackwardArgs<S> a(call, in);
     const PlanView<S>& plan = a.plan;
-    const Rises<S> stage(a.settings);
-    const Lines<S> lines(plan, a.model, stage, a.settings, a.features, a.samples, a.channels, a.threads);
     const int k_count = channels_of(a);
-    const int64_t area = int64_t(stage.tiles) * Lanes<S>::n * (2 + k_count), scratch = area + int64_t(k_count) * Lanes<S>::n;
     const int64_t entries = plan.strip_starts[plan.poses * plan.strips];
-    Buffer<S> memory(scratch * a.threads), moments(entries * kMoments), feature_slots(entries * k_count);
-    with_switches(a.settings.tangent, a.model.extinctions, k_count, [&](auto tangent, auto hides, auto channels) {
-        Workers<Batch> batches(a.threads, stage.tiles);
-        auto strip = [&](int task, int worker) {
-            S* mine = memory.data + worker * scratch;
-            composite_backward_strip<S, tangent.value, hides.value, channels.value>(b, lines, stage, task, batches[worker], mine, mine + area, moments.data, feature_slots.data);
-        };
-        parallel_for(plan.poses * plan.strips, a.threads, strip);
+    Buffer<S> moments(entries * kMoments), feature_slots(entries * k_count);
+    each_strip<S>(a, a.features, a.samples, a.channels, 2 + k_count, [&](auto projection, auto hides, auto channels, auto&&... strip) {
+        composite_backward_strip<decltype(projection), S, hides.value, channels.value>(a, strip..., moments.data, feature_slots.data);
     });
 
     constexpr int chunk = 256;
@@ -158,31 +167,31 @@ template <class S> void composite_backward(const CompositeBackwardArgs<S>& b) {
             for (int k = 0; k < k_count; ++k) {
                 S total = 0;
                 for (int64_t slot = slots[rank]; slot < slots[rank + 1]; ++slot) total += feature_slots[slot * k_count + k];
-                b.features[(int64_t(first + k / a.channels) * plan.count + i) * a.channels + k % a.channels] = total;
+                a.grad_features[(int64_t(first + k / a.channels) * plan.count + i) * a.channels + k % a.channels] = total;
             }
         }
     };
     if (k_count > 0) parallel_for(plan.poses * chunks, a.threads, gather);
-    chain(plan, a.model, a.settings, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, b.screen);
+    with_projection(a.settings.projection, [&](auto projection) { chain<decltype(projection)>(a, moments.data, a.screen); });
+    return 0;
 }
 
-template <class S, bool kTangent, bool kHides>
-void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells,
+template <class P, class S, bool kHides>
+void weigh_backward_strip(const WeightBackwardArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells,
                           S* moments) {
     constexpr int n = Lanes<S>::n;
-    const WeightArgs<S>& a = b.forward;
     const Strip<S> strip(a.plan, a.settings.height, task);
     const Vec<S> floor = splat(a.settings.transmittance_min), alpha_max = splat(a.settings.alpha_max), none = splat(S(0));
     fill(cells, int64_t(stage.tiles) * 2 * n, S(0));
     for (int pass = 0; pass < 2; ++pass) {  // first what each pixel holds in all, then the gradients
         for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * 2 * n, splat(S(1)));
-        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
+        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
             const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
             const Vec<S> per_seen = splat(line[kFeatures]), per_alpha = splat(line[kFeatures + 1]);
-            MomentSums<S, kTangent, kHides> sums;
+            MomentSums<S, P, kHides> sums;
             for (; hit < end; ++hit) {
                 S* mine = cells + int64_t(*hit) * 2 * n;
-                typename Shape<S, kTangent>::Seen seen;
+                typename Shape<S, P>::Seen seen;
                 const Vec<S> light = load(mine);
                 const Mask<S> inside = shape.look(*hit, seen), lit = at_most(floor, light);
                 const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
@@ -201,28 +210,23 @@ void weigh_backward_strip(const WeightBackwardArgs<S>& b, const Lines<S>& lines,
             }
             if (pass == 1) sums.write(moments + strip.slot(rank) * kMoments, S(kOffset));
         };
-        sweep<S, kTangent>(strip, a.plan, stage, lines, batch, AllLit(), visit);
+        sweep<P>(strip, a.plan, stage, lines, batch, AllLit(), visit);
     }
 }
 
-template <class S> void weights_backward(const WeightBackwardArgs<S>& b) {
-    const WeightArgs<S>& a = b.forward;
+template <class S> int64_t weights_backward(const Call& call) {
+    Reader in(call);
+    const WeightBackwardArgs<S> a(call, in);
     const PlanView<S>& plan = a.plan;
-    const Rises<S> stage(a.settings);
     const int64_t all = int64_t(plan.poses) * plan.count;
     Buffer<S> upstream(2 * all, false);
-    for (int64_t i = 0; i < all; ++i) upstream[2 * i] = b.grad_visible_sum[i], upstream[2 * i + 1] = b.grad_total[i];
-    const Lines<S> lines(plan, a.model, stage, a.settings, upstream.data, 1, 2, a.threads);
-    const int64_t area = int64_t(stage.tiles) * 2 * Lanes<S>::n;
-    Buffer<S> memory(area * a.threads, false), moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
-    with_switches(a.settings.tangent, a.model.extinctions, 2, [&](auto tangent, auto hides, auto) {
-        Workers<Batch> batches(a.threads, stage.tiles);
-        auto strip = [&](int task, int worker) {
-            weigh_backward_strip<S, tangent.value, hides.value>(b, lines, stage, task, batches[worker], memory.data + area * worker, moments.data);
-        };
-        parallel_for(plan.poses * plan.strips, a.threads, strip);
+    for (int64_t i = 0; i < all; ++i) upstream[2 * i] = a.grad_visible_sum[i], upstream[2 * i + 1] = a.grad_total[i];
+    Buffer<S> moments(plan.strip_starts[plan.poses * plan.strips] * kMoments);
+    each_strip<S>(a, upstream.data, 1, 2, 2, [&](auto projection, auto hides, auto, auto&&... strip) {
+        weigh_backward_strip<decltype(projection), S, hides.value>(a, strip..., moments.data);
     });
-    chain(plan, a.model, a.settings, a.threads, moments.data, b.means, b.quats, b.scales, b.opacities, b.extinctions, static_cast<S*>(nullptr));
+    with_projection(a.settings.projection, [&](auto projection) { chain<decltype(projection)>(a, moments.data, static_cast<S*>(nullptr)); });
+    return 0;
 }
 
 }  // namespace GSPARC_ISA

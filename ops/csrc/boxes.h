@@ -29,27 +29,10 @@ template <class S> GSPARC_HD Gaussian<S> gaussian(const Model<S>& model, int64_t
     return g;
 }
 
-// Rows and columns (fractional) between which a footprint lies, with a margin: rounding may not cut a pixel off.
+// Rows and columns (fractional) between which a footprint lies.
 template <class S> struct Frame {
     S bottom, top, left, right;
 };
-template <class S> GSPARC_HD Frame<S> frame_of(const Footprint<S>& f, S elevation, S column, S row, S reach, const KernelSettings<S>& settings) {
-    const S margin = S(0.01), wide = reach * S(1.0001);
-    if (settings.tangent) {
-        const S unit = wide * settings.elevation_step * settings.elevation_step;
-        const S a11 = f.k11 * unit, a12 = f.k12 * unit, a22 = f.k22 * unit;
-        const Truth<S> below = f.n[2] < 0;
-        const Extent<S> up = elevation_extent(pick(below, -elevation, elevation), pick(below, -f.n[2], f.n[2]), f.cosine, root(a11), root(a22));
-        const S bottom = pick(below, -up.high, up.low), top = pick(below, -up.low, up.high);
-        const Extent<S> across = azimuth_extent(f.n[2], f.cosine, a11, a12, a22);
-        const S per_row = 1 / settings.elevation_step, per_column = 1 / settings.azimuth_step;
-        return {(bottom - settings.first_elevation) * per_row - margin, (top - settings.first_elevation) * per_row + margin,
-                column + across.low * per_column - margin, column + across.high * per_column + margin};
-    }
-    const S half = root(wide * f.k22), across = root(wide * f.k11);
-    return {row - half - margin, row + half + margin, column - across - margin, column + across + margin};
-}
-
 // A box in whole numbers of type S, so that lanes of Gaussians are boxed together; all 0 where it holds no pixel.
 template <class S> struct Extents {
     S row0, row1, column0, columns;
@@ -100,28 +83,31 @@ template <class S> struct Sight {
     Frame<S> frame;
     S record[kRecord];
 };
-template <class S> GSPARC_HD Sight<S> sight_of(const Gaussian<S>& g, S opacity, const S* position, const S* rotation, const KernelSettings<S>& settings) {
+template <class P, class S> GSPARC_HD Sight<S> sight_of(const Gaussian<S>& g, S opacity, const S* position, const S* rotation, const KernelSettings<S>& settings) {
     Sight<S> s;
-    const Footprint<S> f = project(g, position, rotation, settings);
+    const Footprint<S> f = project<P>(g, position, rotation, settings);
     s.depth = f.r;
     const S azimuth = pick(f.cosine > 0, angle(f.n[1], f.n[0]), S(0)), elevation = angle(f.n[2], f.cosine);
     s.column = pick(f.present, (azimuth - settings.first_azimuth) * (1 / settings.azimuth_step), S(0));
     s.row = pick(f.present, (elevation - settings.first_elevation) * (1 / settings.elevation_step), S(0));
     s.reach = pick(f.present, reach2(f, opacity, settings), S(-1));
-    s.frame = frame_of(f, elevation, s.column, s.row, s.reach, settings);
+    const Frame<S> in = P::frame(f, elevation, s.column, s.row, s.reach * S(1.0001), settings);
+    const S margin = S(0.01);  // rounding may not cut a pixel off
+    s.frame = {in.bottom - margin, in.top + margin, in.left - margin, in.right + margin};
     const S middle = (f.k11 + f.k22) / 2, half = (f.k11 - f.k22) / 2;
     s.radius = root(s.reach * (middle + root(half * half + f.k12 * f.k12)));
-    write_record(f, s.column, s.row, s.reach, settings, s.record);
+    P::write(f, s.column, s.row, s.record);
+    s.record[kReach] = s.reach, s.record[kGain] = f.gain, s.record[11] = S(0);
     return s;
 }
 
 // Fills row i of everything in ProjectArgs; returns what is unsound as `unsound` does.
-template <class S> GSPARC_HD int project_one(const ProjectArgs<S>& a, int64_t i) {
+template <class P, class S> GSPARC_HD int project_one(const ProjectArgs<S>& a, int64_t i) {
     const Gaussian<S> g = gaussian(a.model, i);
     const S opacity = a.model.opacities[i];
     const int wrong = unsound(g, opacity);
     if (wrong >= 0) return wrong;
-    const Sight<S> s = sight_of(g, opacity, a.model.positions + 3 * a.pose, a.model.rotations + 9 * a.pose, a.settings);
+    const Sight<S> s = sight_of<P>(g, opacity, a.model.positions + 3 * a.pose, a.model.rotations + 9 * a.pose, a.settings);
     a.depths[i] = s.depth, a.radii[i] = 0;
     a.means2d[2 * i] = s.column, a.means2d[2 * i + 1] = s.row;
     a.visible[i] = false;

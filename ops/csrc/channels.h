@@ -11,6 +11,17 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+template <class S> struct ChannelArgs {
+    int samples, count, antennas, subcarriers, threads;
+    double first, step;             // frequencies [Hz]
+    const S *gains, *steering;      // (B, N, 2), (N, A, 2); complex numbers are pairs
+    const double* delays;           // (N,) [s]
+    ChannelArgs(const Call& call, Reader& in) : threads(call.threads), first(call.numbers[0]), step(call.numbers[1]) {
+        in.sizes(samples, count, antennas, subcarriers);
+        in.read(gains, steering, delays);
+    }
+};
+
 constexpr int kSourcesAtOnce = 4, kSourceChunks = 16;
 
 template <class S> inline int padded_tones(int subcarriers) { return (subcarriers + Lanes<S>::n - 1) / Lanes<S>::n * Lanes<S>::n; }
@@ -69,7 +80,10 @@ template <class S> inline void add_sources(int antennas, int padded, const S* to
         }
 }
 
-template <class S> void channels(const ChannelArgs<S>& a) {
+template <class S> int64_t channels(const Call& call) {
+    Reader in(call);
+    const ChannelArgs<S> a(call, in);
+    S* const channels = in.next<S>();  // (B, A, K, 2)
     const int padded = padded_tones<S>(a.subcarriers), antennas = a.antennas;
     const int64_t plane = int64_t(2) * antennas * padded, chunk = (a.count + kSourceChunks - 1) / kSourceChunks;
     const int64_t scratch = int64_t(kSourcesAtOnce) * 2 * (padded + antennas);
@@ -98,7 +112,7 @@ template <class S> void channels(const ChannelArgs<S>& a) {
     parallel_for(kSourceChunks, a.threads, run);
     auto gather = [&](int task, int) {
         const int64_t sample = task / antennas, antenna = task % antennas;
-        S* out = a.out + (sample * antennas + antenna) * a.subcarriers * 2;
+        S* out = channels + (sample * antennas + antenna) * a.subcarriers * 2;
         for (int k = 0; k < a.subcarriers; ++k) {
             S re = 0, im = 0;
             for (int part = 0; part < kSourceChunks; ++part) {
@@ -109,10 +123,16 @@ template <class S> void channels(const ChannelArgs<S>& a) {
         }
     };
     parallel_for(a.samples * antennas, a.threads, gather);
+    return 0;
 }
 
-template <class S> void channels_backward(const ChannelBackwardArgs<S>& d) {
-    const ChannelArgs<S>& a = d.forward;
+template <class S> int64_t channels_backward(const Call& call) {
+    Reader in(call);
+    const ChannelArgs<S> a(call, in);
+    const S* upstream;              // (B, A, K, 2)
+    S *gains, *steering;
+    double* delays;
+    in.read(upstream, gains, steering, delays);
     constexpr int n = Lanes<S>::n, chunk = 64;
     const int padded = padded_tones<S>(a.subcarriers), antennas = a.antennas;
     const int64_t rows = int64_t(a.samples) * antennas, scratch = int64_t(2) * padded + 2 * antennas;
@@ -120,7 +140,7 @@ template <class S> void channels_backward(const ChannelBackwardArgs<S>& d) {
     for (int k = 0; k < a.subcarriers; ++k) tone[k] = S(k);
     auto split = [&](int row, int) {
         for (int k = 0; k < a.subcarriers; ++k)
-            for (int part = 0; part < 2; ++part) slopes[(int64_t(row) * 2 + part) * padded + k] = d.slope[(int64_t(row) * a.subcarriers + k) * 2 + part];
+            for (int part = 0; part < 2; ++part) slopes[(int64_t(row) * 2 + part) * padded + k] = upstream[(int64_t(row) * a.subcarriers + k) * 2 + part];
     };
     parallel_for(int(rows), a.threads, split);
     auto run = [&](int task, int worker) {
@@ -151,14 +171,15 @@ template <class S> void channels_backward(const ChannelBackwardArgs<S>& d) {
                     const double sum_re = a.first * r + a.step * hr, sum_im = a.first * m + a.step * hm;
                     by_delay += 6.283185307179586 * (w_im * sum_re - w_re * sum_im);
                 }
-                S* to = d.gains + 2 * (int64_t(sample) * a.count + i);
+                S* to = gains + 2 * (int64_t(sample) * a.count + i);
                 to[0] = by_gain[0], to[1] = by_gain[1];
             }
-            memcpy(d.steering + 2 * i * antennas, by_steering, 2 * antennas * sizeof(S));
-            d.delays[i] = by_delay;
+            memcpy(steering + 2 * i * antennas, by_steering, 2 * antennas * sizeof(S));
+            delays[i] = by_delay;
         }
     };
     parallel_for(int((a.count + chunk - 1) / chunk), a.threads, run);
+    return 0;
 }
 
 }  // namespace GSPARC_ISA

@@ -5,20 +5,20 @@
 
 namespace gsparc {
 
-namespace baseline {
-extern const Kernels<float> single_kernels;
-extern const Kernels<double> double_kernels;
-}  // namespace baseline
+// Instruction sets, the fastest first.
 #ifdef GSPARC_X86
-namespace avx2 {
-extern const Kernels<float> single_kernels;
-extern const Kernels<double> double_kernels;
-}  // namespace avx2
-namespace avx512 {
-extern const Kernels<float> single_kernels;
-extern const Kernels<double> double_kernels;
-}  // namespace avx512
+#define GSPARC_SETS(X) X(avx512) X(avx2) X(baseline)
+#else
+#define GSPARC_SETS(X) X(baseline)
 #endif
+
+#define X(set)                                   \
+    namespace set {                              \
+    extern const Kernels<float> single_kernels;  \
+    extern const Kernels<double> double_kernels; \
+    }
+GSPARC_SETS(X)
+#undef X
 
 namespace {
 
@@ -28,13 +28,9 @@ struct Set {
     const Kernels<double>& twice;
 };
 
-const Set kSets[] = {
-#ifdef GSPARC_X86
-    {"avx512", avx512::single_kernels, avx512::double_kernels},
-    {"avx2", avx2::single_kernels, avx2::double_kernels},
-#endif
-    {"baseline", baseline::single_kernels, baseline::double_kernels},
-};
+#define X(set) {#set, set::single_kernels, set::double_kernels},
+const Set kSets[] = {GSPARC_SETS(X)};
+#undef X
 constexpr int kCount = sizeof kSets / sizeof kSets[0];
 
 bool runs(const char* name) {

@@ -10,7 +10,7 @@
 #include <math.h>
 
 #ifndef GSPARC_HD
-#define GSPARC_HD inline
+#define GSPARC_HD inline __attribute__((always_inline))
 #endif
 #ifndef GSPARC_ISA
 #define GSPARC_ISA baseline
@@ -84,7 +84,7 @@ template <class S> struct Footprint {
     S unit[4], norm;                        // quaternion of length 1 and the length it came with (0: undefined)
     S axis[3][3];                           // a_i, receiver frame
     S sigma[3], along1[3], along2[3], b[3]; // e1.a_i, e2.a_i, n.a_i
-    S stretch1, stretch2, bound2;           // px per radian; squared cosine that bounds the first
+    S stretch1, stretch2;                   // px per radian
     S k11, k12, k22;                        // with the low-pass
     S y[3], length_y, area, det;
     S root_a, root_b, rho;
@@ -98,7 +98,8 @@ template <class S> GSPARC_HD void rotation_of(const S* q, S m[9]) {
     m[6] = 2 * (x * z - w * y), m[7] = 2 * (y * z + w * x), m[8] = 1 - 2 * (x * x + y * y);
 }
 
-template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S* position, const S* rotation, const KernelSettings<S>& settings) {
+// P is a projection: a class in projection/.
+template <class P, class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S* position, const S* rotation, const KernelSettings<S>& settings) {
     Footprint<S> f;
     S x[3], d[3] = {g.mean[0] - position[0], g.mean[1] - position[1], g.mean[2] - position[2]};
     for (int k = 0; k < 3; ++k) x[k] = rotation[k] * d[0] + rotation[3 + k] * d[1] + rotation[6 + k] * d[2];
@@ -126,8 +127,7 @@ template <class S> GSPARC_HD Footprint<S> project(const Gaussian<S>& g, const S*
             f.axis[i][k] = rotation[k] * turn[i] + rotation[3 + k] * turn[3 + i] + rotation[6 + k] * turn[6 + i];
 
     f.stretch2 = 1 / settings.elevation_step;
-    f.bound2 = f.cosine * f.cosine + settings.elevation_step * settings.elevation_step;
-    f.stretch1 = settings.tangent ? f.stretch2 : 1 / (root(f.bound2) * settings.azimuth_step);
+    f.stretch1 = P::stretch(f, settings);
     f.k11 = settings.low_pass, f.k12 = S(0), f.k22 = settings.low_pass;
     S spread = 0;
     for (int i = 0; i < 3; ++i) {
@@ -163,25 +163,16 @@ template <class S> struct Gradients {
     S mean[3], quat[4], scale[3], opacity, extinction, screen[2];
 };
 
-template <class S> GSPARC_HD Gradients<S> project_backward(
+template <class P, class S> GSPARC_HD Gradients<S> project_backward(
     const Footprint<S>& f, const Moments<S>& m, S opacity, S extinction, const S* rotation, const KernelSettings<S>& settings) {
     Gradients<S> out;
     out.opacity = f.gain * m.emits, out.extinction = f.gain * m.hides;
-    const S step = settings.elevation_step;
-    // On the axis itself azimuth and elevation have no slope; of what `equirect` needs only the area has one.
-    const Truth<S> smooth = settings.tangent ? f.cosine >= 0 : f.cosine > 0;
+    const Truth<S> smooth = P::smooth(f);
 
-    // Displacement (d1, d2) of n along (e1, e2) [rad]; for `tangent` p and q move by -(d + q (q . d)).
+    // Slopes by p and q, then by the displacement (d1, d2) of n along (e1, e2) [rad].
     const S dp = f.root_a * m.tau1, dq = f.root_b * m.tau2 - f.root_a * f.rho * m.tau1;
     S g1, g2;
-    if (settings.tangent) {
-        const S hq = m.h_tau2 / f.root_b, hp = m.h_tau1 / f.root_a + f.rho * hq;
-        g1 = dp / step + hp * step, g2 = dq / step + hq * step;
-        out.screen[0] = g1 * step, out.screen[1] = g2 * step;
-    } else {
-        out.screen[0] = dp, out.screen[1] = dq;
-        g1 = pick(smooth, dp / (f.cosine * settings.azimuth_step), S(0)), g2 = pick(smooth, dq / step, S(0));
-    }
+    P::displace(f, m, dp, dq, smooth, settings, g1, g2, out.screen);
 
     // (A, B, rho) and the gain -> (k11, k12, k22, area), written so that no square of det appears.
     const S g_gain = opacity * m.emits + extinction * m.hides;
@@ -214,12 +205,7 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
         g2 += g_b[i] * f.along2[i] - pick(smooth, u2 * f.sigma[i] * f.b[i], S(0));
         twist += f.sigma[i] * (u1 * f.along2[i] - u2 * f.along1[i]);
     }
-    if (!settings.tangent) {
-        // East and north turn about n by d1 tan(elevation), and the stretch of the columns depends on it.
-        g1 += pick(smooth, twist * f.n[2] / f.cosine, S(0));
-        g_stretch1 += g_area * f.area / f.stretch1;
-        g2 += g_stretch1 * f.stretch1 * f.cosine * f.n[2] / f.bound2;
-    }
+    P::turn(f, twist, g_area, g_stretch1, smooth, settings, g1, g2);
 
     S g_r = 0;
     for (int i = 0; i < 3; ++i) out.scale[i] = g_sigma[i] / f.r, g_r -= g_sigma[i] * f.sigma[i] / f.r;
@@ -248,35 +234,6 @@ template <class S> GSPARC_HD Gradients<S> project_backward(
 template <class S> GSPARC_HD S reach2(const Footprint<S>& f, S strongest, const KernelSettings<S>& settings) {
     const S strength = f.gain * strongest, peak = settings.relative ? pick(strength > 0, S(1), S(0)) : strength;
     return pick((peak >= settings.alpha_min) & (peak > 0), 2 * logarithm(peak / settings.alpha_min), S(-1));
-}
-
-template <class S> struct Extent {
-    S low, high;
-};
-
-// Elevations [rad] that a footprint of tangent half widths (p, q) around elevation >= 0 (with its sine, cosine) can reach:
-// a bound, exact upwards. Along p = const the elevation rises with q and then falls, so its least is at an end.
-template <class S> GSPARC_HD Extent<S> elevation_extent(S elevation, S sine, S cosine, S p, S q) {
-    const S half_turn = S(1.5707963267948966);
-    S z[2], across[2];
-    for (int k = 0; k < 2; ++k) {
-        const S away = k ? q : -q, forward = cosine - away * sine;
-        z[k] = sine + away * cosine;
-        across[k] = root(pick(z[k] > 0, forward * forward + p * p, forward * forward));
-    }
-    const Truth<S> first = z[0] * across[1] < z[1] * across[0];  // the lower of the two, without their angles
-    const S low = angle(pick(first, z[0], z[1]), pick(first, across[0], across[1])), top = elevation + angle(q, S(1));
-    return {pick(low < half_turn, low, half_turn), pick(top < half_turn, top, half_turn)};
-}
-
-// Azimuths [rad] relative to the centre that a `tangent` footprint reaches: tangent lines from the axis.
-// a11, a12, a22: covariance times squared reach [rad^2]. Half a turn to each side where it holds the pole.
-template <class S> GSPARC_HD Extent<S> azimuth_extent(S sine, S cosine, S a11, S a12, S a22) {
-    const S d = cosine * cosine - sine * sine * a22;
-    const S pi = S(3.141592653589793);
-    const Truth<S> apart = (d > S(1e-4) * cosine * cosine) & (d > 0);
-    const S middle = sine * a12, radius = root(middle * middle + a11 * d);
-    return {pick(apart, angle(middle - radius, d), -pi), pick(apart, angle(middle + radius, d), pi)};
 }
 
 }  // namespace GSPARC_ISA

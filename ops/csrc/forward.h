@@ -6,24 +6,56 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+template <class S> struct CompositeArgs : ViewArgs<S> {
+    int samples, channels;
+    const S* features;              // (B, N, C)
+    S *image, *transmittance;       // (B, C, H, W), (P, H, W)
+    CompositeArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) {
+        in.sizes(samples, channels);
+        in.read(features, image, transmittance);
+    }
+};
+
+// Channels of one pose: those of all samples where they share it.
+template <class S> inline int channels_of(const CompositeArgs<S>& a) { return Lines<S>::per_pose(a.plan, a.samples, a.channels); }
+
+template <class S> struct WeightArgs : ViewArgs<S> {
+    S *visible_sum, *total;         // (P, N): sums over pixels of alpha T and alpha
+    WeightArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) { in.read(visible_sum, total); }
+};
+
 // No std::integral_constant: nothing of the standard library is compiled per instruction set.
 template <class T, T kValue> struct Constant {
     static constexpr T value = kValue;
 };
 
-// Calls run(kTangent, kHides, kChannels) with the switches as constants; kChannels 0 stands for any number.
-template <class F> inline void with_switches(bool tangent, bool hides, int channels, F run) {
-    const auto most = [&](auto t, auto h) {
-        if (channels == 1) run(t, h, Constant<int, 1>());
-        else if (channels == 2) run(t, h, Constant<int, 2>());
-        else run(t, h, Constant<int, 0>());
+// Calls run(P, kHides, kChannels) with the switches as constants; kChannels 0 stands for any number.
+template <class F> inline void with_switches(int projection, bool hides, int channels, F run) {
+    const auto most = [&](auto p, auto h) {
+        if (channels == 1) run(p, h, Constant<int, 1>());
+        else if (channels == 2) run(p, h, Constant<int, 2>());
+        else run(p, h, Constant<int, 0>());
     };
-    const auto some = [&](auto t) { hides ? most(t, Constant<bool, true>()) : most(t, Constant<bool, false>()); };
-    tangent ? some(Constant<bool, true>()) : some(Constant<bool, false>());
+    with_projection(projection, [&](auto p) { hides ? most(p, Constant<bool, true>()) : most(p, Constant<bool, false>()); });
+}
+
+// Calls run(P, kHides, kChannels, lines, stage, task, batch, memory) for every strip of a plan, in parallel. The memory is
+// uninitialised: so many `vectors` for each tile, and for one tile more.
+template <class S, class F>
+void each_strip(const ViewArgs<S>& a, const S* features, int samples, int channels, int vectors, F run) {
+    with_switches(a.settings.projection, a.model.extinctions, Lines<S>::per_pose(a.plan, samples, channels), [&](auto projection, auto hides, auto constant) {
+        const Rises<S> stage(projection, a.settings);
+        const Lines<S> lines(projection, a.plan, a.model, stage, features, samples, channels, a.threads);
+        const int64_t each = int64_t(stage.tiles + 1) * Lanes<S>::n * vectors;
+        Buffer<S> memory(each * a.threads, false);
+        Workers<Batch> batches(a.threads, stage.tiles);
+        auto strip = [&](int task, int worker) { run(projection, hides, constant, lines, stage, task, batches[worker], memory.data + worker * each); };
+        parallel_for(a.plan.poses * a.plan.strips, a.threads, strip);
+    });
 }
 
 // A cell holds what one tile accumulates: transmittance, then the channels, Lanes<S>::n numbers each.
-template <class S, bool kTangent, bool kHides, int kChannels>
+template <class P, class S, bool kHides, int kChannels>
 void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* cells) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
@@ -32,13 +64,13 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
     fill(cells, int64_t(stage.tiles) * cell, S(0));
     for (int tile = 0; tile < stage.tiles; ++tile) store(cells + int64_t(tile) * cell, splat(S(1)));
     const Lights<S> lights = {cells, cell, floor};
-    const auto visit = [&](const S* line, int, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
+    const auto visit = [&](const S* line, int, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
         Vec<S> feature[kChannels ? kChannels : 1];
         for (int k = 0; k < kChannels; ++k) feature[k] = splat(line[kFeatures + k]);
         for (; hit < end; ++hit) {
             S* mine = cells + int64_t(*hit) * cell;
-            typename Shape<S, kTangent>::Seen seen;
+            typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(mine);
             const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
             const Layer<S, kHides> layer(seen.form, counts, opacity, extinction, alpha_max);
@@ -50,7 +82,7 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
             }
         }
     };
-    sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
+    sweep<P>(strip, a.plan, stage, lines, batch, lights, visit);
     const int64_t pixels = int64_t(a.settings.height) * a.settings.width;
     S *image = a.image + strip.pose * k_count * pixels, *transmittance = a.transmittance + strip.pose * pixels;
     each_stretch<S>(strip, a.settings.width, [&](int tile, int lane, int64_t pixel, int count) {
@@ -60,32 +92,27 @@ void composite_strip(const CompositeArgs<S>& a, const Lines<S>& lines, const Ris
     });
 }
 
-template <class S> void composite(const CompositeArgs<S>& a) {
-    const Rises<S> stage(a.settings);
-    const Lines<S> lines(a.plan, a.model, stage, a.settings, a.features, a.samples, a.channels, a.threads);
-    const int64_t scratch = int64_t(stage.tiles) * Lanes<S>::n * (1 + channels_of(a));
-    with_switches(a.settings.tangent, a.model.extinctions, channels_of(a), [&](auto tangent, auto hides, auto channels) {
-        Buffer<S> memory(scratch * a.threads, false);
-        Workers<Batch> batches(a.threads, stage.tiles);
-        auto strip = [&](int task, int worker) {
-            composite_strip<S, tangent.value, hides.value, channels.value>(a, lines, stage, task, batches[worker], memory.data + worker * scratch);
-        };
-        parallel_for(a.plan.poses * a.plan.strips, a.threads, strip);
+template <class S> int64_t composite(const Call& call) {
+    Reader in(call);
+    const CompositeArgs<S> a(call, in);
+    each_strip<S>(a, a.features, a.samples, a.channels, 1 + channels_of(a), [&](auto projection, auto hides, auto channels, auto&&... strip) {
+        composite_strip<decltype(projection), S, hides.value, channels.value>(a, strip...);
     });
+    return 0;
 }
 
-template <class S, bool kTangent, bool kHides>
+template <class P, class S, bool kHides>
 void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before, S* sums) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
     const Vec<S> floor = splat(a.settings.transmittance_min), alpha_max = splat(a.settings.alpha_max), none = splat(S(0));
     fill(before, int64_t(stage.tiles) * n, S(1));
-    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
+    const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
         const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
         Vec<S> seen_sum = none, total = none;
         for (; hit < end; ++hit) {
             S* mine = before + int64_t(*hit) * n;
-            typename Shape<S, kTangent>::Seen seen;
+            typename Shape<S, P>::Seen seen;
             const Vec<S> light = load(mine);
             const Mask<S> inside = shape.look(*hit, seen), lit = at_most(floor, light);
             const Layer<S, kHides> layer(seen.form, inside, opacity, extinction, alpha_max);
@@ -96,20 +123,15 @@ void weigh_strip(const WeightArgs<S>& a, const Lines<S>& lines, const Rises<S>& 
         S* slot = sums + 2 * strip.slot(rank);
         slot[0] = sum<S>(seen_sum), slot[1] = sum<S>(total);
     };
-    sweep<S, kTangent>(strip, a.plan, stage, lines, batch, AllLit(), visit);
+    sweep<P>(strip, a.plan, stage, lines, batch, AllLit(), visit);
 }
 
-template <class S> void weights(const WeightArgs<S>& a) {
-    const Rises<S> stage(a.settings);
-    const Lines<S> lines(a.plan, a.model, stage, a.settings, nullptr, 0, 0, a.threads);
-    const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
-    Buffer<S> memory(area * a.threads, false), sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
-    with_switches(a.settings.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
-        Workers<Batch> batches(a.threads, stage.tiles);
-        auto strip = [&](int task, int worker) {
-            weigh_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area, sums.data);
-        };
-        parallel_for(a.plan.poses * a.plan.strips, a.threads, strip);
+template <class S> int64_t weights(const Call& call) {
+    Reader in(call);
+    const WeightArgs<S> a(call, in);
+    Buffer<S> sums(2 * a.plan.strip_starts[a.plan.poses * a.plan.strips]);
+    each_strip<S>(a, nullptr, 0, 0, 1, [&](auto projection, auto hides, auto, auto&&... strip) {
+        weigh_strip<decltype(projection), S, hides.value>(a, strip..., sums.data);
     });
     constexpr int chunk = 1024;
     const int chunks = (a.plan.count + chunk - 1) / chunk;
@@ -125,6 +147,7 @@ template <class S> void weights(const WeightArgs<S>& a) {
         }
     };
     parallel_for(a.plan.poses * chunks, a.threads, gather);
+    return 0;
 }
 
 }  // namespace GSPARC_ISA

@@ -5,8 +5,28 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+template <class S> struct FreezeArgs : ViewArgs<S> {  // of one pose
+    int64_t* starts;                // (strips + 1), first block of each strip; [1:] is counted while heads is null
+    int32_t* heads;                 // (blocks, 2) rank and tile of the strip
+    S* weights;                     // (blocks, lanes)
+    FreezeArgs(const Call& call, Reader& in) : ViewArgs<S>(call, in) { in.read(starts, heads, weights); }
+};
+
+template <class S> struct ThawArgs {
+    int channels, height, width, threads;
+    const int64_t* starts;
+    const int32_t* heads;
+    const S *weights, *features;    // features (V, K) by rank
+    S* image;                       // (K, H, W)
+    explicit ThawArgs(const Call& call) : threads(call.threads) {
+        Reader in(call);
+        in.sizes(channels, height, width);
+        in.read(starts, heads, weights, features, image);
+    }
+};
+
 // Counts the blocks of a strip (heads null) or writes them, tile by tile and front to back within a tile.
-template <class S, bool kTangent, bool kHides>
+template <class P, class S, bool kHides>
 void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>& stage, int task, Batch& batch, S* before) {
     constexpr int n = Lanes<S>::n;
     const Strip<S> strip(a.plan, a.settings.height, task);
@@ -22,10 +42,10 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
             }
         }
         fill(before, int64_t(stage.tiles) * n, S(1));
-        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, kTangent>& shape) __attribute__((always_inline)) {
+        const auto visit = [&](const S* line, int rank, const int32_t* hit, const int32_t* end, const Shape<S, P>& shape) __attribute__((always_inline)) {
             const Vec<S> opacity = splat(line[kOpacity]), extinction = splat(line[kExtinction]);
             for (; hit < end; ++hit) {
-                typename Shape<S, kTangent>::Seen seen;
+                typename Shape<S, P>::Seen seen;
                 const Vec<S> light = load(before + *hit * n);
                 const Mask<S> counts = shape.look(*hit, seen) & at_most(floor, light);
                 if (!any(counts)) continue;
@@ -38,7 +58,7 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
                 store(a.weights + block * n, weight);
             }
         };
-        sweep<S, kTangent>(strip, a.plan, stage, lines, batch, lights, visit);
+        sweep<P>(strip, a.plan, stage, lines, batch, lights, visit);
     }
     if (a.heads) return;
     int64_t total = 0;
@@ -46,17 +66,12 @@ void freeze_strip(const FreezeArgs<S>& a, const Lines<S>& lines, const Rises<S>&
     a.starts[task + 1] = total;
 }
 
-template <class S> int freeze(const FreezeArgs<S>& a) {
-    const Rises<S> stage(a.settings);
-    const Lines<S> lines(a.plan, a.model, stage, a.settings, nullptr, 0, 0, a.threads);
-    const int64_t area = int64_t(stage.tiles) * Lanes<S>::n;
-    Buffer<S> memory(area * a.threads, false);
-    with_switches(a.settings.tangent, a.model.extinctions, 1, [&](auto tangent, auto hides, auto) {
-        Workers<Batch> batches(a.threads, stage.tiles);
-        auto strip = [&](int task, int worker) {
-            freeze_strip<S, tangent.value, hides.value>(a, lines, stage, task, batches[worker], memory.data + worker * area);
-        };
-        parallel_for(a.plan.strips, a.threads, strip);
+// Returns the lanes of a block.
+template <class S> int64_t freeze(const Call& call) {
+    Reader in(call);
+    const FreezeArgs<S> a(call, in);
+    each_strip<S>(a, nullptr, 0, 0, 1, [&](auto projection, auto hides, auto, auto&&... strip) {
+        freeze_strip<decltype(projection), S, hides.value>(a, strip...);
     });
     return Lanes<S>::n;
 }
@@ -96,11 +111,13 @@ template <class S> void thaw_strip(const ThawArgs<S>& a, int task, S* cells) {
     });
 }
 
-template <class S> void thaw(const ThawArgs<S>& a) {
+template <class S> int64_t thaw(const Call& call) {
+    const ThawArgs<S> a(call);
     const int64_t scratch = int64_t(tiles_across<S>(a.width)) * Lanes<S>::n * a.channels;
     Buffer<S> memory(scratch * a.threads);
     auto strip = [&](int task, int worker) { thaw_strip<S>(a, task, memory.data + worker * scratch); };
-    parallel_for((a.height + kStripRows - 1) / kStripRows, a.threads, strip);
+    parallel_for(strips_of(a.height), a.threads, strip);
+    return 0;
 }
 
 }  // namespace GSPARC_ISA

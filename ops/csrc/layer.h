@@ -23,7 +23,7 @@ template <class S, bool kHides> struct Layer {
 };
 
 // The sums of Moments over blocks of lanes.
-template <class S, bool kTangent, bool kHides> struct MomentSums {
+template <class S, class P, bool kHides> struct MomentSums {
     Vec<S> tau1{}, tau2{}, h1{}, h2{}, tau11{}, tau12{}, tau22{}, emits{}, hides{};
 
     // d_alpha, d_gamma: loss by emitted and hidden share; without kHides the first holds both.
@@ -42,7 +42,7 @@ template <class S, bool kTangent, bool kHides> struct MomentSums {
         const Vec<S> e1 = e * t1, e2 = e * t2;
         tau1 += e1, tau2 += e2;
         tau11 = fma(e1, t1, tau11), tau12 = fma(e1, t2, tau12), tau22 = fma(e2, t2, tau22);
-        if (kTangent) {
+        if (P::kCubic) {
             form = select(counts, form, none);
             h1 = fma(form, e1, h1), h2 = fma(form, e2, h2);
         }

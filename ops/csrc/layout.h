@@ -1,4 +1,4 @@
-// What the kernels, the plan and the bindings hand each other. Plain data.
+// What Python, the plan and the kernels hand each other. Plain data.
 #pragma once
 #include <stdint.h>
 
@@ -6,9 +6,12 @@ namespace gsparc {
 
 // Grid, optics and thresholds; `KernelSettings` of settings.py has the same fields in the same order.
 #define GSPARC_SETTINGS(X) \
-    X(int, height) X(int, width) X(bool, periodic) X(bool, tangent) X(bool, compensate) X(bool, relative) \
+    X(int, height) X(int, width) X(int, projection) X(bool, periodic) X(bool, compensate) X(bool, relative) \
     X(S, first_elevation) X(S, first_azimuth) X(S, elevation_step) X(S, azimuth_step) X(S, low_pass) X(S, near) \
     X(S, alpha_min) X(S, transmittance_min) X(S, alpha_max) X(S, horizon_cosine)
+
+// Class in projection/ and name of each projection, in the order of `PROJECTIONS` of projection.py.
+#define GSPARC_PROJECTIONS(X) X(Tangent, tangent) X(Equirect, equirect)
 
 template <class S> struct KernelSettings {
 #define X(type, name) type name;
@@ -16,7 +19,7 @@ template <class S> struct KernelSettings {
 #undef X
 };
 
-template <class S> KernelSettings<S> in_precision(const KernelSettings<double>& from) {
+template <class S, class From> KernelSettings<S> in_precision(const KernelSettings<From>& from) {
     KernelSettings<S> to;
 #define X(type, name) to.name = type(from.name);
     GSPARC_SETTINGS(X)
@@ -29,8 +32,6 @@ constexpr int kMoments = 9;     // scalars of Moments
 constexpr int kLanes = 16;      // most pixels done at a time by any instruction set
 
 constexpr int64_t kUnsoundPose = int64_t(1) << 62;  // what a plan returns of a pose; of a Gaussian 4 i + parameter
-
-constexpr int kMarkPixels = 384, kMarkRounds = 64, kMarkPairs = kMarkPixels * kMarkRounds;  // see machine_limits.h
 
 // A strip is kStripRows rows of the image, the unit of work. Row-wise strips let azimuth wrap without tiles.
 constexpr int kStripRows = 4;
@@ -63,11 +64,26 @@ template <class S> struct Model {
     const S *positions, *rotations;                             // (P, 3), (P, 3, 3)
 };
 
-// Reads addresses of tensors one after the other; 0, or one left out at the end, is an absent tensor.
+// One call of a kernel from Python; `Call` of calls.py has the same fields. What sizes, numbers and tensors mean is the
+// kernel's business. An address of 0 is an absent tensor.
+struct Call {
+    int32_t twice, threads, device;
+    int32_t built_for, driver;  // CUDA versions
+    int32_t sizes[8];
+    KernelSettings<double> settings;
+    double numbers[8];
+    uint64_t tensors[32];
+    uint64_t scratch, stream;  // of the CUDA kernels
+};
+
+// Reads a call's sizes and tensors one after the other.
 struct Reader {
-    const uint64_t *at, *end;
-    template <class T> T* next() { return at < end ? reinterpret_cast<T*>(uintptr_t(*at++)) : nullptr; }
+    const int32_t* size;
+    const uint64_t* tensor;
+    explicit Reader(const Call& call) : size(call.sizes), tensor(call.tensors) {}
+    template <class T> T* next() { return reinterpret_cast<T*>(uintptr_t(*tensor++)); }
     template <class... T> void read(T*&... to) { ((to = next<T>()), ...); }
+    template <class... T> void sizes(T&... to) { ((to = *size++), ...); }
 };
 
 template <class S> Model<S> read_model(Reader& in) {
@@ -75,5 +91,21 @@ template <class S> Model<S> read_model(Reader& in) {
     in.read(m.means, m.quats, m.scales, m.opacities, m.extinctions, m.positions, m.rotations);
     return m;
 }
+
+inline int strips_of(int height) { return (height + kStripRows - 1) / kStripRows; }
+
+// What calls on a plan begin with: P and N; the plan, the Gaussians and the poses.
+template <class S> struct ViewArgs {
+    PlanView<S> plan;
+    Model<S> model;
+    KernelSettings<S> settings;
+    int threads;
+    ViewArgs(const Call& call, Reader& in) : settings(in_precision<S>(call.settings)), threads(call.threads) {
+        in.sizes(plan.poses, plan.count);
+        plan.strips = strips_of(settings.height);
+        in.read(plan.records, plan.boxes, plan.order, plan.shown, plan.slots, plan.strip_starts, plan.entries);
+        model = read_model<S>(in);
+    }
+};
 
 }  // namespace gsparc

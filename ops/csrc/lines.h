@@ -7,7 +7,7 @@ namespace GSPARC_ISA {
 
 // What depends on the row alone. Directions are divided by the cosine of the elevation, so that an offset is a number
 // of the column plus a number of the row: `rise` is the tangent of the elevation, `level` the horizon so divided.
-// For `equirect` rise is the row. A lane below the last row is NaN and passes no test.
+// A projection may take another `rise`. A lane below the last row is NaN and passes no test.
 template <class S> struct Rises {
     static constexpr int n = Lanes<S>::n;
     const int tiles, strips;
@@ -17,10 +17,10 @@ template <class S> struct Rises {
     const Tables<S> tables;
     const KernelSettings<Pack<S>> settings;
 
-    explicit Rises(const KernelSettings<S>& settings)
+    template <class P> Rises(P, const KernelSettings<S>& settings)
         : tiles(tiles_across<S>(settings.width)), strips((settings.height + kStripRows - 1) / kStripRows), plain(table_size(settings)),
           rise(int64_t(strips) * n), level(int64_t(strips) * n), middle(strips), half(strips), tile_cos(tiles + n), tile_sin(tiles + n),
-          across(S(kTileColumns<S> - 1) / 2 * settings.azimuth_step), tables(tables_at(settings, plain.data)), settings(widened(settings)) {
+          across(S(kTileColumns<S> - 1) / 2 * settings.azimuth_step), tables(tables_at(settings, plain.data)), settings(in_precision<Pack<S>>(settings)) {
         fill_tables(settings, plain.data);
         const double columns = kTileColumns<S>, step = settings.azimuth_step;
         fill_circle(settings.first_azimuth + (columns - 1) / 2 * step, columns * step, tiles, tile_cos.data, tile_sin.data);
@@ -32,7 +32,7 @@ template <class S> struct Rises {
                 const int row = strip * kStripRows + k / kTileColumns<S>;
                 const bool real = row < settings.height;
                 const S cosine = real && tables.cos_row[row] > least ? tables.cos_row[row] : least;
-                const S here = real ? (settings.tangent ? tables.sin_row[row] / cosine : S(row)) : S(NAN);
+                const S here = real ? P::rise(tables.sin_row[row], cosine, row) : S(NAN);
                 rise[strip * n + k] = here, level[strip * n + k] = settings.horizon_cosine / cosine;
                 if (here < low) low = here;
                 if (here > high) high = here;
@@ -44,10 +44,9 @@ template <class S> struct Rises {
 };
 
 // One Gaussian's line, side by side in depth order: its record up to the reach, then these. Offsets are in units of
-// kOffset, so that their square is the number of halvings of the footprint, which `bell` takes. For `equirect` the column
-// is that of the image of the centre that is nearest to the columns up to kSeam; of those behind it the next one is.
+// kOffset, so that their square is the number of halvings of the footprint, which `bell` takes.
 constexpr double kOffset = 1.1774100225154747, kHalvings = 1 / (kOffset * kOffset);  // sqrt(2 log 2)
-constexpr int kSeam = 5, kOpacity = 10, kExtinction = 11, kFeatures = 12;
+constexpr int kOpacity = 10, kExtinction = 11, kFeatures = 12;
 
 // Of all ranks: lines (P, N, width), K channels per pose, whole cache lines; and outlines (P, N, kOutline).
 template <class S> struct Lines {
@@ -55,7 +54,7 @@ template <class S> struct Lines {
     const int width;
     Buffer<S> rows, outlines;
 
-    Lines(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const KernelSettings<S>& settings, const S* features, int samples, int channels, int threads)
+    template <class P> Lines(P, const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const S* features, int samples, int channels, int threads)
         : width(padded(kFeatures + per_pose(plan, samples, channels))), rows(int64_t(plan.poses) * plan.count * width, false),
           outlines(int64_t(plan.poses) * plan.count * kOutline, false) {
         constexpr int chunk = 512;
@@ -73,7 +72,7 @@ template <class S> struct Lines {
                     __builtin_prefetch(soon), __builtin_prefetch(soon + kReach), __builtin_prefetch(model.opacities + later);
                     if (features) __builtin_prefetch(features + (int64_t(first) * plan.count + later) * channels);
                 }
-                fill_some(plan, model, stage, settings, pose, rank, some);
+                fill_some<P>(plan, model, stage, pose, rank, some);
                 for (int b = 0; b < count; ++b) {
                     S* to = rows.data + at * width + kFeatures + b * channels;
                     const S* from = features + int64_t(first + b) * plan.count * channels;
@@ -100,7 +99,7 @@ template <class S> struct Lines {
 
 private:
     // Ranks [rank, rank + some): everything but their features.
-    void fill_some(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, const KernelSettings<S>& settings, int pose, int rank, int some) {
+    template <class P> void fill_some(const PlanView<S>& plan, const Model<S>& model, const Rises<S>& stage, int pose, int rank, int some) {
         const int64_t at = int64_t(pose) * plan.count + rank;
         int32_t who[n];
         S opacities[n], extinctions[n];
@@ -111,20 +110,14 @@ private:
         }
         Pack<S> record[kRecord];
         gather_at(plan.records + int64_t(pose) * plan.count * kRecord, kRecord, who, kRecord, record);
-        const Outline<Pack<S>> outline = settings.tangent ? outline_of<S, true>(record, stage.settings) : outline_of<S, false>(record, stage.settings);
+        const Outline<Pack<S>> outline = P::outline(record, root(record[kReach]) * S(1.001), stage.settings);  // a little larger than life
         const Pack<S> numbers[kOutline] = {outline.column, outline.middle, outline.height, outline.lean, outline.width, outline.left, outline.right, outline.stretch};
         for (int c = 0; c < kOutline; c += 4) scatter_fours(numbers + c, kOutline, some, outlines.data + at * kOutline + c);
         const Pack<S> gain = record[kGain];
         record[kOpacity] = gain * Pack<S>(load(opacities));
         record[kExtinction] = model.extinctions ? gain * Pack<S>(load(extinctions)) : record[kOpacity];
         record[kReach] = record[kReach] * S(kHalvings);
-        for (int k = settings.tangent ? 0 : 2; k < 6; ++k) record[k] = record[k] * S(1 / kOffset);
-        if (!settings.tangent) {
-            const Pack<S> turn = stage.tables.turn, column = record[0] - downward(record[0] / turn) * turn, half = turn * S(0.5);
-            const Which<S> low = column < half;
-            record[0] = pick(low, column, column - turn), record[kSeam] = pick(low, column + half, column - half);
-            record[3] = -record[2] * record[3] * S(kOffset);
-        }
+        P::line(record, stage.tables.turn);
         for (int c = 0; c < kFeatures; c += 4) scatter_fours(record + c, width, some, rows.data + at * width + c);
     }
 };

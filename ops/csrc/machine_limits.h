@@ -3,13 +3,18 @@
 #pragma once
 #include <string.h>
 
-#include "strips.h"
+#include "projection.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
 
+constexpr int kMarkPixels = 384, kMarkRounds = 64;
+
 // sum += exp(x) at a row of pixels that stays in the first-level cache: one load, one exponential, one accumulation each.
-inline void mark_exponentials(int tasks, int threads, float* sums) {
+// Sizes: tasks. Returns how many.
+template <class S> int64_t mark_exponentials(const Call& call) {
+    const int tasks = call.sizes[0], threads = call.threads;
+    Buffer<float> sums(tasks);
     constexpr int n = Lanes<float>::n;
     Buffer<float> memory(int64_t(threads) * 2 * kMarkPixels);
     auto run = [&](int task, int worker) {
@@ -36,34 +41,56 @@ inline void mark_exponentials(int tasks, int threads, float* sums) {
         sums[task] = all;
     };
     parallel_for(tasks, threads, run);
+    return int64_t(tasks) * kMarkPixels * kMarkRounds;
 }
 
 // Copies bytes in pieces, as the kernels would move them at best.
-inline void mark_copy(const char* from, char* to, int64_t bytes, int threads) {
+// Tensors: from and to. Numbers: bytes.
+template <class S> int64_t mark_copy(const Call& call) {
+    Reader in(call);
+    const char* from = in.next<const char>();
+    char* to = in.next<char>();
+    const int64_t bytes = int64_t(call.numbers[0]);
     constexpr int64_t piece = 1 << 18;
     auto run = [&](int task, int) {
         const int64_t begin = int64_t(task) * piece, end = begin + piece < bytes ? begin + piece : bytes;
         memcpy(to + begin, from + begin, end - begin);
     };
-    parallel_for(int((bytes + piece - 1) / piece), threads, run);
+    parallel_for(int((bytes + piece - 1) / piece), call.threads, run);
+    return bytes;
+}
+
+template <class P, class S> int64_t mark_strip(const Strip<S>& strip, const Tables<S>& t, const KernelSettings<S>& settings) {
+    int64_t found = 0;
+    for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
+        const S* record = strip.records + int64_t(strip.order[*entry]) * kRecord;
+        const Runs runs = runs_of(strip.boxes[*entry], settings.width);
+        for (int row = strip.row0; row < strip.row1; ++row)
+            for (int run = 0; run < runs.count; ++run)
+                for (int column = runs.from[run]; column < runs.to[run]; column += Lanes<S>::n) {
+                    const Place<S> at = {splat(t.cos_row[row]), splat(t.sin_row[row]), splat(S(row)), load(t.cos_column + column), load(t.sin_column + column), load(t.column + column)};
+                    Vec<S> tau1, tau2, form;
+                    found += __builtin_popcount(bits_of<S>(P::offsets(record, at, t, settings, tau1, tau2, form)));
+                }
+    }
+    return found;
 }
 
 // Pixel-Gaussian pairs inside the exact footprints of a plan: the exponentials that no renderer can avoid.
-template <class S> int64_t mark_pairs(const PlanView<S>& plan, const KernelSettings<S>& settings, int threads) {
-    const TileTables<S> grid(settings);
+template <class S> int64_t mark_pairs(const Call& call) {
+    Reader in(call);
+    const ViewArgs<S> a(call, in);
+    const PlanView<S>& plan = a.plan;
+    const KernelSettings<S>& settings = a.settings;
+    Buffer<S> numbers(table_size(settings));
+    fill_tables(settings, numbers.data);
+    const Tables<S> tables = tables_at(settings, numbers.data);
     const int tasks = plan.poses * plan.strips;
     Buffer<int64_t> counts(tasks);
     auto run = [&](int task, int) {
-        const Strip<S> strip(plan, settings.height, task);
-        for (const int32_t* entry = strip.first; entry < strip.last; ++entry) {
-            Vec<S> found = splat(S(0));
-            const auto count = [&](int, Vec<S>, Vec<S>, Vec<S>, Mask<S> inside) { found += select(inside, splat(S(1)), splat(S(0))); };
-            if (settings.tangent) each_tile<S, true, false>(strip, *entry, grid, settings, Always<S>(), count);
-            else each_tile<S, false, false>(strip, *entry, grid, settings, Always<S>(), count);
-            counts[task] += int64_t(sum<S>(found));
-        }
+        counts[task] = with_projection(settings.projection, [&](auto projection) { return mark_strip<decltype(projection)>(Strip<S>(plan, settings.height, task), tables, settings); });
     };
-    parallel_for(tasks, threads, run);
+    parallel_for(tasks, a.threads, run);
     int64_t total = 0;
     for (int task = 0; task < tasks; ++task) total += counts[task];
     return total;

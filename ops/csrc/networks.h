@@ -10,6 +10,15 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+template <class S> struct NetworkArgs {
+    int samples, count, inputs, hidden, outputs, threads;
+    const S *encoded, *weight1, *bias1, *weight2, *bias2;  // (B, E), (N, E, H), (N, H), (N, H, C), (N, C)
+    NetworkArgs(const Call& call, Reader& in) : threads(call.threads) {
+        in.sizes(samples, count, inputs, hidden, outputs);
+        in.read(encoded, weight1, bias1, weight2, bias2);
+    }
+};
+
 constexpr int kNetworkChunk = 64, kSamplesAtOnce = 4;
 
 // Rows of C numbers, n of them, as C rows of n.
@@ -71,17 +80,20 @@ template <class S, int kSamples> GSPARC_INLINE void hidden_units(const NetworkAr
     }
 }
 
-template <class S, int kSamples> GSPARC_INLINE void network_outputs(const NetworkArgs<S>& a, const HiddenBlock<S>& block, int64_t i, int sample) {
+template <class S, int kSamples> GSPARC_INLINE void network_outputs(const NetworkArgs<S>& a, const HiddenBlock<S>& block, int64_t i, int sample, S* out) {
     const Vec<S> none = splat(S(0));
     Vec<S> inner[kSamples];
     hidden_units<S, kSamples>(a, block, sample, inner);
     for (int c = 0; c < a.outputs; ++c) {
         const Vec<S> w = load(block.second + c * Lanes<S>::n);
-        for (int b = 0; b < kSamples; ++b) a.out[(int64_t(sample + b) * a.count + i) * a.outputs + c] += sum<S>(greater<S>(inner[b], none) * w);
+        for (int b = 0; b < kSamples; ++b) out[(int64_t(sample + b) * a.count + i) * a.outputs + c] += sum<S>(greater<S>(inner[b], none) * w);
     }
 }
 
-template <class S> void networks(const NetworkArgs<S>& a) {
+template <class S> int64_t networks(const Call& call) {
+    Reader in(call);
+    const NetworkArgs<S> a(call, in);
+    S* const out = in.next<S>();  // (B, N, C)
     constexpr int n = Lanes<S>::n;
     const int64_t each = HiddenBlock<S>::scratch(a);
     Buffer<S> memory(each * a.threads);
@@ -89,21 +101,26 @@ template <class S> void networks(const NetworkArgs<S>& a) {
         const int64_t begin = int64_t(task) * kNetworkChunk, end = begin + kNetworkChunk < a.count ? begin + kNetworkChunk : a.count;
         for (int64_t i = begin; i < end; ++i) {
             for (int b = 0; b < a.samples; ++b)
-                for (int c = 0; c < a.outputs; ++c) a.out[(int64_t(b) * a.count + i) * a.outputs + c] = a.bias2[i * a.outputs + c];
+                for (int c = 0; c < a.outputs; ++c) out[(int64_t(b) * a.count + i) * a.outputs + c] = a.bias2[i * a.outputs + c];
             for (int hidden = 0; hidden < a.hidden; hidden += n) {
                 const HiddenBlock<S> block(a, i, hidden, memory.data + worker * each);
                 int sample = 0;
-                for (; sample + kSamplesAtOnce <= a.samples; sample += kSamplesAtOnce) network_outputs<S, kSamplesAtOnce>(a, block, i, sample);
-                for (; sample < a.samples; ++sample) network_outputs<S, 1>(a, block, i, sample);
+                for (; sample + kSamplesAtOnce <= a.samples; sample += kSamplesAtOnce) network_outputs<S, kSamplesAtOnce>(a, block, i, sample, out);
+                for (; sample < a.samples; ++sample) network_outputs<S, 1>(a, block, i, sample, out);
             }
         }
     };
     parallel_for((a.count + kNetworkChunk - 1) / kNetworkChunk, a.threads, run);
+    return 0;
 }
 
-template <class S> void networks_backward(const NetworkBackwardArgs<S>& d) {
+template <class S> int64_t networks_backward(const Call& call) {
+    Reader in(call);
+    const NetworkArgs<S> a(call, in);
+    const S* slope_of;              // (B, N, C)
+    S *weight1, *bias1, *weight2, *bias2;
+    in.read(slope_of, weight1, bias1, weight2, bias2);
     constexpr int n = Lanes<S>::n;
-    const NetworkArgs<S>& a = d.forward;
     const int64_t block_size = HiddenBlock<S>::scratch(a), each = block_size + int64_t(n) * (a.inputs + a.outputs);
     Buffer<S> memory(each * a.threads);
     auto run = [&](int task, int worker) {
@@ -112,8 +129,8 @@ template <class S> void networks_backward(const NetworkBackwardArgs<S>& d) {
         for (int64_t i = begin; i < end; ++i) {
             for (int c = 0; c < a.outputs; ++c) {
                 S total = 0;
-                for (int b = 0; b < a.samples; ++b) total += d.slope[(int64_t(b) * a.count + i) * a.outputs + c];
-                d.bias2[i * a.outputs + c] = total;
+                for (int b = 0; b < a.samples; ++b) total += slope_of[(int64_t(b) * a.count + i) * a.outputs + c];
+                bias2[i * a.outputs + c] = total;
             }
             for (int hidden = 0; hidden < a.hidden; hidden += n) {
                 const HiddenBlock<S> block(a, i, hidden, mine);
@@ -121,7 +138,7 @@ template <class S> void networks_backward(const NetworkBackwardArgs<S>& d) {
                 Vec<S> bias = splat(S(0));
                 fill(first, int64_t(n) * (a.inputs + a.outputs), S(0));
                 for (int b = 0; b < a.samples; ++b) {
-                    const S *slope = d.slope + (int64_t(b) * a.count + i) * a.outputs, *x = a.encoded + int64_t(b) * a.inputs;
+                    const S *slope = slope_of + (int64_t(b) * a.count + i) * a.outputs, *x = a.encoded + int64_t(b) * a.inputs;
                     Vec<S> inner, back = splat(S(0));
                     hidden_units<S, 1>(a, block, b, &inner);
                     const Mask<S> off = at_most(inner, splat(S(0)));
@@ -136,14 +153,15 @@ template <class S> void networks_backward(const NetworkBackwardArgs<S>& d) {
                 }
                 S lanes[n];
                 store(lanes, bias);
-                memcpy(d.bias1 + i * a.hidden + hidden, lanes, some * sizeof(S));
-                for (int e = 0; e < a.inputs; ++e) memcpy(d.weight1 + (i * a.inputs + e) * a.hidden + hidden, first + e * n, some * sizeof(S));
+                memcpy(bias1 + i * a.hidden + hidden, lanes, some * sizeof(S));
+                for (int e = 0; e < a.inputs; ++e) memcpy(weight1 + (i * a.inputs + e) * a.hidden + hidden, first + e * n, some * sizeof(S));
                 for (int h = 0; h < some; ++h)
-                    for (int c = 0; c < a.outputs; ++c) d.weight2[(i * a.hidden + hidden + h) * a.outputs + c] = second[c * n + h];
+                    for (int c = 0; c < a.outputs; ++c) weight2[(i * a.hidden + hidden + h) * a.outputs + c] = second[c * n + h];
             }
         }
     };
     parallel_for((a.count + kNetworkChunk - 1) / kNetworkChunk, a.threads, run);
+    return 0;
 }
 
 }  // namespace GSPARC_ISA

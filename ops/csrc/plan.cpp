@@ -1,5 +1,4 @@
-#include "plan.h"
-
+// Order and bins: which strip holds which footprints, front to back.
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -8,11 +7,24 @@
 #include <utility>
 #include <vector>
 
+#include "kernels.h"
 #include "pool.h"
 #include "workspace.h"
 
 namespace gsparc {
 namespace {
+
+template <class S> struct PlanArgs {
+    Model<S> model;                    // opacities: the larger of opacity and extinction
+    const int64_t* ids;                // (N,) or null: the row number
+    int poses, count, strips, threads;
+    KernelSettings<S> settings;
+    S *records, *means2d, *radii;      // (P, N, kRecord) by depth; (P, N, 2) and (P, N) by Gaussian
+    bool* visible;                     // (P, N)
+    Box* boxes;                        // (P, N) by depth
+    int32_t *order, *shown;            // (P, N), (P,)
+    int64_t *slots, *strip_starts;     // (P, N + 1), (P strips + 1)
+};
 
 template <class S> using Bits = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
 
@@ -103,8 +115,6 @@ public:
 private:
     std::vector<int32_t> steps_;
 };
-
-}  // namespace
 
 template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     const int64_t count = a.count;
@@ -244,9 +254,26 @@ template <class S> void fill_entries(const PlanView<S>& plan, int threads, int32
     parallel_for(plan.poses * bins.chunks, threads, write);
 }
 
-template int64_t make_plan(const PlanArgs<float>&);
-template int64_t make_plan(const PlanArgs<double>&);
-template void fill_entries(const PlanView<float>&, int, int32_t*);
-template void fill_entries(const PlanView<double>&, int, int32_t*);
+template <class S> int64_t plan_of(const Call& call) {
+    Reader in(call);
+    PlanArgs<S> a;
+    in.sizes(a.poses, a.count);
+    a.threads = call.threads, a.settings = in_precision<S>(call.settings), a.strips = strips_of(a.settings.height);
+    a.model = read_model<S>(in);
+    in.read(a.ids, a.records, a.boxes, a.order, a.shown, a.slots, a.strip_starts, a.means2d, a.radii, a.visible);
+    return make_plan(a);
+}
+
+template <class S> int64_t entries_of(const Call& call) {
+    Reader in(call);
+    const ViewArgs<S> a(call, in);
+    fill_entries(a.plan, a.threads, const_cast<int32_t*>(a.plan.entries));
+    return 0;
+}
+
+}  // namespace
+
+int64_t plan(const Call& call) { return call.twice ? plan_of<double>(call) : plan_of<float>(call); }
+int64_t entries(const Call& call) { return call.twice ? entries_of<double>(call) : entries_of<float>(call); }
 
 }  // namespace gsparc

@@ -1,16 +1,9 @@
 // From Gaussians to records and boxes, as many at a time as there are lanes.
 #pragma once
-#include "boxes.h"
-#include "rows.h"
+#include "projection.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
-
-// The settings with every number in all lanes.
-template <class S> KernelSettings<Pack<S>> widened(const KernelSettings<S>& l) {
-    return {l.height, l.width, l.periodic, l.tangent, l.compensate, l.relative, l.first_elevation, l.first_azimuth,
-            l.elevation_step, l.azimuth_step, l.low_pass, l.near, l.alpha_min, l.transmittance_min, l.alpha_max, l.horizon_cosine};
-}
 
 template <class S> inline Gaussian<Pack<S>> gaussians(const Model<S>& model, int64_t i, int count) {
     Gaussian<Pack<S>> g;
@@ -39,7 +32,7 @@ template <class S> struct Stand {
 };
 
 // `project_one` for rows [i, i + count), count at most the lanes.
-template <class S> int64_t project_some(const ProjectArgs<S>& a, const KernelSettings<Pack<S>>& settings, const Stand<S>& stand, int64_t i, int count) {
+template <class P, class S> int64_t project_some(const ProjectArgs<S>& a, const KernelSettings<Pack<S>>& settings, const Stand<S>& stand, int64_t i, int count) {
     Pack<S> opacity;
     gather_rows(a.model.opacities + i, 1, count, &opacity);
     const Gaussian<Pack<S>> g = gaussians(a.model, i, count);
@@ -49,7 +42,7 @@ template <class S> int64_t project_some(const ProjectArgs<S>& a, const KernelSet
             if (wrong >= 0) return 4 * k + wrong;
         }
     }
-    const Sight<Pack<S>> s = sight_of(g, opacity, stand.position, stand.rotation, settings);
+    const Sight<Pack<S>> s = sight_of<P>(g, opacity, stand.position, stand.rotation, settings);
     const Pack<S> place[2] = {s.column, s.row};
     scatter_rows(place, 2, count, a.means2d + 2 * i);
     scatter_rows(&s.depth, 1, count, a.depths + i);
@@ -73,13 +66,15 @@ template <class S> int64_t project_some(const ProjectArgs<S>& a, const KernelSet
 
 template <class S> int64_t project_range(const ProjectArgs<S>& a, int begin, int end) {
     constexpr int n = Pack<S>::n;
-    const KernelSettings<Pack<S>> settings = widened(a.settings);
+    const auto settings = in_precision<Pack<S>>(a.settings);
     const Stand<S> stand(a.model, a.pose);
-    for (int64_t i = begin; i < end; i += n) {
-        const int64_t wrong = project_some(a, settings, stand, i, end - i < n ? int(end - i) : n);
-        if (wrong >= 0) return wrong;
-    }
-    return -1;
+    return with_projection(a.settings.projection, [&](auto projection) -> int64_t {
+        for (int64_t i = begin; i < end; i += n) {
+            const int64_t wrong = project_some<decltype(projection)>(a, settings, stand, i, end - i < n ? int(end - i) : n);
+            if (wrong >= 0) return wrong;
+        }
+        return -1;
+    });
 }
 
 }  // namespace GSPARC_ISA

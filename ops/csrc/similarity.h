@@ -7,6 +7,19 @@
 namespace gsparc {
 namespace GSPARC_ISA {
 
+// B images (H, W), seen through a separable window of 2 radius + 1 taps.
+struct SimilarityArgs {
+    int count, height, width, radius, threads;
+    float c1, c2;
+    const float *taps, *prediction, *target;
+    float *value, *slope;           // (B,), and (B, H, W) d value / d prediction, or null
+    explicit SimilarityArgs(const Call& call) : threads(call.threads), c1(float(call.numbers[0])), c2(float(call.numbers[1])) {
+        Reader in(call);
+        in.sizes(count, height, width, radius);
+        in.read(taps, prediction, target, value, slope);
+    }
+};
+
 // Rows of an image padded to whole lanes on the right, so that a vector may overhang.
 struct Plane {
     float* data;
@@ -118,7 +131,8 @@ template <int kTaps> inline void similarity_image(const SimilarityArgs& a, const
     a.value[image] = float(total / count);
 }
 
-inline void similarity(const SimilarityArgs& a) {
+template <class S> int64_t similarity(const Call& call) {
+    const SimilarityArgs a(call);
     constexpr int usual = 11;  // Wang's window
     const int64_t each = SimilarityScratch::size(a);
     Buffer<float> memory(each * a.threads);
@@ -128,6 +142,7 @@ inline void similarity(const SimilarityArgs& a) {
         else similarity_image<0>(a, s, image);
     };
     parallel_for(a.count, a.threads, run);
+    return 0;
 }
 
 }  // namespace GSPARC_ISA

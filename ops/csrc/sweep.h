@@ -4,7 +4,7 @@
 #pragma once
 #include <new>
 
-#include "shapes.h"
+#include "projection.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
@@ -79,18 +79,19 @@ GSPARC_INLINE int32_t* append(int32_t* hit, Bits bits, int first, int count) {
 }
 
 // The same, less those that a footprint without an outline cannot reach.
-template <class S> GSPARC_INLINE int32_t* append_near(int32_t* hit, Bits bits, int first, int end, const S* line, const Rises<S>& stage, int strip) {
+template <class P, class S> GSPARC_INLINE int32_t* append_near(int32_t* hit, Bits bits, int first, int end, const S* line, const Rises<S>& stage, int strip) {
     constexpr int n = Lanes<S>::n;
-    for (; first < end; first += n) {
-        const unsigned some = end - first < n ? (1u << (end - first)) - 1 : (1u << n) - 1;
-        hit = append(hit, first, bits.from(first) & some & near_tiles(line, stage, strip, first));
-    }
+    if constexpr (P::kOpen)
+        for (; first < end; first += n) {
+            const unsigned some = end - first < n ? (1u << (end - first)) - 1 : (1u << n) - 1;
+            hit = append(hit, first, bits.from(first) & some & P::near_tiles(line, stage, strip, first));
+        }
     return hit;
 }
 
 // Finds the tiles of the next footprints of a strip; returns the first that is left over. Spans of all first, then what
 // becomes of them: one chain of arithmetic hides behind the next.
-template <class S, bool kTangent>
+template <class P, class S>
 GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, const Lines<S>& lines, const S* base, const S* outlines, const int32_t* entry, Bits bits, Batch& batch) {
     constexpr int n = Lanes<S>::n, columns = kTileColumns<S>;
     static_assert(kBatch % n == 0 && n <= kBlock, "a batch is whole lanes");
@@ -104,7 +105,7 @@ GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, 
         Pack<S> numbers[kOutline];
         gather_at(outlines, kOutline, ranks + first, kOutline, numbers);
         const Outline<Pack<S>> outline = {numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], numbers[5], numbers[6], numbers[7]};
-        spans[first / n] = spans_of<S, kTangent>(outline, middle - half, middle + half, stage.settings);
+        spans[first / n] = spans_of<P>(outline, middle - half, middle + half, stage.settings);
     }
     int32_t* hit = batch.hits.data;
     int owners = 0;
@@ -115,9 +116,9 @@ GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, 
         const Spans<S>& span = spans[k / n];
         const int lane = k % n;
         const int32_t* const before = hit;
-        if (kTangent && span.open >> lane & 1) {
+        if (P::kOpen && span.open >> lane & 1) {
             const Runs runs = runs_of(strip.boxes[ranks[k]], stage.settings.width);
-            for (int run = 0; run < runs.count; ++run) hit = append_near(hit, bits, runs.from[run] / columns, (runs.to[run] - 1) / columns + 1, line, stage, strip.index);
+            for (int run = 0; run < runs.count; ++run) hit = append_near<P>(hit, bits, runs.from[run] / columns, (runs.to[run] - 1) / columns + 1, line, stage, strip.index);
         } else {
             hit = append(hit, bits, int(span.first[lane]), int(span.count[lane]));
             if (span.wrapped[lane]) hit = append(hit, bits, 0, int(span.wrapped[lane]));
@@ -129,23 +130,26 @@ GSPARC_INLINE const int32_t* find(const Strip<S>& strip, const Rises<S>& stage, 
     return entry + some;
 }
 
+// A footprint before the rows of a strip: `look` finds the offsets of a tile's pixels and says which lie inside.
+template <class S, class P> using Shape = typename P::template Shape<S>;
+
 // Calls visit(line, rank, hit, end, shape) for each footprint of the strip that may count somewhere, front to
 // back, with its tiles. `relight(bits)` is called between batches: it says where light still arrives, and false ends
 // the walk.
-template <class S, bool kTangent, class Relight, class Visit>
+template <class P, class S, class Relight, class Visit>
 GSPARC_INLINE void sweep(const Strip<S>& strip, const PlanView<S>& plan, const Rises<S>& stage, const Lines<S>& lines,
                          Batch& batch, const Relight& relight, const Visit& visit) {
     const S *base = lines.of(plan, strip.pose, 0), *outlines = lines.outlines.data + int64_t(strip.pose) * plan.count * kOutline;
     const Bits bits = {batch.words.data, stage.tiles};
     bits.set_all();
     for (const int32_t* entry = strip.first; entry < strip.last;) {
-        entry = find<S, kTangent>(strip, stage, lines, base, outlines, entry, bits, batch);
+        entry = find<P>(strip, stage, lines, base, outlines, entry, bits, batch);
         const int32_t* hit = batch.hits.data;
         for (int owner = 0; owner < batch.owners; ++owner) {
             const int32_t* const end = batch.hits.data + batch.ends[owner];
             const int rank = batch.ranks[owner];
             const S* line = base + int64_t(rank) * lines.width;
-            const Shape<S, kTangent> shape(line, stage, strip.index);
+            const Shape<S, P> shape(line, stage, strip.index);
             visit(line, rank, hit, end, shape);
             hit = end;
         }

@@ -11,7 +11,7 @@
 #define GSPARC_ISA device
 #include "cuda/view.h"
 
-using gsparc::device::Call;
+using gsparc::Call;
 extern "C" {
 int64_t gsparc_plan(const Call*);
 int64_t gsparc_bin(const Call*);

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from gsparc.ops import backends, cuda, cuda_kernels, cuda_library, operators
+from gsparc.ops import backends, calls, cuda, cuda_library, operators
 
 HERE = Path(__file__).parent
 KEPT = HERE.parents[1] / "build" / "shim"
@@ -41,7 +41,7 @@ def gpu() -> cuda_library.Library:
     if reason:
         pytest.skip(reason)
     cuda.load()
-    return cuda_kernels.libraries["cuda"]
+    return calls.libraries["cuda"]
 
 
 def on_gpu(run: Callable) -> Callable:
@@ -49,11 +49,12 @@ def on_gpu(run: Callable) -> Callable:
 
     def there(name, like, *tensors, **options):
         moved = [None if t is None else t.cuda() for t in tensors]
-        run(name, torch.empty(0, dtype=like.dtype, device="cuda"), *moved, **options)
+        result = run(name, torch.empty(0, dtype=like.dtype, device="cuda"), *moved, **options)
         torch.cuda.synchronize()
         for tensor, copy in zip(tensors, moved, strict=True):
             if tensor is not None:
                 tensor.data.copy_(copy)  # unseen by autograd: most of them are inputs
+        return result
 
     return there
 
@@ -63,12 +64,12 @@ def serving(where: str) -> Iterator[cuda_library.Library]:
     """CPU tensors go through the CUDA kernels, on the `shim` or on the `gpu`."""
     kernels = library() if where == "shim" else gpu()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(cuda_kernels.libraries, "cpu", kernels)
-        patch.setitem(operators.KERNELS, "cpu", cuda_kernels)
+        patch.setitem(calls.libraries, "cpu", kernels)
+        patch.setitem(operators.KERNELS, "cpu", operators.KERNELS["cuda"])
         patch.setattr(backends, "_cpu", lambda: cuda)
         patch.setattr(backends, "_cuda", lambda: cuda)
         if where == "gpu":
-            patch.setattr(cuda_kernels, "run", on_gpu(cuda_kernels.run))
-        cuda_kernels._tables.cache_clear()
+            patch.setattr(calls, "run", on_gpu(calls.run))
+        cuda._tables.cache_clear()
         yield kernels
-    cuda_kernels._tables.cache_clear()
+    cuda._tables.cache_clear()

@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-import ctypes
 import math
 
 import pytest
 import torch
 from rasters import GRIDS, Scene, assert_close, origin, poses, random_scene, render
 
-from gsparc.ops import Optics, SphereGrid, cuda_kernels, freeze, make_plan, networks, operators, rasterize
+from gsparc.ops import (
+    Optics,
+    SphereGrid,
+    calls,
+    cuda,
+    freeze,
+    make_plan,
+    networks,
+    operators,
+    rasterize,
+    similarity,
+)
 from gsparc.ops.settings import kernel_settings
 from gsparc.training.losses import _Kernel, _written_out
 
@@ -37,9 +47,7 @@ def test_order_of_the_threads_does_not_matter(where):
     """A missing barrier shows when a block's threads run in the opposite order; on a GPU, run it twice."""
     scene = crowd(200).to(torch.float32)
     first = render(scene, poses(3), GRIDS["hemisphere"])
-    turned = (
-        cuda_kernels.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
-    )
+    turned = calls.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
     turned(1)
     second = render(scene, poses(3), GRIDS["hemisphere"])
     turned(0)
@@ -121,7 +129,7 @@ def test_similarity_of_flat_images_stays_finite(where):
 def test_windows_that_the_kernel_does_not_take_are_refused(where, taps):
     images = torch.rand(1, 20, 20)
     with pytest.raises(ValueError, match="symmetric and has at most 11 taps"):
-        cuda_kernels.similarity(images, images, taps, (1e-4, 9e-4), True)
+        similarity.similarity_op(images, images, taps, [1e-4, 9e-4], True)
 
 
 def test_more_positions_than_a_grid_has_rows(where):
@@ -134,7 +142,7 @@ def test_more_positions_than_a_grid_has_rows(where):
 
 def test_too_many_pairs_for_one_plan_are_refused(where, monkeypatch):
     scene = random_scene(n=40)
-    monkeypatch.setattr(cuda_kernels, "MOST_PAIRS", 100)
+    monkeypatch.setattr(cuda, "MOST_PAIRS", 100)
     with pytest.raises(MemoryError, match="3 poses of 40 Gaussians are too many for a plan"):
         make_plan(scene.means, scene.quats, scene.scales, scene.opacities, poses(3), GRIDS["patch"])
 
@@ -145,14 +153,14 @@ def test_tables_that_a_graph_holds_are_never_freed(where):
     tables = []
     for height in [20, *range(21, 60), 20]:
         make_plan(*model, origin(), SphereGrid(height, 8, -0.3, 2.5, 0.01, 0.05))
-        tables.append(cuda_kernels._tables.cache_info().misses)
+        tables.append(cuda._tables.cache_info().misses)
     assert tables[-1] == tables[-2]
 
 
 def test_captured_plan_with_headroom_is_the_plan(where, monkeypatch):
     scene = random_scene(n=40).to(torch.float32)
     want = render(scene, poses(3), GRIDS["hemisphere"])
-    monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda, "_capturing", lambda tensor: True)
     got = render(scene, poses(3), GRIDS["hemisphere"])
     for name, value in want.items():
         assert torch.equal(value, got[name]), name
@@ -161,16 +169,16 @@ def test_captured_plan_with_headroom_is_the_plan(where, monkeypatch):
 def test_captured_plan_without_room_is_nan_never_wrong(where, monkeypatch):
     scene, grid = random_scene(n=40).to(torch.float32), GRIDS["hemisphere"]
     render(scene, poses(0), grid)
-    monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
-    monkeypatch.setattr(cuda_kernels, "_with_headroom", lambda entries: 5)
+    monkeypatch.setattr(cuda, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda, "_with_headroom", lambda entries: 5)
     got = render(scene, poses(0), grid)
     for name in ("image", "transmittance", "d_means", "d_quats", "d_scales", "d_opacities", "d_features"):
         assert torch.isnan(got[name]).all(), name
 
 
 def test_captured_plan_needs_an_earlier_one(where, monkeypatch):
-    monkeypatch.setattr(cuda_kernels, "_capturing", lambda tensor: True)
-    monkeypatch.setattr(cuda_kernels, "_capacities", {})
+    monkeypatch.setattr(cuda, "_capturing", lambda tensor: True)
+    monkeypatch.setattr(cuda, "_capacities", {})
     scene = random_scene(n=4)
     with pytest.raises(RuntimeError, match="plan once before capturing"):
         make_plan(scene.means, scene.quats, scene.scales, scene.opacities, origin(), GRIDS["patch"])
@@ -201,10 +209,3 @@ def test_too_many_entries_are_refused_before_allocation(where, monkeypatch):
         image.sum().backward()
     with pytest.raises(MemoryError, match="footprint entries need"):
         make_plan(*model, origin(), GRIDS["patch"])
-
-
-def test_call_has_the_layout_of_the_kernels(where):
-    assert (
-        ctypes.sizeof(cuda_kernels.cuda_library.Call)
-        == 14 * 4 + (2 * 4 + 4 + 4 + 10 * 8) + 8 * 8 + 32 * 8 + 2 * 8
-    )

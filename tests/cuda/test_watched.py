@@ -19,7 +19,7 @@ import torch
 from rasters import GRIDS, origin, poses, random_scene, render
 from shim import INCLUDES, KEPT, SHIM, fingerprint, serving
 
-from gsparc.ops import SphereGrid, cuda_kernels, cuda_library, freeze, make_plan, mean_weights, networks
+from gsparc.ops import SphereGrid, calls, cuda_library, freeze, make_plan, mean_weights, networks
 from gsparc.ops.similarity import similarity_op
 
 REPLAY = Path(__file__).parent / "replay.cpp"
@@ -78,10 +78,10 @@ def ends(*command: str) -> subprocess.CompletedProcess[str]:
 @contextmanager
 def recording(path: Path) -> Iterator[None]:
     """Every call of the kernels goes into a file as replay.cpp reads it, then runs."""
-    run = cuda_kernels.run
+    run = calls.run
 
     def kept(name, like, *tensors, **numbers):
-        call = cuda_kernels.call_for(like, (), **numbers)
+        call = calls.call_for(like, **numbers)
         with path.open("ab") as file:
             file.write(name.encode().ljust(32, b"\0") + bytes(call) + len(tensors).to_bytes(8, "little"))
             for tensor in tensors:
@@ -89,10 +89,10 @@ def recording(path: Path) -> Iterator[None]:
                 size = -1 if flat is None else len(flat)
                 file.write(size.to_bytes(8, "little", signed=True))
                 file.write(b"" if flat is None else flat.numpy().tobytes())
-        run(name, like, *tensors, **numbers)
+        return run(name, like, *tensors, **numbers)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cuda_kernels, "run", kept)
+        patch.setattr(calls, "run", kept)
         yield
 
 

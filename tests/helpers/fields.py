@@ -16,6 +16,7 @@ from rasters import Outcome, Scene, render
 from torch import Tensor
 
 from gsparc.ops import Cutoff, Pose, SphereGrid, reference
+from gsparc.ops.projection import HORIZON_COSINE
 from gsparc.ops.settings import ALPHA_MAX, SHORTEST_QUATERNION, Optics
 
 EPS = {"float32": 2.0**-23, "float64": 2.0**-52}
@@ -245,7 +246,7 @@ def _measure(drawn: Drawn, nudges: int, **more) -> Condition:
         room = 8 * torch.stack([*away, torch.full_like(here, 256 * EPS["float32"])]).amax(0)
         unsteady |= ((here - math.log(max(threshold, 1e-300))).abs() <= room).any(0)
     if drawn.projection == "tangent":
-        unsteady |= ((base.facing - reference.HORIZON_COSINE).abs() < 1e-5).any(0)
+        unsteady |= ((base.facing - HORIZON_COSINE).abs() < 1e-5).any(0)
     steady = ~unsteady.reshape(drawn.grid.height, drawn.grid.width)
     truth = show(exact(drawn), "reference", pixels=steady, **more)
     moves = dict.fromkeys(truth, 0.0)

@@ -33,7 +33,7 @@ def parts(scene):
         ({"opacities": torch.full((4,), 1.5, dtype=torch.float64)}, ValueError, "Gaussian 0 has opacities"),
         ({"scales": torch.full((4, 3), -1.0, dtype=torch.float64)}, ValueError, "Gaussian 0 has scales"),
         ({"features": torch.zeros(5, 2, dtype=torch.float64)}, ValueError, "features must be"),
-        ({"projection": "flat"}, ValueError, "'equirect' or 'tangent'"),
+        ({"projection": "flat"}, ValueError, "'tangent' or 'equirect'"),
         ({"near": 0.0}, ValueError, "near > 0"),
         ({"ids": torch.arange(3)}, ValueError, "ids must be"),
     ],

@@ -14,7 +14,7 @@ from gsparc.commands.bench.case import Call
 from gsparc.commands.bench.measure import Machine, measure, timed, undisturbed
 from gsparc.commands.bench.scene import Scene, scene
 from gsparc.methods.timing import ClockSettings
-from gsparc.ops.settings import Projection
+from gsparc.ops.projection import Projection
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings, GaussianField
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, make_plan
-from gsparc.ops.settings import IMAGE_CUTOFF, Projection
+from gsparc.ops.projection import Projection
+from gsparc.ops.settings import IMAGE_CUTOFF
 
 ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
 GRID = SphereGrid.hemisphere()

@@ -9,7 +9,7 @@ from gsparc.commands.bench.case import Call, Case, Work
 from gsparc.commands.bench.scene import GRID, places, receiver, scene
 from gsparc.field.model import GaussianModel
 from gsparc.ops import Pose, composite
-from gsparc.ops.settings import Projection
+from gsparc.ops.projection import Projection
 from gsparc.training.losses import spectrum_loss
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for
 

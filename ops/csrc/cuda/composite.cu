@@ -16,10 +16,10 @@ template <class S> struct Picture {
 
 template <class S> GSPARC_HD int64_t pixels_of(const KernelSettings<S>& settings) { return int64_t(settings.height) * settings.width; }
 
-template <class S, bool kTangent, int kChannels>
+template <class S, class P, int kChannels>
 __global__ void __launch_bounds__(kBlock) composite_kernel(View<S> v, Model<S> model, Picture<S> out) {
     __shared__ Desk<S, kChannels> desk;
-    Walk<S, kTangent, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
+    Walk<S, P, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
     const int from = blockIdx.y * kChannels, used = out.channels - from < kChannels ? out.channels - from : kChannels;
     const bool broken = v.overflows();
     S sums[kChannels] = {};
@@ -60,12 +60,12 @@ template <class S> struct Upstream {
 
 constexpr int power_of_two(int least) { return least <= 16 ? 16 : 32; }
 
-template <class S, bool kTangent, int kChannels>
+template <class S, class P, int kChannels>
 __global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> model, Picture<S> forward, Upstream<S> up) {
     constexpr int kRow = kMoments + kChannels;
     __shared__ Desk<S, kChannels> desk;
     if (v.overflows()) return;
-    Walk<S, kTangent, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
+    Walk<S, P, kChannels> walk(v, desk, blockIdx.x, threadIdx.x);
     const int from = blockIdx.y * kChannels, used = forward.channels - from < kChannels ? forward.channels - from : kChannels;
     const int64_t pixels = pixels_of(v.settings), at = walk.pixel.place(v.settings), row0 = int64_t(blockIdx.y) * v.capacity;
     S g[kChannels] = {}, behind = 0;  // what is still to come of the loss, behind the batch's front
@@ -114,7 +114,7 @@ __global__ void __launch_bounds__(kBlock) backward_kernel(View<S> v, Model<S> mo
                     const Layer<S, true> layer = walk.layer(j, form);
                     const S gain = lit ? gain_of(j) : S(0), weight = light * layer.alpha, through = S(1) - layer.gamma;
                     if (lit) rest -= weight * gain;
-                    MomentSums<S, kTangent, true> sums;
+                    MomentSums<S, P, true> sums;
                     sums.add(layer, true, fma(light, gain, per_alpha), lit ? -rest / through : S(0), tau1, tau2, form, walk.alpha_max);
                     sums.write(values);
                     GSPARC_UNROLL
@@ -137,11 +137,11 @@ template <class S> struct Weighed {
     int32_t* ends;  // (tiles,): first entry of a tile that nobody sees
 };
 
-template <class S, bool kTangent>
+template <class S, class P>
 __global__ void __launch_bounds__(kBlock) weigh_kernel(View<S> v, Model<S> model, Weighed<S> out) {
     __shared__ Desk<S, 1> desk;
     if (v.overflows()) return;
-    Walk<S, kTangent, 1> walk(v, desk, blockIdx.x, threadIdx.x);
+    Walk<S, P, 1> walk(v, desk, blockIdx.x, threadIdx.x);
     while (walk.base < walk.end) {
         walk.look(model, nullptr, 0, 0, 0);
         S light = walk.start;
@@ -227,7 +227,7 @@ template <class S> struct Slopes {
 constexpr int kSlopes = 12;  // of a mean, a quaternion, three scales, opacity and extinction
 
 // Chains the sums (chunks, P, N, kMoments) into slopes (P, N, kSlopes) of the parameters as each pose sees them.
-template <class S>
+template <class S, class P>
 __global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunks, S* slopes, S* screen) {
     const uint32_t row = blockIdx.x * kThreads + threadIdx.x, all = uint32_t(v.poses) * v.count;
     if (row >= all) return;
@@ -245,9 +245,9 @@ __global__ void chain_kernel(View<S> v, Model<S> model, const S* sums, int chunk
     const Gaussian<S> g = gaussian(model, i);
     const S opacity = model.opacities[i], extinction = model.extinctions ? model.extinctions[i] : opacity;
     const S* rotation = model.rotations + 9 * pose;
-    const Footprint<S> f = project(g, model.positions + 3 * pose, rotation, v.settings);
+    const Footprint<S> f = project<P>(g, model.positions + 3 * pose, rotation, v.settings);
     const Moments<S> moments = {m[0], m[1], m[2], m[3], m[4], m[5], m[6], m[7], m[8]};
-    const Gradients<S> one = project_backward(f, moments, opacity, extinction, rotation, v.settings);
+    const Gradients<S> one = project_backward<P>(f, moments, opacity, extinction, rotation, v.settings);
     for (int k = 0; k < 3; ++k) to[k] = one.mean[k], to[7 + k] = one.scale[k];
     for (int k = 0; k < 4; ++k) to[3 + k] = one.quat[k];
     to[10] = one.opacity, to[11] = one.extinction;
@@ -276,18 +276,18 @@ int64_t blocks_for(int64_t threads) { return (threads + kThreads - 1) / kThreads
 template <class S> int width_for(int channels) { return sizeof(S) == 8 ? 4 : (channels <= 1 ? 1 : (channels <= 4 ? 4 : 16)); }
 int chunks_for(int channels, int width) { return channels > width ? (channels + width - 1) / width : 1; }
 
-template <class S, bool kTangent> auto composite_of(int width) {
-    if constexpr (sizeof(S) == 8) return composite_kernel<S, kTangent, 4>;
-    else return width == 1 ? composite_kernel<S, kTangent, 1> : width == 4 ? composite_kernel<S, kTangent, 4> : composite_kernel<S, kTangent, 16>;
+template <class S, class P> auto composite_of(int width) {
+    if constexpr (sizeof(S) == 8) return composite_kernel<S, P, 4>;
+    else return width == 1 ? composite_kernel<S, P, 1> : width == 4 ? composite_kernel<S, P, 4> : composite_kernel<S, P, 16>;
 }
-template <class S, bool kTangent> auto backward_of(int width) {
-    if constexpr (sizeof(S) == 8) return backward_kernel<S, kTangent, 4>;
-    else return width == 1 ? backward_kernel<S, kTangent, 1> : width == 4 ? backward_kernel<S, kTangent, 4> : backward_kernel<S, kTangent, 16>;
+template <class S, class P> auto backward_of(int width) {
+    if constexpr (sizeof(S) == 8) return backward_kernel<S, P, 4>;
+    else return width == 1 ? backward_kernel<S, P, 1> : width == 4 ? backward_kernel<S, P, 4> : backward_kernel<S, P, 16>;
 }
 
 template <class S> int64_t blend(const View<S>& v, const Model<S>& model, const Picture<S>& picture, void* stream) {
     const int width = width_for<S>(picture.channels), chunks = chunks_for(picture.channels, width);
-    const auto kernel = v.settings.tangent ? composite_of<S, true>(width) : composite_of<S, false>(width);
+    const auto kernel = with_projection(v.settings.projection, [&](auto p) { return composite_of<S, decltype(p)>(width); });
     return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, picture);
 }
 
@@ -298,11 +298,11 @@ int64_t add(const View<S>& v, int chunks, void* stream, const S* rows, int width
 }
 
 template <class S> int64_t composite(const Call& call) {
-    auto in = reader(call);
+    Reader in(call);
     const View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     Picture<S> out;
-    out.channels = call.channels;
+    in.sizes(out.channels);
     in.read(out.features, out.image, out.transmittance);
     if (!call.scratch) return 1;
     return -blend(v, model, out, reinterpret_cast<void*>(uintptr_t(call.stream)));
@@ -311,12 +311,12 @@ template <class S> int64_t composite(const Call& call) {
 // Backward of `composite`, or, where `weights`, of the weights: then features are the slopes of the sums of
 // alpha T, and the image they make is the total that the pass runs down from.
 template <class S> int64_t backward(const Call& call, bool weights) {
-    auto in = reader(call);
+    Reader in(call);
     const View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     Picture<S> forward{};
     Upstream<S> up{};
-    forward.channels = call.channels;
+    in.sizes(forward.channels);
     if (weights) in.read(forward.features, up.per_alpha);
     else in.read(forward.features, forward.image, forward.transmittance, up.image, up.transmittance);
     Slopes<S> out;
@@ -325,7 +325,7 @@ template <class S> int64_t backward(const Call& call, bool weights) {
     if (!weights) in.read(features, screen);  // (P, N, K), (P, N, 2)
 
     const int64_t all = int64_t(v.poses) * v.count;
-    const int width = width_for<S>(call.channels), chunks = chunks_for(call.channels, width), row = kMoments + width;
+    const int width = width_for<S>(forward.channels), chunks = chunks_for(forward.channels, width), row = kMoments + width;
     Arena arena(reinterpret_cast<void*>(uintptr_t(call.scratch)));
     up.rows = arena.take<S>(int64_t(chunks) * v.capacity * row);
     S *sums = arena.take<S>(int64_t(chunks) * all * kMoments), *slopes = arena.take<S>(all * kSlopes);
@@ -335,16 +335,17 @@ template <class S> int64_t backward(const Call& call, bool weights) {
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     Steps steps;
     if (weights) steps.then([&] { return blend(v, model, forward, stream); });
-    const auto kernel = v.settings.tangent ? backward_of<S, true>(width) : backward_of<S, false>(width);
+    const auto kernel = with_projection(v.settings.projection, [&](auto p) { return backward_of<S, decltype(p)>(width); });
+    const auto chain = with_projection(v.settings.projection, [](auto p) { return chain_kernel<S, decltype(p)>; });
     steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, chunks, kBlock, stream, v, model, forward, up); });
-    steps.then([&] { return add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : call.channels); });
-    steps.then([&] { return launch(chain_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, sums, chunks, slopes, screen); });
+    steps.then([&] { return add<S>(v, chunks, stream, up.rows, row, kMoments, sums, features, weights ? 0 : forward.channels); });
+    steps.then([&] { return launch(chain, blocks_for(all), 1, kThreads, stream, v, model, sums, chunks, slopes, screen); });
     steps.then([&] { return launch(add_poses<S>, blocks_for(int64_t(v.count) * kSlopes), 1, kThreads, stream, v, slopes, out); });
     return steps.result();
 }
 
 template <class S> int64_t weigh(const Call& call) {
-    auto in = reader(call);
+    Reader in(call);
     const View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     Weighed<S> out{};
@@ -356,7 +357,7 @@ template <class S> int64_t weigh(const Call& call) {
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
     Steps steps;
-    const auto kernel = v.settings.tangent ? weigh_kernel<S, true> : weigh_kernel<S, false>;
+    const auto kernel = with_projection(v.settings.projection, [](auto p) { return weigh_kernel<S, decltype(p)>; });
     steps.then([&] { return launch(kernel, int64_t(v.poses) * v.tiles, 1, kBlock, stream, v, model, out); });
     if (sums)
         steps.then([&] { return add<S>(v, 1, stream, out.rows, 2, 2, sums, nullptr, 0); });
@@ -367,26 +368,7 @@ template <class S> int64_t weigh(const Call& call) {
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" {
-
-int64_t gsparc_composite(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return composite<decltype(zero)>(*call); });
-}
-
-int64_t gsparc_composite_backward(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return backward<decltype(zero)>(*call, false); });
-}
-
-int64_t gsparc_weights(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return weigh<decltype(zero)>(*call); });
-}
-
-int64_t gsparc_weights_backward(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return backward<decltype(zero)>(*call, true); });
-}
-
-}  // extern "C"
+GSPARC_ENTRY(composite, composite<S>(call))
+GSPARC_ENTRY(composite_backward, backward<S>(call, false))
+GSPARC_ENTRY(weights, weigh<S>(call))
+GSPARC_ENTRY(weights_backward, backward<S>(call, true))

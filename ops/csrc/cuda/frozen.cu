@@ -96,9 +96,9 @@ template <class S> __global__ void __launch_bounds__(kBlock, 8) thaw_many(Frozen
 }
 
 template <class S> int64_t thaw(const Call& call) {
-    auto in = reader(call);
+    Reader in(call);
     Frozen<S> f;
-    f.height = call.height, f.width = call.width, f.columns = call.channels;
+    in.sizes(f.columns, f.height, f.width);
     f.tiles_x = (f.width + kTileWidth - 1) / kTileWidth;
     in.read(f.starts, f.ends, f.ranks, f.blocks, f.features, f.image);
     if (!call.scratch) return 1;
@@ -112,7 +112,4 @@ template <class S> int64_t thaw(const Call& call) {
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" int64_t gsparc_thaw(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return thaw<decltype(zero)>(*call); });
-}
+GSPARC_ENTRY(thaw, thaw<S>(call))

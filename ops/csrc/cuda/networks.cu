@@ -119,9 +119,9 @@ __global__ void __launch_bounds__(kBlock) networks_backward_kernel(Networks n, D
     }
 }
 
-Networks read_networks(const Call& c, Reader& in) {
+Networks read_networks(Reader& in) {
     Networks n;
-    n.samples = c.samples, n.count = c.count, n.inputs = c.inputs, n.hidden = c.hidden, n.outputs = c.channels;
+    in.sizes(n.samples, n.count, n.inputs, n.hidden, n.outputs);
     in.read(n.x, n.weight1, n.bias1, n.weight2, n.bias2);
     return n;
 }
@@ -132,10 +132,10 @@ Networks read_networks(const Call& c, Reader& in) {
 
 extern "C" {
 
-int64_t gsparc_networks(const gsparc::GSPARC_ISA::Call* call) {
+int64_t gsparc_networks(const gsparc::Call* call) {
     using namespace gsparc::GSPARC_ISA;
-    auto in = reader(*call);
-    const Networks n = read_networks(*call, in);
+    gsparc::Reader in(*call);
+    const Networks n = read_networks(in);
     float* out = in.next<float>();
     if (!call->scratch) return 1;
     if (const int64_t error = use_device(call->device)) return -error;
@@ -146,10 +146,10 @@ int64_t gsparc_networks(const gsparc::GSPARC_ISA::Call* call) {
     return -launch(networks_kernel<kMany>, blocks, int(rows < kMostRows ? rows : kMostRows), kBlock, stream, n, out);
 }
 
-int64_t gsparc_networks_backward(const gsparc::GSPARC_ISA::Call* call) {
+int64_t gsparc_networks_backward(const gsparc::Call* call) {
     using namespace gsparc::GSPARC_ISA;
-    auto in = reader(*call);
-    const Networks n = read_networks(*call, in);
+    gsparc::Reader in(*call);
+    const Networks n = read_networks(in);
     Derivatives d;
     in.read(d.out, d.weight1, d.bias1, d.weight2, d.bias2);
     if (!call->scratch) return 1;

@@ -47,14 +47,14 @@ template <class S> struct Outputs {
     unsigned long long* wrong;
 };
 
-template <class S> __global__ void project_kernel(View<S> v, Model<S> model, Outputs<S> out) {
+template <class S, class P> __global__ void project_kernel(View<S> v, Model<S> model, Outputs<S> out) {
     const uint32_t at = blockIdx.x * kThreads + threadIdx.x;
     if (at >= uint32_t(v.poses) * v.count) return;
     const int pose = at / v.count;
     const int64_t i = at % v.count, base = int64_t(pose) * v.count;
     const ProjectArgs<S> one = {model, v.count, v.settings, v.records + base * kRecord, out.depths + base, out.means2d + 2 * base,
                                 out.radii + base, v.boxes + base, out.visible + base, pose};
-    const int wrong = project_one(one, i);
+    const int wrong = project_one<P>(one, i);
     if (wrong >= 0) {
         atomicMin(out.wrong, static_cast<unsigned long long>(4 * i + wrong));
         one.visible[i] = false, one.depths[i] = 0;
@@ -127,13 +127,13 @@ struct TileRange {
 
 // A tile counts if at least one of its pixels lies inside the footprint: the test the compositing will make. Calls
 // keep(which of those found, tile) for tiles [from, end) of a range; returns how many there are.
-template <class S, bool kTangent, class Keep>
+template <class S, class P, class Keep>
 __device__ int find_tiles(const View<S>& v, const TileRange& range, const S* record, int from, int end, Keep keep) {
     int found = 0, row = from < end ? range.row0 + from / range.columns : 0, k = from < end ? from % range.columns : 0;
     for (int at = from; at < end; ++at, ++k) {
         if (k == range.columns) k = 0, ++row;
         const int column = range.column0 + k < v.tiles_x ? range.column0 + k : range.column0 + k - v.tiles_x;
-        const Pixel<S, kTangent> pixel(v, row, column, threadIdx.x % kWarp);
+        const Pixel<S, P> pixel(v, row, column, threadIdx.x % kWarp);
         S tau1, tau2, form;
         if (warp_any(pixel.offsets(record, v.settings, tau1, tau2, form))) keep(found++, row * v.tiles_x + column);
     }
@@ -142,7 +142,7 @@ __device__ int find_tiles(const View<S>& v, const TileRange& range, const S* rec
 
 // `pieces` warps hold one Gaussian, each a run of its tiles. Writing is a second run of counting, which takes who is
 // visible from the sorted keys.
-template <class S, bool kTangent>
+template <class S, class P>
 __global__ void list_tiles(View<S> v, int pieces, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
     __shared__ int found[kMostPieces];
     const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp, piece = warp % pieces, all = v.poses * v.count;
@@ -159,7 +159,7 @@ __global__ void list_tiles(View<S> v, int pieces, const uint64_t* sorted, int64_
     }
     const int tiles = range.rows * range.columns, from = tiles * piece / pieces, end = tiles * (piece + 1) / pieces;
     if (counts || pieces > 1) {
-        const int mine = find_tiles<S, kTangent>(v, range, record, from, end, [](int, int) {});
+        const int mine = find_tiles<S, P>(v, range, record, from, end, [](int, int) {});
         if (lane == 0) found[warp] = mine;
         block_sync();
     }
@@ -171,7 +171,7 @@ __global__ void list_tiles(View<S> v, int pieces, const uint64_t* sorted, int64_
     }
     if (from >= end) return;
     const int64_t slot = v.slots[int64_t(pose) * (v.count + 1) + rank] + before;
-    find_tiles<S, kTangent>(v, range, record, from, end, [&](int nth, int tile) {
+    find_tiles<S, P>(v, range, record, from, end, [&](int nth, int tile) {
         if (lane == 0 && slot + nth < v.capacity) keys[slot + nth] = uint32_t(pose) * v.tiles + tile, gaussians[slot + nth] = i;
     });
 }
@@ -217,12 +217,12 @@ template <class S>
 int64_t list(const View<S>& v, void* stream, const uint64_t* sorted, int64_t* counts, uint32_t* keys, int32_t* gaussians) {
     const int64_t all = int64_t(v.poses) * v.count;
     const int pieces = pieces_for(all), warps = pieces > kWarps ? pieces : kWarps, together = warps / pieces;
-    const auto kernel = v.settings.tangent ? list_tiles<S, true> : list_tiles<S, false>;
+    const auto kernel = with_projection(v.settings.projection, [](auto p) { return list_tiles<S, decltype(p)>; });
     return launch(kernel, (all + together - 1) / together, 1, warps * kWarp, stream, v, pieces, sorted, counts, keys, gaussians);
 }
 
 template <class S> int64_t plan(const Call& call) {
-    auto in = reader(call);
+    Reader in(call);
     View<S> v = read_view<S>(call, in);
     const Model<S> model = read_model<S>(in);
     const auto* ids = in.next<const int64_t>();
@@ -249,8 +249,9 @@ template <class S> int64_t plan(const Call& call) {
     if (steps.result() || arena.measuring()) return steps.result() ? steps.result() : arena.bytes();
 
     void* stream = reinterpret_cast<void*>(uintptr_t(call.stream));
+    const auto project = with_projection(v.settings.projection, [](auto p) { return project_kernel<S, decltype(p)>; });
     steps.then([&] { return clear(out.wrong, 0xff, 2 * sizeof *out.wrong, stream); });  // sound, and sorted
-    steps.then([&] { return launch(project_kernel<S>, blocks_for(all), 1, kThreads, stream, v, model, out); });
+    steps.then([&] { return launch(project, blocks_for(all), 1, kThreads, stream, v, model, out); });
     for (int pose = 0; pose < sorts; ++pose) {
         const int64_t at = pose * sorted_at_once;
         steps.then([&] { return sort_pairs<uint64_t>(temp, sort_bytes, out.keys + at, keys + at, out.values + at, v.order + at, sorted_at_once, bits, stream); });
@@ -267,7 +268,7 @@ template <class S> int64_t plan(const Call& call) {
 }
 
 template <class S> int64_t bin(const Call& call) {
-    auto in = reader(call);
+    Reader in(call);
     const View<S> v = read_view<S>(call, in);
     const int64_t capacity = v.capacity;
     const int tiles = v.poses * v.tiles, bits = bits_for(tiles);
@@ -289,36 +290,29 @@ template <class S> int64_t bin(const Call& call) {
     return steps.result();
 }
 
+// Fills the grid's tables (host memory); with none, returns how many numbers they hold.
+template <class S> int64_t tables(const Call& call) {
+    const auto settings = in_precision<S>(call.settings);
+    S* const numbers = Reader(call).next<S>();
+    if (!numbers) return table_size(settings);
+    fill_tables(settings, numbers);
+    return 0;
+}
+
 }  // namespace
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" {
-
 // Each call first with scratch 0: returns the bytes of scratch it needs. Then 0, or minus a CUDA error.
-int64_t gsparc_plan(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return plan<decltype(zero)>(*call); });
-}
+GSPARC_ENTRY(plan, plan<S>(call))
+GSPARC_ENTRY(bin, bin<S>(call))
+GSPARC_ENTRY(tables, tables<S>(call))
 
-int64_t gsparc_bin(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) { return bin<decltype(zero)>(*call); });
-}
-
-// Fills the grid's tables (host memory); with none, returns how many numbers they hold.
-int64_t gsparc_tables(const gsparc::GSPARC_ISA::Call* call) {
-    using namespace gsparc::GSPARC_ISA;
-    return with_scalar(*call, [&](auto zero) -> int64_t {
-        using S = decltype(zero);
-        if (call->tensors[0]) fill_tables(gsparc::in_precision<S>(call->settings), reinterpret_cast<S*>(uintptr_t(call->tensors[0])));
-        return call->tensors[0] ? 0 : table_size(gsparc::in_precision<S>(call->settings));
-    });
-}
+extern "C" {
 
 // Whether the driver can run these kernels on the call's device; `built_for` and `driver` receive the CUDA versions of
 // the build and of the driver.
-int64_t gsparc_check(gsparc::GSPARC_ISA::Call* call) {
+int64_t gsparc_check(gsparc::Call* call) {
 #ifdef __CUDACC__
     using namespace gsparc::GSPARC_ISA;
     cudaFuncAttributes known;

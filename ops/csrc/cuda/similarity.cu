@@ -121,16 +121,17 @@ int tiles_of(int height, int width) { return (height + kHigh - 1) / kHigh * ((wi
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
 
-extern "C" int64_t gsparc_similarity(const gsparc::GSPARC_ISA::Call* call) {
+extern "C" int64_t gsparc_similarity(const gsparc::Call* call) {
     using namespace gsparc::GSPARC_ISA;
     Images a;
-    a.height = call->height, a.width = call->width, a.radius = call->radius;
-    a.c1 = float(call->window[0]), a.c2 = float(call->window[1]);
-    for (int k = 0; k < kTaps; ++k) a.taps[k] = k > 2 * a.radius ? 0.0f : float(call->window[2 + (k <= a.radius ? k : 2 * a.radius - k)]);
-    auto in = reader(*call);
+    gsparc::Reader in(*call);
+    int64_t samples;
+    in.sizes(samples, a.height, a.width, a.radius);
+    a.c1 = float(call->numbers[0]), a.c2 = float(call->numbers[1]);
+    for (int k = 0; k < kTaps; ++k) a.taps[k] = k > 2 * a.radius ? 0.0f : float(call->numbers[2 + (k <= a.radius ? k : 2 * a.radius - k)]);
     in.read(a.prediction, a.target, a.shift, a.sums, a.slope);
     Arena arena(reinterpret_cast<void*>(uintptr_t(call->scratch)));
-    a.by = a.slope ? arena.take<float>(kDerivatives * call->samples * a.places()) : nullptr;
+    a.by = a.slope ? arena.take<float>(kDerivatives * samples * a.places()) : nullptr;
     if (arena.measuring()) return arena.bytes();
 
     if (const int64_t error = use_device(call->device)) return -error;
@@ -138,7 +139,7 @@ extern "C" int64_t gsparc_similarity(const gsparc::GSPARC_ISA::Call* call) {
     Steps steps;
     auto tiled = [&](void (*kernel)(Images), int height, int width) {
         a.tiles_x = (width + kWide - 1) / kWide, a.tiles = tiles_of(height, width);
-        return launch(kernel, int64_t(call->samples) * a.tiles, 1, kBlock, stream, a);
+        return launch(kernel, samples * a.tiles, 1, kBlock, stream, a);
     };
     steps.then([&] { return tiled(similarity_places, a.rows(), a.columns()); });
     if (a.slope) steps.then([&] { return tiled(similarity_slopes, a.height, a.width); });

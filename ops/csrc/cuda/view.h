@@ -2,8 +2,8 @@
 #pragma once
 #include "cuda/device.h"
 
-#include "boxes.h"
 #include "layer.h"
+#include "projection.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
@@ -11,20 +11,6 @@ namespace GSPARC_ISA {
 // A lane is a pixel of a tile. A block of kWarps warps shares a tile.
 constexpr int kWarps = 4, kBlock = kWarps * kWarp;
 static_assert(kTileWidth * kTileHeight == kWarp, "a lane is a pixel");
-
-// One call from Python (cuda_library.py has the same structure). Addresses of 0 are absent tensors.
-struct Call {
-    int32_t twice, poses, count, samples, channels, capacity, device, height, width;
-    int32_t inputs, hidden;       // of networks
-    int32_t radius;               // of the window of a similarity
-    int32_t built_for, driver;    // CUDA versions
-    KernelSettings<double> settings;
-    double window[8];             // of a similarity: C1, C2, one half of its taps
-    uint64_t tensors[32];
-    uint64_t scratch, stream;
-};
-
-inline Reader reader(const Call& call) { return {call.tensors, call.tensors + 32}; }
 
 // The plan's buffers. Slots are entries in the order of the ranks: the slots of one Gaussian lie together.
 template <class S> struct View {
@@ -48,7 +34,7 @@ template <class S> struct View {
 
 template <class S> View<S> read_view(const Call& call, Reader& in) {
     View<S> v;
-    v.poses = call.poses, v.count = call.count, v.capacity = call.capacity;
+    in.sizes(v.poses, v.count, v.capacity);
     v.settings = in_precision<S>(call.settings);
     v.tiles_x = (v.settings.width + kTileWidth - 1) / kTileWidth;
     v.tiles = v.tiles_x * ((v.settings.height + kTileHeight - 1) / kTileHeight);
@@ -60,7 +46,7 @@ template <class S> View<S> read_view(const Call& call, Reader& in) {
 }
 
 // One lane's pixel of a tile.
-template <class S, bool kTangent> struct Pixel {
+template <class S, class P> struct Pixel {
     int row, column;
     bool real;               // false beyond the edge of the grid
     S east, north, up;       // its direction
@@ -80,12 +66,7 @@ template <class S, bool kTangent> struct Pixel {
     GSPARC_HD bool offsets(const S* record, const KernelSettings<S>& settings, S& tau1, S& tau2, S& form) const {
         const Tables<S> circle = {nullptr, nullptr, nullptr, nullptr, nullptr, turn, per_turn};
         const Place<S> here = {S(1), up, S(row), east, north, number};  // the row's cosine is in the columns already
-        const RowView<S, kTangent> view(record, here, circle, settings);
-        typename RowView<S, kTangent>::Seen seen;
-        const bool inside = view.look(here, seen);
-        form = view.form(seen);
-        view.slopes(seen, tau1, tau2);
-        return inside && real;
+        return P::offsets(record, here, circle, settings, tau1, tau2, form) && real;
     }
     GSPARC_HD int64_t place(const KernelSettings<S>& settings) const { return int64_t(row) * settings.width + column; }
 };
@@ -98,3 +79,14 @@ template <class F> int64_t with_scalar(const Call& call, F run) {
 
 }  // namespace GSPARC_ISA
 }  // namespace gsparc
+
+// `gsparc_NAME`, called by Python: `result` of a `call` of scalars S.
+#define GSPARC_ENTRY(name, result)                               \
+    extern "C" int64_t gsparc_##name(const gsparc::Call* at) {   \
+        using namespace gsparc::GSPARC_ISA;                      \
+        const gsparc::Call& call = *at;                          \
+        return with_scalar(call, [&](auto zero) -> int64_t {     \
+            using S = decltype(zero);                            \
+            return result;                                       \
+        });                                                      \
+    }

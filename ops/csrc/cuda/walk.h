@@ -30,13 +30,13 @@ template <class S, int kChannels> struct Desk {
     S through[kWarps][kWarp], after[kWarps][kWarp], spent[kWarps][kWarp];
 };
 
-template <class S, bool kTangent, int kChannels> struct Walk {
+template <class S, class P, int kChannels> struct Walk {
     using Shared = Desk<S, kChannels>;
 
     const View<S>& v;
     Shared& desk;
     const int warp, lane, pose;
-    const Pixel<S, kTangent> pixel;
+    const Pixel<S, P> pixel;
     const S floor, alpha_max;
     int base, end, first = 0, taken = 0, per = 0;
     S light = 1, start = 1;  // before the batch of all warps, and before this warp's piece
