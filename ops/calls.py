@@ -56,7 +56,8 @@ def call_for(
     """A call in the precision and on the device of `like`; the caller keeps the tensors alive."""
     call = Call(like.dtype == torch.float64, torch.get_num_threads(), max(like.get_device(), 0))
     call.sizes[: len(sizes)] = sizes
-    call.numbers[: len(numbers)] = numbers
+    if numbers:
+        call.numbers[: len(numbers)] = numbers
     addresses = [0 if t is None else t.data_ptr() for t in tensors]
     struct.pack_into(f"{len(addresses)}Q", call, Call.tensors.offset, *addresses)  # ctypes takes far longer
     if settings is not None:
