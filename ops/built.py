@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import functools
-from types import ModuleType
+from typing import Any
 
 
 @functools.cache
-def kernels() -> ModuleType | None:
+def kernels() -> Any:
     """The compiled CPU kernels, or None in an install without a compiler."""
     try:
         from gsparc.ops import _native

@@ -108,9 +108,9 @@ def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, sett
     starts = count * tiles(settings) + 1
     if n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
-        return Buffers(*zeros, buffers.entries.new_zeros(starts)), means2d, radii, visible
+        return Buffers._make([*zeros, buffers.entries.new_zeros(starts)]), means2d, radii, visible
     verdict = means.new_empty(2, dtype=torch.int64)
-    view = {"gaussians": gaussians, "poses": poses, "settings": settings}
+    view: dict[str, Any] = {"gaussians": gaussians, "poses": poses, "settings": settings}
     run_on_plan("plan", ids, means2d, radii, visible, verdict, buffers=buffers, **view)
     key = (count, n, settings)
     if _capturing(means):

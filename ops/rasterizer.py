@@ -60,7 +60,7 @@ def make_plan(
 
 def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
     """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
-    gaussians = validation.gaussians(*parameters, ids=None)  # type: ignore[arg-type]
+    gaussians = validation.gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
     if plan.num_gaussians != len(gaussians.means):
         raise ValueError(
             f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan again"

@@ -74,11 +74,11 @@ def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Ten
 def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """For a pose and the Gaussians in depth order: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
     order = plan.buffers[0][index]
-    means, quats, scales, opacities, extinctions = (None if t is None else t[order] for t in gaussians)
-    seen = reference.project(means, quats, scales, plan.pose[index], plan.grid, plan.optics)
+    near = Gaussians._make(None if t is None else t[order] for t in gaussians)
+    seen = reference.project(near.means, near.quats, near.scales, plan.pose[index], plan.grid, plan.optics)
     shift = (means2d[index] - means2d[index].detach())[order]
     shapes = reference.footprints(seen, plan.grid, plan.optics, shift)
-    hides = opacities if extinctions is None else extinctions
-    alpha, gamma = reference.layers(seen, shapes, opacities, hides, plan.optics)
+    hides = near.opacities if near.extinctions is None else near.extinctions
+    alpha, gamma = reference.layers(seen, shapes, near.opacities, hides, plan.optics)
     before, transmittance = reference.transmittances(gamma, plan.optics.cutoff.transmittance)
     return alpha * before, alpha, transmittance
