@@ -249,7 +249,8 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     import gsparc.commands.link.command as command
 
     data, file = trained
-    monkeypatch.setattr("gsparc.evaluation.open_runs.load", lambda settings: data)
+    module = SimpleNamespace(measurements=data)
+    monkeypatch.setattr("gsparc.evaluation.open_runs.datamodule", lambda settings, trusted: module)
     monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
     config = compose(
         f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",

@@ -1,4 +1,4 @@
-"""Checkpoints of before the modules were sorted anew still load, and answer what they answered then."""
+"""Checkpoints written before modules were moved and renamed still load, and predict the same."""
 
 from __future__ import annotations
 
@@ -49,31 +49,31 @@ def holding(part: str) -> list[str]:
     return [name for name, known in sorted(everything().items()) if part in known]
 
 
-def same(found: Any, expected: np.ndarray, what: str) -> None:
+def check_equal(found: Any, expected: np.ndarray, what: str) -> None:
     found = found.detach().numpy() if isinstance(found, torch.Tensor) else np.asarray(found)
     assert found.shape == expected.shape and found.dtype == expected.dtype, what
     scale = float(np.abs(expected).max()) if expected.size else 0.0
     np.testing.assert_allclose(found, expected, rtol=RTOL, atol=ATOL * max(scale, 1e-30), err_msg=what)
 
 
-def said(prediction: Any, known: dict[str, np.ndarray], prefix: str = "") -> None:
+def check_prediction(prediction: Any, known: dict[str, np.ndarray], prefix: str = "") -> None:
     for part in ("mean", "confidence", "variance"):
         value = getattr(prediction, part)
         assert (value is None) == (prefix + part not in known), prefix + part
         if value is not None:
-            same(value, known[prefix + part], prefix + part)
+            check_equal(value, known[prefix + part], prefix + part)
 
 
-def asked(known: dict[str, np.ndarray]) -> Batch:
+def question_of(known: dict[str, np.ndarray]) -> Batch:
     """The three positions, or snapshots, in local coordinates."""
-    told = {part: torch.from_numpy(value) for part, value in known.items() if value.dtype.kind in "fc"}
+    tensors = {part: torch.from_numpy(value) for part, value in known.items() if value.dtype.kind in "fc"}
     return Batch(
         index=torch.arange(3),
-        tx=told["tx"],
-        rx=Pose(told["rx_position"], told["rx_rotation"]),
-        target=torch.zeros_like(told["mean"]),
-        noise_variance=told.get("noise_variance"),
-        uplink=told.get("uplink"),
+        tx=tensors["tx"],
+        rx=Pose(tensors["rx_position"], tensors["rx_rotation"]),
+        target=torch.zeros_like(tensors["mean"]),
+        noise_variance=tensors.get("noise_variance"),
+        uplink=tensors.get("uplink"),
     )
 
 
@@ -89,30 +89,30 @@ def test_nothing_is_missing():
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_it_answers_as_it_did(name):
+def test_predictions_are_the_same(name):
     known = everything()[name]
     method, _ = load(FIXTURES / f"{name}.ckpt")
-    batch = asked(known)
+    batch = question_of(known)
     with torch.no_grad():
-        said(method.answer(batch), known)
+        check_prediction(method.answer(batch), known)
         if "uplink" not in known:
-            said(method.predict(batch.tx, batch.rx), known)
+            check_prediction(method.predict(batch.tx, batch.rx), known)
 
 
 @pytest.mark.parametrize("name", sorted({*holding("asked_at"), *holding("asked")}))
-def test_it_answers_in_world_coordinates(name):
-    """What is not stored apart is what the method says, in physical units."""
+def test_predictions_in_world_coordinates_are_the_same(name):
+    """What is not stored apart is the method's prediction, in physical units."""
     known = everything()[name]
     predictor = gsparc.load(FIXTURES / f"{name}.ckpt")
     question = in_the_world(predictor, known)
     expected = known.get("asked", known["mean"] * np.float32(predictor.site.target_scale))
-    same(getattr(predictor, predictor.site.kind)(**question), expected, "asked")
+    check_equal(getattr(predictor, predictor.site.kind)(**question), expected, "asked")
     if "confidence" in known:
-        same(predictor.confidence(**question), known.get("sure", known["confidence"]), "sure")
+        check_equal(predictor.confidence(**question), known.get("sure", known["confidence"]), "sure")
 
 
 @pytest.mark.parametrize("name", holding("paths_gain"))
-def test_it_is_made_of_the_same_paths(name):
+def test_paths_are_the_same(name):
     known = everything()[name]
     predictor = gsparc.load(FIXTURES / f"{name}.ckpt")
     found = predictor.paths(**in_the_world(predictor, known))
@@ -124,18 +124,18 @@ def test_it_is_made_of_the_same_paths(name):
     ):
         assert (value is None) == (part not in known), part
         if value is not None:
-            same(value, known[part], part)
+            check_equal(value, known[part], part)
 
 
 @pytest.mark.parametrize("name", holding("unknown_noise/mean"))
-def test_it_hears_an_uplink_of_unknown_noise(name):
+def test_predictions_from_an_uplink_of_unknown_noise_are_the_same(name):
     known = everything()[name]
     method, _ = load(FIXTURES / f"{name}.ckpt")
-    said(method.listen(torch.from_numpy(known["uplink"])), known, "unknown_noise/")
+    check_prediction(method.listen(torch.from_numpy(known["uplink"])), known, "unknown_noise/")
 
 
 @pytest.mark.parametrize("name", holding("accepts"))
-def test_it_trusts_and_accepts_as_it_did(name):
+def test_confidence_and_acceptance_are_the_same(name):
     known = everything()[name]
     path = FIXTURES / f"{name}.ckpt"
     predictor = gsparc.load(path)
@@ -145,18 +145,20 @@ def test_it_trusts_and_accepts_as_it_did(name):
     for kind in KINDS:
         if f"sure_{kind}" in known:
             other = gsparc.load(path, confidence=kind)
-            same(other.confidence(**question), known[f"sure_{kind}"], kind)
+            check_equal(other.confidence(**question), known[f"sure_{kind}"], kind)
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if name.startswith("traded")])
-def test_what_was_traded_away_stays_so(name):
+def test_reduced_models_predict_the_same(name):
     known = everything()[name]
     method, stored = load(FIXTURES / f"{name}.ckpt")
     points, measured = kept(stored.extra)
-    batch, spared = asked(known), 0
+    batch, reductions = question_of(known), 0
     for number, point in enumerate(points):
         if point.settings:
             view = reduced(method, point.settings, measured)
-            said(view.predict(batch.tx, batch.rx), known, f"point{number}/")
-            spared += 1
-    assert spared == len([part for part in known if part.endswith("/mean") and part.startswith("point")]) > 0
+            check_prediction(view.predict(batch.tx, batch.rx), known, f"point{number}/")
+            reductions += 1
+    assert (
+        reductions == len([part for part in known if part.endswith("/mean") and part.startswith("point")]) > 0
+    )

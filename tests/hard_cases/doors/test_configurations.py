@@ -77,7 +77,7 @@ VALUES = {
     "model.attenuation.d_min=0": "model.attenuation.d_min=0: a number above 0",
     "model.attenuation.gain=-2": "model.attenuation.gain=-2",
     "model.attenuation.d_ref=nan": "model.attenuation.d_ref=nan",
-    "model.raster.projection=tangents": "'equirect' or 'tangent'",
+    "model.raster.projection=tangents": "'tangent' or 'equirect'",
     "model.raster.backend=gpu": "'reference', 'cpu' or 'cuda'",
     "model.raster.low_pass=-1": "low_pass >= 0",
     "model.raster.alpha_cutoff=2": r"cut-offs lie in \(0, 1\)",
