@@ -27,7 +27,8 @@ from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.evaluate import Evaluation, evaluate
-from gsparc.evaluation.metrics import DECIDING, figure_names, score_of
+from gsparc.evaluation.figures import DECIDING, score_of
+from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary

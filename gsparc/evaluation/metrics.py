@@ -7,7 +7,6 @@ are NaN in the per-sample arrays, never enter a mean, are counted, and come out 
 from __future__ import annotations
 
 import logging
-import math
 from typing import Any
 
 import numpy as np
@@ -26,11 +25,6 @@ SMALLEST_UNIT = 1e-140  # beyond it or its inverse squares under- or overflow: f
 SILENCE = 1e-6  # of the true power: a silent prediction is 60 dB off, not infinitely
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
-DECIDING: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "nmse", "rssi": "rmse_db"}
-"""The figure by which methods, fronts and effects are compared."""
-
-RATIOS = ("nmse", "nmse_scalar", "mse")  # of powers: compared in decibels, smaller is better
-DISTANCES = ("rmse_db", "mae_db", "power_mae_db", "mae")  # smaller is better
 
 
 class SampleMetric(Metric):
@@ -227,18 +221,6 @@ def figure_names(kind: Kind) -> tuple[str, ...]:
     metric.update(one, one)
     counts = ("samples", "silent_samples")
     return tuple(name for name in metric.summary(metric.compute()) if name not in counts)
-
-
-def lower_is_better(figure: str) -> bool:
-    """Whether a smaller value of a figure of merit is the better one."""
-    return figure in RATIOS or figure in DISTANCES
-
-
-def score_of(figure: str, value: float) -> float:
-    """A number that is larger when the figure is better: in decibels for ratios of powers, else as it is."""
-    if figure in RATIOS:
-        return -10 * math.log10(max(value, 1e-12))
-    return -value if figure in DISTANCES else value
 
 
 def paired_values(samples: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

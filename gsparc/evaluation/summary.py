@@ -17,6 +17,7 @@ import numpy as np
 from rich.table import Table
 
 from gsparc.data.files import whole_file
+from gsparc.evaluation.figures import DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 ORDER = ("zero", "mean", "nearest", "idw", "gp")  # of the baselines
@@ -63,12 +64,7 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
         title: what was measured.
         prefix: `test`, `train` or `val`.
     """
-    if f"{prefix}/ssim" in facts:
-        wanted = (("ssim", ".4f"), ("ssim_gauss", ".4f"), ("psnr_db", ".2f"), ("skill", ".3f"))
-    elif f"{prefix}/rmse_db" in facts:
-        wanted = (("rmse_db", ".2f"), ("mae_db", ".2f"), ("nmse", ".4f"), ("skill", ".3f"))
-    else:
-        wanted = (("nmse", ".3g"), ("nmse_scalar", ".3g"), ("snr_db", ".2f"), ("skill", ".3f"))
+    wanted = [(name, form_of(name)) for name in (*TABLES[facts["dataset/kind"]], "skill")]
     names = sorted({k.split("/")[1] for k in facts if k.startswith("baseline/")})
     names.sort(key=lambda name: ORDER.index(name) if name in ORDER else len(ORDER))
     rows = []
@@ -115,13 +111,12 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """The baseline that beats the method, if one does."""
-    figure = next((name for name in ("psnr_db", "rmse_db") if f"{prefix}/{name}" in facts), "nmse")
-    sign = -1 if figure == "psnr_db" else 1
+    figure = DECIDING[facts["dataset/kind"]]
     own = facts.get(f"{prefix}/{figure}")
     keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
-    known = {k.split("/")[1]: sign * float(facts[k]) for k in keys if facts[k] is not None}
-    best = min(known, key=lambda name: known[name], default=None)
-    if best is None or own is None or known[best] >= sign * float(own):
+    known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
+    best = max(known, key=lambda name: known[name], default=None)
+    if best is None or own is None or known[best] <= score_of(figure, own):
         return []
     return [f"{best} has the better {figure} here: for this data and split it is the better choice"]
 

@@ -18,7 +18,8 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import one_line
-from gsparc.evaluation.metrics import DECIDING, figure_names, lower_is_better, score_of
+from gsparc.evaluation.figures import DECIDING, lower_is_better, score_of
+from gsparc.evaluation.metrics import figure_names
 from gsparc.methods import checkpoint
 from gsparc.training.lightning_module import GaussianModule
 

@@ -10,14 +10,11 @@ import torch
 from skimage.metrics import structural_similarity
 
 from gsparc.evaluation.metrics import (
-    DECIDING,
     ChannelMetrics,
     PowerMetrics,
     SpectrumMetrics,
-    lower_is_better,
     metrics_for,
     paired_values,
-    score_of,
 )
 
 
@@ -174,21 +171,6 @@ def test_paired_values_average_to_the_figures(kind):
     assert {"nmse", "mse"} < set(values)
     for name, value in values.items():
         assert value.mean() == pytest.approx(figures[name], rel=1e-9)
-
-
-def test_a_score_is_larger_when_the_figure_is_better():
-    assert score_of("psnr_db", 30) > score_of("psnr_db", 20)
-    assert score_of("nmse", 0.01) == pytest.approx(20) and score_of("nmse", 0.1) < score_of("nmse", 0.01)
-    assert score_of("rmse_db", 2) > score_of("rmse_db", 3) and np.isfinite(score_of("nmse", 0.0))
-
-
-def test_every_figure_knows_which_way_is_better():
-    """The validation error of channels did not: the report called the worst moment of a training its best."""
-    smaller = {"nmse", "mse", "mae", "rmse_db", "mae_db"}
-    larger = {"psnr_db", "snr_db", "ssim", "ssim_gauss", "skill"}
-    assert all(lower_is_better(name) and score_of(name, 0.1) > score_of(name, 0.2) for name in smaller)
-    assert not any(lower_is_better(name) or score_of(name, 0.1) > score_of(name, 0.2) for name in larger)
-    assert set(DECIDING.values()) <= smaller | larger
 
 
 def test_poison_is_refused():

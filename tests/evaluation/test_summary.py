@@ -50,6 +50,7 @@ def test_samples_become_rows(tmp_path):
 
 def test_table_shows_no_accuracy_without_its_time():
     facts = {
+        "dataset/kind": "spectrum",
         "test/ssim": 0.91234,
         "test/psnr_db": 30.0,
         "time/train_s": 123.0,
@@ -64,7 +65,7 @@ def test_table_shows_no_accuracy_without_its_time():
     lines = [line for line in console.export_text().splitlines() if "│" in line]
     cells = [[cell.strip() for cell in line.strip("│ ").split("│")] for line in lines]
     assert [row[0] for row in cells] == ["zero", "gp", "gsparc"]
-    assert cells[2] == ["gsparc", "0.9123", "-", "30.00", "-", "123", "1.25"]
+    assert cells[2] == ["gsparc", "30.00", "-", "0.9123", "-", "-", "123", "1.25"]
     assert cells[1][-2:] == ["0.5", "2.5"]
 
 
@@ -81,12 +82,13 @@ def test_commit_is_known_inside_the_tree_only(tmp_path):
 
 
 def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
-    facts = {"dataset/stand_in": "rfid", "machine/load": 3.0, "test/nmse": 0.2}
+    facts = {"dataset/kind": "csi", "dataset/stand_in": "rfid", "machine/load": 3.0, "test/nmse": 0.2}
     facts |= {"baseline/gp/nmse": 0.1, "baseline/idw/nmse": 0.3}
     said = " | ".join(remarks(facts))
     for words in ("SIMULATED stand-in", "load 3.0", "gp has the better nmse"):
         assert words in said
     assert "idw" not in said
-    quiet = {"dataset/stand_in": None, "machine/load": 0.5, "test/psnr_db": 30.0, "baseline/gp/psnr_db": 29.0}
+    quiet = {"dataset/kind": "spectrum", "dataset/stand_in": None, "machine/load": 0.5, "test/psnr_db": 30.0}
+    quiet["baseline/gp/psnr_db"] = 29.0
     assert remarks(quiet) == []
     assert "gp" in remarks({**quiet, "baseline/gp/psnr_db": 31.0})[0]

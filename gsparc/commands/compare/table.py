@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.commands.compare.fitting import Filled
 from gsparc.commands.compare.latency import Latency
 from gsparc.data.schema import Kind
-from gsparc.evaluation.metrics import DECIDING, score_of
+from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.summary import BUSY, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from gsparc.commands.study.study import Row
 from gsparc.evaluation.drawing import logarithmic, panels, save
-from gsparc.evaluation.metrics import lower_is_better
+from gsparc.evaluation.figures import lower_is_better
 
 
 @dataclass(frozen=True)

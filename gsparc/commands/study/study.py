@@ -12,7 +12,7 @@ import numpy as np
 from gsparc.commands.study.run import Outcome, fit_and_score, in_folders, query_ms
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.metrics import DECIDING
+from gsparc.evaluation.figures import DECIDING
 from gsparc.methods.method import FitContext, Method
 from gsparc.methods.timing import ClockSettings
 

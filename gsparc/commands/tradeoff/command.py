@@ -22,7 +22,7 @@ from gsparc.data.files import platform_cache
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.metrics import DECIDING, score_of
+from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.evaluation.summary import provenance, table, write_samples, write_summary

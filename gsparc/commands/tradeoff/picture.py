@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsparc.evaluation.drawing import logarithmic, panels, save
-from gsparc.evaluation.metrics import lower_is_better, score_of
+from gsparc.evaluation.figures import lower_is_better, score_of
 from gsparc.methods.pareto import Point
 
 NAMES = {

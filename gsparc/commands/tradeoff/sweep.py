@@ -14,7 +14,7 @@ from torch import Tensor
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import paired_differences
-from gsparc.evaluation.metrics import DECIDING
+from gsparc.evaluation.figures import DECIDING
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Point, Settings

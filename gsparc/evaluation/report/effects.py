@@ -8,10 +8,10 @@ from itertools import product
 
 import numpy as np
 
+from gsparc.evaluation.figures import PER_SAMPLE, heading_of
 from gsparc.evaluation.report.intervals import Interval
-from gsparc.evaluation.report.runs import PER_SAMPLE, Run, number, sizes
+from gsparc.evaluation.report.runs import Run, number, sizes
 from gsparc.evaluation.report.table import Column, Table
-from gsparc.evaluation.report.tables import HEADS
 
 
 def effects(runs: Sequence[Run]) -> Table | None:
@@ -21,7 +21,7 @@ def effects(runs: Sequence[Run]) -> Table | None:
         "Effects: gain and cost",
         [
             Column("effect"), Column("without"), Column("with"),
-            Column(f"{HEADS.get(name, name)} gained", "+.2f"),
+            Column(f"{heading_of(name)} gained", "+.2f"),
             Column("train s more", "+.3g"), Column("query ms more", "+.3g"),
         ],
         note="Differences per test sample, mean and 95 % interval; same seed, same split.",

@@ -7,10 +7,9 @@ from functools import partial
 
 import numpy as np
 
-from gsparc.evaluation.metrics import score_of
+from gsparc.evaluation.figures import form_of, heading_of, score_of
 from gsparc.evaluation.report.runs import Run, number
 from gsparc.evaluation.report.table import Column, Table
-from gsparc.evaluation.report.tables import FORMS, HEADS
 
 MINUTES = (1, 2, 5, 10)
 
@@ -18,12 +17,12 @@ MINUTES = (1, 2, 5, 10)
 def within_minutes(runs: Sequence[Run]) -> Table:
     """The best validation figure reached within fixed training times, and the time to fixed figures."""
     figure = validation_figure(runs[0])
-    head = HEADS.get(figure, figure)
+    head = heading_of(figure)
     table = Table(
         "Accuracy against training time",
         [
             Column("method and setting"), Column("seed", "d"),
-            *(Column(f"{head} within {m} min", FORMS.get(figure, ".4f")) for m in MINUTES),
+            *(Column(f"{head} within {m} min", form_of(figure)) for m in MINUTES),
             *(Column(f"s to {level:.4g}", ".3g") for level in levels(runs)),
             Column("train s in all", ".3g"),
         ],

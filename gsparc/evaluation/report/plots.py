@@ -17,11 +17,11 @@ from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
 from gsparc.evaluation.drawing import logarithmic, panels, save
-from gsparc.evaluation.metrics import lower_is_better, score_of
+from gsparc.evaluation.figures import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.intervals import interval, over_seeds
 from gsparc.evaluation.report.learning import curve, validation_figure
-from gsparc.evaluation.report.runs import PER_SAMPLE, Run, sizes
-from gsparc.evaluation.report.tables import BASELINES, HEADS, grouped
+from gsparc.evaluation.report.runs import Run, sizes
+from gsparc.evaluation.report.tables import BASELINES, grouped
 from gsparc.methods.pareto import front
 
 WIDE, TALL = 7.0, 3.8
@@ -100,7 +100,7 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
         axes.step(np.sort(rival), np.arange(1, len(rival) + 1) / len(rival), c="k", lw=0.8, label="gp")
     axes.set_ylabel("share of samples")
     title = "How the accuracy is distributed (95 % bands)"
-    return _finished(axes, title, f"{HEADS.get(name, name)} of a test sample")
+    return _finished(axes, title, f"{heading_of(name)} of a test sample")
 
 
 def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
@@ -118,7 +118,7 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
         for axes, name in zip(line, names, strict=False):
             values = np.abs(np.concatenate([run.samples[name] for run in group]))
             _cdf(axes, values[np.isfinite(values)], label, number, samples=len(group[0].samples[name]))
-            axes.set_xlabel(HEADS.get(name, name))
+            axes.set_xlabel(heading_of(name))
         if timed:
             every = [run.render_ms for run in group if len(run.render_ms)]
             _cdf(line[-1], np.concatenate(every), label, number)
@@ -188,7 +188,7 @@ def costs(runs: Sequence[Run]) -> Figure:
         "s simulated": lambda run: run.facts.get("dataset/simulate_s"),
         "s trained": lambda run: run.facts.get("time/train_s"),
         "ms a query": lambda run: run.latency[0],
-        HEADS.get(name, name): lambda run: run.figure_of(name),
+        heading_of(name): lambda run: run.figure_of(name),
     }
     for panel, (title, value) in zip(line, columns.items(), strict=True):
         for row, group in enumerate(groups.values()):
@@ -254,7 +254,7 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
         points.scatter(stated, value, s=8, color=color, label=f"{short(run.setting)}: rank {rank:+.2f}")
         kept.plot(share, mean, color=color, lw=1)
         kept.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
-    points.set(xlabel="confidence", ylabel=HEADS.get(name, name))
+    points.set(xlabel="confidence", ylabel=heading_of(name))
     kept.set_xlabel("share of answers used, most confident first")
     kept.set_title("mean over the answers used (95 % band)", fontsize=8)
     _legend(points)
@@ -273,7 +273,7 @@ def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
 
 
 def _accuracy_axis(axes: Axes, name: str) -> None:
-    axes.set_ylabel(HEADS.get(name, name))
+    axes.set_ylabel(heading_of(name))
     if lower_is_better(name):
         axes.set_yscale("log")
 

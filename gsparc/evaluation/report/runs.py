@@ -14,12 +14,8 @@ import numpy as np
 import yaml
 
 from gsparc.data.schema import Kind
-from gsparc.evaluation.metrics import DECIDING
+from gsparc.evaluation.figures import DECIDING
 
-SIDE: dict[Kind, tuple[str, ...]] = {
-    "spectrum": ("ssim_gauss", "ssim", "mse"), "csi": ("snr_db",), "rssi": ("mae_db", "nmse")
-}  # fmt: skip
-PER_SAMPLE: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": "error_db"}
 HIDDEN = ("seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment", "logger")
 
 

@@ -6,22 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gsparc.evaluation.figures import PER_SAMPLE, TABLES, form_of, heading_of
 from gsparc.evaluation.report.intervals import Interval, interval, over_seeds
-from gsparc.evaluation.report.runs import PER_SAMPLE, SIDE, Run, number
+from gsparc.evaluation.report.runs import Run, number
 from gsparc.evaluation.report.table import Column, Table
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
 WORST = 3
-FORMS = {"psnr_db": ".2f", "snr_db": ".2f", "rmse_db": ".2f", "mae_db": ".2f", "nmse": ".3g", "mse": ".3g"}
-HEADS = {
-    "psnr_db": "PSNR dB", "ssim_gauss": "SSIM (Gauss 11)", "ssim": "SSIM (uniform 7)", "mse": "MSE",
-    "nmse": "NMSE", "snr_db": "SNR dB", "rmse_db": "RMSE dB", "mae_db": "MAE dB",
-}  # fmt: skip
 
 
-def heading(figure: str, note: str = "") -> Column:
+def heading(name: str, note: str = "") -> Column:
     """Of an accuracy."""
-    return Column(HEADS.get(figure, figure), FORMS.get(figure, ".4f"), note)
+    return Column(heading_of(name), form_of(name), note)
 
 
 def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
@@ -34,7 +30,7 @@ def grouped(runs: Sequence[Run]) -> dict[str, list[Run]]:
 
 def results(runs: Sequence[Run]) -> Table:
     """Every run and every baseline of one study: accuracy, time, memory, size, effects, data and commit."""
-    figures = (runs[0].figure, *SIDE[runs[0].kind])
+    figures = TABLES[runs[0].kind]
     table = Table(
         "Results",
         [
@@ -72,7 +68,7 @@ def results(runs: Sequence[Run]) -> Table:
 
 def seeds(runs: Sequence[Run]) -> Table:
     """Settings side by side, their spread over seeds, and what they cost."""
-    figures = (runs[0].figure, *SIDE[runs[0].kind])
+    figures = TABLES[runs[0].kind]
     table = Table(
         "Settings over seeds",
         [
@@ -118,7 +114,7 @@ def worst(runs: Sequence[Run]) -> Table:
         "The three worst receivers",
         [
             Column("method and setting"), Column("seed", "d"), Column("sample"), Column("where [m]"),
-            Column(HEADS.get(name, name), ".2f"), Column("gp there", ".2f"), Column("confidence", ".2f"),
+            Column(heading_of(name), ".2f"), Column("gp there", ".2f"), Column("confidence", ".2f"),
         ],
         note="The moving end's position; the Gaussian process there shows whether it is hard for all.",
     )  # fmt: skip

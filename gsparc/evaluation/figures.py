@@ -1,0 +1,77 @@
+"""Figures of merit as they are shown and compared; `metrics.py` computes them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from gsparc.data.schema import Kind
+
+
+@dataclass(frozen=True)
+class Figure:
+    """How a figure of merit is shown and compared.
+
+    Attributes:
+        heading: of its column and axis.
+        form: format of its numbers.
+        better: which values are better; a `ratio` of powers is compared in decibels, smaller is better.
+    """
+
+    heading: str
+    form: str = ".4f"
+    better: Literal["larger", "smaller", "ratio"] = "larger"
+
+
+FIGURES = {
+    "psnr_db": Figure("PSNR dB", ".2f"),
+    "ssim_gauss": Figure("SSIM (Gauss 11)"),
+    "ssim": Figure("SSIM (uniform 7)"),
+    "mse": Figure("MSE", ".3g", "ratio"),
+    "mae": Figure("MAE", ".3g", "smaller"),
+    "nmse": Figure("NMSE", ".3g", "ratio"),
+    "nmse_scalar": Figure("NMSE up to a scalar", ".3g", "ratio"),
+    "snr_db": Figure("SNR dB", ".2f"),
+    "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
+    "rmse_db": Figure("RMSE dB", ".2f", "smaller"),
+    "mae_db": Figure("MAE dB", ".2f", "smaller"),
+    "error_db": Figure("error dB", ".2f", "smaller"),
+    "skill": Figure("skill", ".3f"),
+}
+TABLES: dict[Kind, tuple[str, ...]] = {
+    "spectrum": ("psnr_db", "ssim_gauss", "ssim", "mse"),
+    "csi": ("nmse", "nmse_scalar", "snr_db"),
+    "rssi": ("rmse_db", "mae_db", "nmse"),
+}
+"""The columns of a kind's tables; methods, fronts and effects are compared by the first."""
+DECIDING: dict[Kind, str] = {kind: names[0] for kind, names in TABLES.items()}
+PER_SAMPLE: dict[Kind, str] = {"spectrum": "psnr_db", "csi": "snr_db", "rssi": "error_db"}
+"""The figure of a single sample, in decibels."""
+
+
+def heading_of(name: str) -> str:
+    """Of a column or an axis; the name itself where it is not a figure of merit."""
+    return _look_up(name).heading
+
+
+def form_of(name: str) -> str:
+    """Format of its numbers."""
+    return _look_up(name).form
+
+
+def lower_is_better(name: str) -> bool:
+    """Whether a smaller value of a figure of merit is the better one."""
+    return _look_up(name).better != "larger"
+
+
+def score_of(name: str, value: float) -> float:
+    """A number that is larger when the figure is better: in decibels for ratios of powers, else as it is."""
+    better = _look_up(name).better
+    if better == "ratio":
+        return -10 * math.log10(max(value, 1e-12))
+    return -value if better == "smaller" else value
+
+
+def _look_up(name: str) -> Figure:
+    return FIGURES.get(name, Figure(name))
