@@ -71,6 +71,7 @@ class CostLedger(L.Callback):
         module.train_seconds = self.seconds
 
     on_validation_start = on_train_end  # type: ignore[assignment]
+    on_fit_end = on_train_end  # type: ignore[assignment]  # alone, after a checkpoint with every step done
 
     def on_exception(self, trainer: L.Trainer, module: Any, exception: BaseException) -> None:
         """Stop the watch."""

@@ -2,37 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import Logger
+from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.datamodule import DataModule
 from gsparc.methods.method import FitContext
 
 
 def context_of(
-    config: DictConfig,
-    run_dir: Path,
-    datamodule: DataModule | None = None,
-    loggers: Sequence[Logger] = (),
-    resume: Path | None = None,
+    config: DictConfig, trainer: partial[Trainer], callbacks: Callable[[], Sequence[Callback]], **others: Any
 ) -> FitContext:
-    """The context of one fold, from `trainer`, `callbacks`, `seed`, `budget_s`, `dataset.batch_size`."""
-    nodes = [node for node in (config.get("callbacks") or {}).values() if node is not None]
+    """The context of a fit: `seed`, `budget_s`, `init_from`, `dataset.batch_size` and what is given.
+
+    Args:
+        config: a composed configuration.
+        trainer: makes a Trainer from further options, once per fold.
+        callbacks: makes them anew, once per Trainer.
+        **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
+    """
     init_from = config.get("init_from")
     return FitContext(
-        run_dir=run_dir,
         seed=int(config.seed),
         budget_s=config.budget_s,
-        resume=resume,
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
-        datamodule=datamodule,
-        trainer=instantiate(config.trainer, _partial_=True),
-        callbacks=lambda: [instantiate(node) for node in nodes],
-        loggers=loggers,
+        trainer=trainer,
+        callbacks=callbacks,
         config_yaml=OmegaConf.to_yaml(config, resolve=True),
+        **others,
     )
+
+
+def callbacks_of(nodes: Mapping[str, Any] | None) -> list[Callback]:
+    """Every callback of the group `callbacks` that was not set to null."""
+    return [instantiate(node) for node in (nodes or {}).values() if node is not None]

@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands import cli
-from gsparc.commands.context import context_of
+from gsparc.commands.context import callbacks_of, context_of
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.run import fit_and_score
@@ -33,7 +34,7 @@ from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
 from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitReport, Method, TrainsByGradient
+from gsparc.methods.method import FitContext, FitReport, Method, TrainsByGradient
 from gsparc.methods.registry import build
 
 log = logging.getLogger(__name__)
@@ -89,12 +90,16 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)
 
+    model = partial(build, config.model)
+    trainer = instantiate(config.trainer, _partial_=True)
+    callbacks = partial(callbacks_of, config.get("callbacks"))
     with _loggers(config) as loggers:
-        fitted = fit_and_score(
-            lambda: build(config.model), data, split,
-            lambda number: context_of(config, folders[number], module, loggers, resumes[number]),
-            eval_on=None, keep=keep,
-        )  # fmt: skip
+        given = {"trainer": trainer, "callbacks": callbacks, "loggers": loggers, "datamodule": module}
+
+        def context(number: int) -> FitContext:
+            return context_of(config, run_dir=folders[number], resume=resumes[number], **given)
+
+        fitted = fit_and_score(model, data, split, context, eval_on=None, keep=keep)
         methods = fitted.methods
         found = evaluate(
             methods, fitted.train_s, data, split,

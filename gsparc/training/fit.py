@@ -73,8 +73,8 @@ class SeveralDevices(L.Callback):
         if trainer.world_size > 1 and self.parameters != {id(p) for p in module.parameters()}:
             raise ValueError("callbacks that add or remove Gaussians need one device: trainer.devices=1")
 
-    def on_train_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """What the callbacks before have measured; of all attributes, only metrics leave the process."""
+    def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
+        """Also after a checkpoint with every step done; of all attributes, only metrics leave the process."""
         trainer.callback_metrics[SECONDS] = torch.tensor(module.train_seconds, dtype=torch.float64)
 
 

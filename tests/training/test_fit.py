@@ -8,6 +8,7 @@ import torch
 from campaigns import brief, compose, spectra
 from contexts import short
 
+from gsparc.callbacks import CostLedger
 from gsparc.data.load import load, split_for
 from gsparc.methods import checkpoint
 from gsparc.methods.registry import build
@@ -45,6 +46,15 @@ def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(tmp_path):
     resumed = run(tmp_path, resume=last)
     whole = run(tmp_path)
     assert all(torch.equal(whole[key], resumed[key]) for key in whole)
+
+
+def test_a_checkpoint_with_every_step_done_still_ends_in_a_model(tmp_path):
+    """Killed between the last checkpoint and the model's file: Lightning then skips training and its end."""
+    whole = run(tmp_path, CostLedger())
+    ledger = CostLedger()
+    resumed = run(tmp_path, ledger, resume=tmp_path / "run" / "last.ckpt")
+    assert all(torch.equal(whole[key], resumed[key]) for key in whole)
+    assert ledger.seconds > 0.0
 
 
 def test_a_second_interrupt_does_not_wait(tmp_path):
