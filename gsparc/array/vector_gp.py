@@ -16,6 +16,8 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from gsparc.methods import gp
+
 SHORT_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
 SHORT_RATIO = 1 / 3  # of the lengths
 SWEEPS = 30
@@ -24,34 +26,18 @@ TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that
 TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
-@dataclass(frozen=True)
-class Kernel:
-    """`amplitude * (a smooth long part + a rough short one + noise * identity)`.
+class Kernel(gp.Kernel):
+    """`amplitude * (a smooth long part + a rough short one + noise * identity)`, of array vectors.
 
     The long part is Matern-5/2 of `length`, the short one Matern-3/2 of a third of it.
-
-    Attributes:
-        length: [m].
-        noise: variance relative to `amplitude`.
-        amplitude: variance per element of an array vector.
     """
 
-    length: float
-    noise: float
-    amplitude: float = 1.0
-
     def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Correlations (A, B) without noise between positions (A, 3) and (B, 3) [m]."""
+        """See the base class."""
         distance = cdist(a, b) / self.length
         smooth, rough = 5**0.5 * distance, 3**0.5 / SHORT_RATIO * distance
         long = (1 + smooth + smooth**2 / 3) * np.exp(-smooth)
         return (1 - SHORT_SHARE) * long + SHORT_SHARE * (1 + rough) * np.exp(-rough)
-
-    def gram(self, a: np.ndarray) -> np.ndarray:
-        """Correlations (A, A) with noise."""
-        matrix = self.cross(a, a)
-        matrix[np.diag_indices_from(matrix)] += self.noise
-        return matrix
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ are NaN in the per-sample arrays, never enter a mean, are counted, and come out 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,13 +32,17 @@ class SampleMetric(Metric):
     """Base: one float64 per sample and quantity, kept in the order of the updates.
 
     `compute()` gives the arrays, `summary()` the flat figures.
+
+    Args:
+        scale: physical target = stored target * scale; spectra have none.
     """
 
     full_state_update = False
     quantities: tuple[str, ...] = ()
 
-    def __init__(self) -> None:
+    def __init__(self, scale: float = 1.0) -> None:
         super().__init__()
+        self.scale = scale
         for name in self.quantities:
             self.add_state(name, default=[], dist_reduce_fx="cat")
 
@@ -99,7 +104,7 @@ class SpectrumMetrics(SampleMetric):
         """See the base class."""
         return {
             "ssim": _mean(samples["ssim"]),
-            "ssim_median": _median(samples["ssim"]),
+            "ssim_median": _mean(samples["ssim"], np.nanmedian),
             **{name: _mean(samples[name]) for name in ("ssim_gauss", "psnr_db", "mse", "mae")},
             "nmse": _ratio(samples["mse"], samples["target_power"]),
             "samples": len(samples["mse"]),
@@ -110,16 +115,9 @@ class ChannelMetrics(SampleMetric):
     """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR, NMSE after one complex scalar each.
 
     `power_mae_db` is the mean absolute error of a sample's power in dB, the figure of coverage maps.
-
-    Args:
-        scale: physical channel = stored channel * scale.
     """
 
     quantities = ("error_power", "target_power", "scalar_error_power", "snr_db", "mse", "mae", "power_db")
-
-    def __init__(self, scale: float = 1.0) -> None:
-        super().__init__()
-        self.scale = scale
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         # In stored units, which are near 1: fourth powers of 1e-90 or 1e90 under- or overflow.
@@ -153,7 +151,7 @@ class ChannelMetrics(SampleMetric):
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "nmse_scalar": _ratio(samples["scalar_error_power"], samples["target_power"]),
             "snr_db": _mean(samples["snr_db"]),
-            **{f"snr_db_p{p}": _quantile(samples["snr_db"], p / 100) for p in (10, 50, 90)},
+            **{f"snr_db_p{p}": _mean(samples["snr_db"], np.nanquantile, p / 100) for p in (10, 50, 90)},
             "mse": _mean(samples["mse"]),
             "mae": _mean(samples["mae"]),
             "power_mae_db": _mean(np.abs(samples["power_db"])),
@@ -170,10 +168,6 @@ class PowerMetrics(SampleMetric):
     """
 
     quantities = ("prediction", "target")
-
-    def __init__(self, scale: float = 1.0) -> None:
-        super().__init__()
-        self.scale = scale
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.double().flatten() * self.scale for x in (prediction, target))
@@ -208,9 +202,7 @@ class PowerMetrics(SampleMetric):
 
 def metrics_for(kind: Kind, scale: float = 1.0) -> SampleMetric:
     """The metrics of a dataset kind; `scale` is `Site.target_scale`."""
-    if kind == "spectrum":
-        return SpectrumMetrics()
-    return ChannelMetrics(scale) if kind == "csi" else PowerMetrics(scale)
+    return {"spectrum": SpectrumMetrics, "csi": ChannelMetrics, "rssi": PowerMetrics}[kind](scale)
 
 
 def figure_names(kind: Kind) -> tuple[str, ...]:
@@ -265,16 +257,9 @@ def _nonzero(entries: np.ndarray) -> np.ndarray:
     return np.where(entries > 0, entries, np.nan)
 
 
-def _mean(values: np.ndarray) -> float | None:
-    return None if np.isnan(values).all() else float(np.nanmean(values))
-
-
-def _quantile(values: np.ndarray, share: float) -> float | None:
-    return None if np.isnan(values).all() else float(np.nanquantile(values, share))
-
-
-def _median(values: np.ndarray) -> float | None:
-    return None if np.isnan(values).all() else float(np.nanmedian(values))
+def _mean(values: np.ndarray, of: Callable[..., Any] = np.nanmean, *share: float) -> float | None:
+    """The mean of what is known, or another figure `of` it; None where nothing is."""
+    return None if np.isnan(values).all() else float(of(values, *share))
 
 
 def _ratio(error: np.ndarray, power: np.ndarray) -> float | None:

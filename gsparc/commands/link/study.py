@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -199,14 +198,6 @@ def transmit(
     return found
 
 
-def _of(name: str, values: Mapping[str, np.ndarray], taken: np.ndarray) -> np.ndarray:
-    return values[name]
-
-
-def _of_accepted(name: str, values: Mapping[str, np.ndarray], taken: np.ndarray) -> np.ndarray:
-    return values[name][taken]
-
-
 def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
     """Curves by name: each receiver on all and on accepted positions, prediction with fallback on all."""
     taken = [accepted[b.position] for b in found]
@@ -222,8 +213,8 @@ def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
 
     wanted: dict[str, Curve] = {}
     for name in found[0].failed:
-        wanted[name] = curve(partial(_of, name))
-        wanted[f"{name}@accepted"] = curve(partial(_of_accepted, name))
+        wanted[name] = curve(lambda of, taken, name=name: of[name])
+        wanted[f"{name}@accepted"] = curve(lambda of, taken, name=name: of[name][taken])
     wanted["fallback"] = curve(lambda of, taken: np.where(taken, of["predicted"], of[FALLBACK]))
     return wanted
 
