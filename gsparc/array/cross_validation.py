@@ -168,7 +168,8 @@ def tune(
     def objective(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
         kernel = kernel_at(parameters)
         inverse = np.linalg.inv(kernel.gram(positions))
-        return samples.score(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))
+        found = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
+        return _mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
 
     if len(positions) < 4:
         return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
@@ -211,10 +212,6 @@ class _Samples:
     def error(self, predicted: np.ndarray) -> np.ndarray:
         """(g, c) mean squared."""
         return ((predicted - self.images[self.centres]) ** 2).mean(-1)
-
-    def score(self, kernel: Kernel, inverse: np.ndarray, vectors: np.ndarray) -> float:
-        """Mean over gaps and centres of the log of the squared error: up to a factor, minus the PSNR."""
-        return _mean_log_error(self.error(self.predictions(kernel, inverse, vectors)[1]))
 
 
 def compared(left: LeftOut) -> tuple[float, float]:

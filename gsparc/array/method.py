@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import time
 from typing import Any
@@ -12,15 +13,16 @@ from torch import Tensor
 
 from gsparc.array.cross_validation import MIN_VARIANCE, LeftOut, compared, tune
 from gsparc.array.phase_retrieval import recover
-from gsparc.array.reduce import reduced
 from gsparc.array.vector_cache import recovered, report
 from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
 from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
 from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import MeanOnly
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
@@ -165,9 +167,21 @@ class ArrayField(PredictsVariance):
         power = (features.square().mean(0) * self.field.gains.square().sum(1)).view(2, -1).sum(0)
         return {"contribution": power, "places": places}
 
+    @torch.no_grad()
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`."""
-        return reduced(self, settings, measured)
+        """See `Reducible`: fewer packets (`keep`, a share) on fewer pixels (`stride`)."""
+        assert self.field is not None and self.site is not None and self.background is not None
+        twin, stride = copy.copy(self), int(settings.get("stride", 1))
+        if "keep" in settings:
+            share, contribution = float(settings["keep"]), measured["contribution"]
+            twin.field = self.field.strongest(share, contribution, measured["places"])
+        found: Method = twin
+        if stride > 1:
+            array, grid, wavelength = self.site.array_geometry()
+            background = self.background[::stride, ::stride]
+            twin.renderer = SpectrumRenderer(array, coarser(grid, stride), wavelength, background)
+            found = Filled(twin, grid, stride)
+        return found if settings.get("confidence", True) else MeanOnly(found)
 
     def state(self) -> dict[str, Any]:
         """Packets, background, error model."""

@@ -8,6 +8,7 @@ from the teacher by ridge regression.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 from gsparc.array.vector_gp import VectorGP
 
 MIN_PACKETS, MAX_PACKETS = 256, 2048  # of the default count: query time grows with it
+RIDGE = 1e-6  # relative to a feature's mean square
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class PacketSettings:
     samples: int = 5000
     near: float = 0.02
     far: float = 3.0
-    ridge: float = 1e-6
+    ridge: float = RIDGE
 
 
 class WavePackets(nn.Module):
@@ -94,6 +96,28 @@ class WavePackets(nn.Module):
         out = torch.addmm(self.bias, self.features(x), self.gains)
         out[:, -2:].clamp_(0, 1)
         return torch.view_as_complex(out.view(len(x), -1, 2))
+
+    @torch.no_grad()
+    def strongest(self, share: float, contribution: Tensor, places: Tensor) -> WavePackets:
+        """The `share` of the packets that contribute (N,) most, fitted to all around places (n, 3) [m]."""
+        total = len(contribution)
+        count = max(1, math.ceil(share * total))
+        kept = contribution.topk(count).indices.sort().values
+        blank = (torch.zeros(count, 3), torch.ones(count), torch.zeros(count, 3), self.origin)
+        few = WavePackets(*blank, elements=self.elements).requires_grad_(False)
+        both = torch.cat([kept, kept + total])
+        few.form.copy_(self.form[:, both])
+        widths = self.form[3, :total].neg().mul(2).rsqrt()  # of the window exp(-x^2 / 2 s^2)
+        draws = torch.Generator().manual_seed(0)
+        spread = widths.median() * torch.randn(8, *places.shape, generator=draws)
+        queries = torch.cat([places, (places + spread / 2).flatten(0, 1)])
+        features = few.features(queries).double()
+        wanted = (self.features(queries) @ self.gains).double()
+        gram = features.mT @ features
+        gram.diagonal().add_(RIDGE * gram.diagonal().mean())
+        few.gains.copy_(torch.linalg.solve(gram, features.mT @ wanted).float())
+        few.bias.copy_(self.bias)
+        return few
 
 
 def student_t(count: int, rng: np.random.Generator) -> np.ndarray:

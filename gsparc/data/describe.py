@@ -46,7 +46,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
-        ("stays", f"the {ENDS[site.static_end]}, at {_vector(still)} m"),
+        ("stays", f"the {ENDS[site.static_end]}, at ({', '.join(f'{x:.3f}' for x in still)}) m"),
         ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
         ("neighbours", _neighbours(moving, site.wavelength)),
     ]
@@ -138,7 +138,3 @@ def _grid(grid: SphereGrid) -> str:
         f"rows are elevations {first[0]:.4g} to {last[0]:.4g} degrees, "
         f"columns azimuths {first[1]:.4g} to {last[1]:.4g} degrees{closed}"
     )
-
-
-def _vector(v: np.ndarray) -> str:
-    return "(" + ", ".join(f"{x:.3f}" for x in v) + ")"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import logging
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -104,8 +103,3 @@ def _stored_scores(path: Path) -> Scores | None:
     except Exception as error:  # whatever a damaged archive raises: it is only a cache
         log.warning("cached results are unusable and computed again: %s (%s)", path, error)
         return None
-
-
-def mean_seconds(seconds: Sequence[float]) -> float:
-    """Seconds to train one model: the mean over folds [s]."""
-    return float(np.mean(seconds))

@@ -11,7 +11,7 @@ import numpy as np
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline, mean_seconds
+from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods import timing
@@ -75,11 +75,11 @@ def evaluate(
     facts[f"{eval_on}/skill"] = _skill(scores, others)
     for name, other in others.items():
         own = {**other.scores.figures(), "skill": _skill(other.scores, others)}
-        own["train_s"] = mean_seconds(other.train_s)
+        own["train_s"] = float(np.mean(other.train_s))
         facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:
         facts |= paired_differences(scores, others[REFERENCE].scores, REFERENCE)
-    facts["time/train_s"] = None if seconds is None else mean_seconds(seconds)
+    facts["time/train_s"] = None if seconds is None else float(np.mean(seconds))
     facts["time/train_total_s"] = None if seconds is None else float(sum(seconds))
     contenders = {OWN: methods[0], **{name: other.methods[0] for name, other in others.items()}}
     facts |= timing.machine_facts()

@@ -12,21 +12,20 @@ from gsparc.data.splits import Fold
 from gsparc.evaluation.drawing import panels, save
 from gsparc.methods.method import Method
 
+SPECTRA = 4  # test rows drawn
 
-def draw_predictions(
-    method: Method, data: Measurements, fold: Fold, title: str, path: Path, count: int = 4
-) -> None:
-    """Draw test rows: `count` spectra, or all channels or powers as points.
+
+def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str, path: Path) -> None:
+    """Draw test rows: `SPECTRA` spectra, or all channels or powers as points.
 
     Args:
         method: fitted on `fold`.
         data, fold: where the test rows come from.
         title: above everything.
         path: PNG file.
-        count: number of spectra.
     """
     spectra = data.site.kind == "spectrum"
-    few = np.linspace(0, len(fold.test) - 1, min(count, len(fold.test))).astype(int)
+    few = np.linspace(0, len(fold.test) - 1, min(SPECTRA, len(fold.test))).astype(int)
     rows = fold.test[few] if spectra else fold.test
     batch = data.batch(rows)
     found = method.answer(batch)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import math
 import time
 from collections import Counter
 from dataclasses import replace
@@ -17,6 +19,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import MeanOnly
 from gsparc.multipath.diffraction import (
     Edges,
     diffracted,
@@ -29,8 +32,7 @@ from gsparc.multipath.ensemble import Budget, at_noise_floor, ensemble_weights, 
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.multipath.query import Query
-from gsparc.multipath.reduce import reduced
+from gsparc.multipath.query import MeanQuery, Query
 from gsparc.multipath.rows import Rows, elements, gather
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
@@ -286,9 +288,28 @@ class ImageSourceGP(FramedMethod):
             for i, member in enumerate(self.members)
         }
 
+    @torch.no_grad()
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`."""
-        return reduced(self, settings, measured)
+        """See `Reducible`: `searches` of largest weight, a share of their sources (`keep`), no variance.
+
+        The gains of the remaining sources are fitted anew: one factorisation here, nothing at queries.
+        """
+        twin = copy.copy(self)
+        count = min(int(settings.get("searches", len(self.members))), len(self.members))
+        chosen = self.weights.topk(count).indices.sort().values
+        twin.members = [self.members[i] for i in chosen]
+        twin.weights = self.weights[chosen] / self.weights[chosen].sum()
+        if "keep" in settings:
+            share = float(settings["keep"])
+            twin.members = [
+                _loudest(member, share, measured[f"contribution{i}"])
+                for member, i in zip(twin.members, chosen, strict=True)
+            ]
+        if settings.get("confidence", True):
+            twin.query = Query(twin.members)
+            return twin
+        twin.query = MeanQuery(twin.members, variance_rows=1)
+        return MeanOnly(twin)
 
     # ---- state ----
     def state(self) -> dict[str, Any]:
@@ -314,3 +335,12 @@ class ImageSourceGP(FramedMethod):
     def size(self) -> int:
         """Sources of the largest scene."""
         return max((len(member.scene.words) for member in self.members), default=0) + len(self.edges)
+
+
+def _loudest(member: PhasedPosterior, share: float, contribution: Tensor) -> PhasedPosterior:
+    """A search with the sources that contribute (K,) most, and the transmitter, where all words start."""
+    count = max(1, math.ceil(share * len(contribution)))
+    kept = sorted({0, *contribution.topk(count).indices.tolist()})
+    phased = member.phased
+    scene = PhasedScene(phased.scene.only(kept), phased.phase[kept], phased.quadrature)
+    return PhasedPosterior(member.rows, scene, member.noise_floor)

@@ -41,7 +41,8 @@ class Lags:
         self.image = (grid.height, grid.width)
         directions = grid.directions().numpy().reshape(-1, 3)
         twice = np.where(self._sine, 2.0, 1.0)
-        self._basis = torch.from_numpy((self._parts(directions) * self._both(twice)).astype(np.float32)).T
+        weight = np.concatenate([twice, twice[self._sine]])
+        self._basis = torch.from_numpy((self._parts(directions) * weight).astype(np.float32)).T
         gram = (self._basis @ self._basis.T).double().numpy()
         gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / len(gram)
         self._inverse = torch.from_numpy(np.linalg.inv(gram)).float()
@@ -64,6 +65,3 @@ class Lags:
     def _parts(self, directions: np.ndarray) -> np.ndarray:
         angle = directions @ self._differences.T
         return np.concatenate([np.cos(angle), np.sin(angle)[:, self._sine]], axis=1)
-
-    def _both(self, values: np.ndarray) -> np.ndarray:
-        return np.concatenate([values, values[self._sine]])

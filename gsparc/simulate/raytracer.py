@@ -119,12 +119,9 @@ class RayTracer:
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
         """
-        parts, start = [], 0
-        while start < len(receivers):
-            some = receivers[start : start + self.sampling.batch]
-            parts.append(self._batch(some, effects, self.sampling.seed if seed is None else seed))
-            start += len(some)
-        return join(parts)
+        rays, size = self.sampling.seed if seed is None else seed, self.sampling.batch
+        starts = range(0, len(receivers), size)
+        return join([self._batch(receivers[i : i + size], effects, rays) for i in starts])
 
     def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:
         """One call; halved, or with a larger buffer, when candidates were cut off."""

@@ -28,7 +28,6 @@ from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
-from gsparc.methods.pareto import Settings
 from gsparc.ops import Pose
 from gsparc.training import reduce
 from gsparc.training.auto_settings import Choices, resolve, settled
@@ -265,13 +264,8 @@ class LearnedField(Method):
         stride = () if reduce.through_array(model) else ("stride",)
         return (*known, *stride, *(("frozen",) if static else ()))
 
-    def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """See `Reducible`."""
-        return reduce.contributions(self, data, rows)
-
-    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`."""
-        return reduce.reduced(self, settings, measured)
+    contributions = reduce.contributions
+    reduced = reduce.reduced
 
     # -- storing -----------------------------------------------------------------------------------
 

@@ -16,17 +16,16 @@ import torch
 from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
+from gsparc.array.moving import reduce
 from gsparc.array.moving.compress import components
 from gsparc.array.moving.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.array.moving.power_gp import Trend, TrendSettings, fit_trend
-from gsparc.array.moving.reduce import reduced
 from gsparc.array.moving.triangulate import SearchSettings, bearings, find_sources, mixture, powers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import Kernel, choose_kernel
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
-from gsparc.methods.pareto import Settings
+from gsparc.methods.method import FitContext, FitReport, Prediction, PredictsVariance
 from gsparc.methods.target_rows import to_real
 from gsparc.physics.lags import BLOCK, Lags
 
@@ -107,9 +106,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         """Nothing: the process itself holds what each component contributes."""
         return {}
 
-    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Reducible`."""
-        return reduced(self, settings)
+    reduced = reduce.reduced
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         begin = time.perf_counter()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @torch.no_grad()
-def reduced(method: MovingArrayField, settings: Settings) -> Method:
+def reduced(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
     """The mean of the first `searches` with the strongest components of the residual (`keep`, a share).
 
     On fewer pixels (`stride`) and without its variance, most of the query time for large training sets.

@@ -130,27 +130,21 @@ def best_kind(evidence: Evidence, rows: np.ndarray) -> str:
 
 
 def accept(
-    evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int
+    evidence: Evidence, promise: Promise, kind: str, spatial: bool, seed: int | list[int], apart_m: float = 0
 ) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
     """Confidence, threshold, and positions (indices of the evidence): unseen by both, and set aside.
 
     Raises:
         ValueError: `kind` is no confidence of this evidence.
     """
-    return _draw(evidence, promise, kind, "spatial" if spatial else "random", np.random.default_rng(seed))
-
-
-def _draw(
-    evidence: Evidence, promise: Promise, kind: str, how: How, rng: np.random.Generator, apart_m: float = 0.0
-) -> tuple[str, Threshold, np.ndarray, np.ndarray]:
-    """One division: confidence, threshold, and positions to test on and set aside."""
-    choose_on, calibrate, test = divided(evidence, how, rng)
+    rng = np.random.default_rng(seed)
+    choose_on, calibrate, test = divided(evidence, "spatial" if spatial else "random", rng)
     used = best_kind(evidence, choose_on) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], promise.bad(evidence.error)
     calibrate = spread_out(evidence.position, calibrate, apart_m, rng)
-    patch = cells(evidence.position)[calibrate] if how == "spatial" else None
+    patch = cells(evidence.position)[calibrate] if spatial else None
     found = choose(score[calibrate], bad[calibrate], levels_of(score[choose_on]), promise, patch)
     return used, found, test, choose_on
 
@@ -173,8 +167,7 @@ def trials(
     realised, coverage, kinds = [], [], []
     bad = promise.bad(evidence.error)
     for draw in range(draws):
-        rng = np.random.default_rng([seed, draw])
-        used, found, test, _ = _draw(evidence, promise, kind, how, rng, apart_m)
+        used, found, test, _ = accept(evidence, promise, kind, how == "spatial", [seed, draw], apart_m)
         taken = test[evidence.scores[used][test] >= found.value]
         kinds.append(used)
         realised.append(bad[taken].mean() if len(taken) else np.nan)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +24,6 @@ from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.baseline_cache import mean_seconds
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods import checkpoint
@@ -209,8 +209,8 @@ def fill(prepared: Prepared) -> Filled:
     )  # fmt: skip
     facts: dict[str, Any] = {f"test/{name}": value for name, value in found.figures.items()}
     facts |= {
-        "time/train_s": mean_seconds(found.train_s),
-        "time/train_cpu_s": mean_seconds(found.train_cpu_s),
+        "time/train_s": statistics.fmean(found.train_s),
+        "time/train_cpu_s": statistics.fmean(found.train_cpu_s),
         "time/score_s": found.score_s,
         "model/name": prepared.cell.method,
         "model/num_gaussians": found.methods[0].size(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -200,22 +200,25 @@ def transmit(
 
 def curves(found: list[Blocks], accepted: np.ndarray) -> dict[str, Curve]:
     """Curves by name: each receiver on all and on accepted positions, prediction with fallback on all."""
-    taken = [accepted[b.position] for b in found]
 
-    def curve(of: Callable[[dict[str, np.ndarray], np.ndarray], np.ndarray]) -> Curve:
-        failed, wrong = (
-            [of(getattr(b, what), t) for b, t in zip(found, taken, strict=True)]
-            for what in ("failed", "bit_errors")
-        )
-        bler, ber = (np.array([x.mean() if len(x) else np.nan for x in parts]) for parts in (failed, wrong))
+    def curve(parts: Iterable[tuple[np.ndarray, np.ndarray]]) -> Curve:
+        """Of the failed blocks and the shares of wrong bits at every Eb/N0."""
+        failed, wrong = zip(*parts, strict=True)
+        bler, ber = (np.array([x.mean() if len(x) else np.nan for x in some]) for some in (failed, wrong))
         errors, blocks = np.array([f.sum() for f in failed]), np.array([len(f) for f in failed])
         return Curve(np.array([b.ebno_db for b in found]), bler, ber, errors, blocks)
 
     wanted: dict[str, Curve] = {}
+    taken = [accepted[b.position] for b in found]
     for name in found[0].failed:
-        wanted[name] = curve(lambda of, taken, name=name: of[name])
-        wanted[f"{name}@accepted"] = curve(lambda of, taken, name=name: of[name][taken])
-    wanted["fallback"] = curve(lambda of, taken: np.where(taken, of["predicted"], of[FALLBACK]))
+        every = [(b.failed[name], b.bit_errors[name]) for b in found]
+        wanted[name] = curve(every)
+        wanted[f"{name}@accepted"] = curve((f[t], w[t]) for (f, w), t in zip(every, taken, strict=True))
+    wanted["fallback"] = curve(
+        (np.where(t, b.failed["predicted"], b.failed[FALLBACK]),
+         np.where(t, b.bit_errors["predicted"], b.bit_errors[FALLBACK]))
+        for b, t in zip(found, taken, strict=True)
+    )  # fmt: skip
     return wanted
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,10 @@ class Condition:
 
     def __str__(self) -> str:
         return self.what if self.what == "none" else f"{self.what} {self.amount:g}"
+
+    def learned_from(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
+        """Data and rows of a fold under this condition."""
+        return (data, fold) if self.learned is None else self.learned(data, fold, seed)
 
 
 @dataclass(frozen=True)
@@ -158,14 +163,9 @@ class Study:
             outcome, learned = plain, condition.learned
             if outcome is None or learned is not None:
                 folder = context.run_dir / variant.name / str(condition).replace(" ", "-") / str(turn)
-
-                def changed(
-                    data: Measurements, fold: Fold, learned: Any = learned
-                ) -> tuple[Measurements, Fold]:
-                    return (data, fold) if learned is None else learned(data, fold, seed)
-
                 settings = in_folders(replace(context, run_dir=folder, seed=seed))
-                outcome = fit_and_score(variant.make, data, split, settings, learned=changed)
+                learned_from = partial(condition.learned_from, seed=seed)
+                outcome = fit_and_score(variant.make, data, split, settings, learned=learned_from)
                 plain = outcome if learned is None else plain
             if condition.tested is not None:
                 outcome = outcome.scored_on(condition.tested(data, split, seed), split)
@@ -195,8 +195,7 @@ class Study:
             if base is not None:
                 train_ratio = float(np.median(seconds / np.array([np.mean(one.train_s) for one in base])))
                 query_ratio = p50 / asked[str(id(base[-1].methods[0]))][0]
-            learned = condition.learned or (lambda data, fold, seed: (data, fold))
-            folds = [learned(data, fold, self.seed)[1] for fold in split.folds]
+            folds = [condition.learned_from(data, fold, self.seed)[1] for fold in split.folds]
             rows.append(
                 Row(
                     variant.name, condition.what, condition.amount,
