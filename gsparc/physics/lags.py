@@ -42,7 +42,9 @@ class Lags:
         directions = grid.directions().numpy().reshape(-1, 3)
         twice = np.where(self._sine, 2.0, 1.0)
         weight = np.concatenate([twice, twice[self._sine]])
-        self._basis = torch.from_numpy((self._parts(directions) * weight).astype(np.float32)).T
+        angle = directions @ self._differences.T
+        waves = np.concatenate([np.cos(angle), np.sin(angle)[:, self._sine]], axis=1)
+        self._basis = torch.from_numpy((waves * weight).astype(np.float32)).T
         gram = (self._basis @ self._basis.T).double().numpy()
         gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / len(gram)
         self._inverse = torch.from_numpy(np.linalg.inv(gram)).float()
@@ -61,7 +63,3 @@ class Lags:
     def spectrum(self, lags: Tensor) -> Tensor:
         """Power (n, H, W), at least 0, of lags (n, count)."""
         return (lags @ self._basis).clamp_(min=0).reshape(-1, *self.image)
-
-    def _parts(self, directions: np.ndarray) -> np.ndarray:
-        angle = directions @ self._differences.T
-        return np.concatenate([np.cos(angle), np.sin(angle)[:, self._sine]], axis=1)

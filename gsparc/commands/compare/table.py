@@ -136,12 +136,6 @@ def blocks(found: Sequence[Row]) -> list[Block]:
     return result
 
 
-def within_spread(row: Row, first: Row) -> bool:
-    """Whether a row is first, or no farther behind than the two spreads over seeds together."""
-    spread = float(np.hypot(row.spread_db or 0.0, first.spread_db or 0.0))
-    return row.score_db >= first.score_db - spread
-
-
 def remarks(block: Block, ours: str) -> list[str]:
     """What the table shows about simple baselines and about our own default, favourable or not."""
     first = block.rows[0]
@@ -151,7 +145,9 @@ def remarks(block: Block, ours: str) -> list[str]:
     own = next((r for r in block.rows if r.method == ours), None)
     if own is not None and own is not first:
         gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
-        found.append(gap + (", within the seeds' spread" if within_spread(own, first) else ""))
+        spread = float(np.hypot(own.spread_db or 0.0, first.spread_db or 0.0))  # of both over seeds
+        level = own.score_db >= first.score_db - spread
+        found.append(gap + (", within the seeds' spread" if level else ""))
     for row in block.rows:
         if own is not None and row.method in SIMPLE and row.score_db > own.score_db and row is not first:
             found.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")

@@ -43,12 +43,6 @@ NEED_VARIANCE = ("predicted_variance", "predicted_pilots")
 SHARES = np.array([0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 
 
-def need_sionna() -> None:
-    """Refuse in words where Sionna is not installed."""
-    if find_spec("sionna") is None:
-        raise ValueError("gsparc.commands.link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
-
-
 def band(found: Channels) -> Band:
     """One antenna's channels, for rate adaptation, which takes what states no variance for exact."""
     return Band(found.true[:, 0], found.predicted[:, 0], found.variance.nan_to_num(0.0))
@@ -56,7 +50,8 @@ def band(found: Channels) -> Band:
 
 def task(config: DictConfig) -> dict[str, Any]:
     """All three experiments on one checkpoint; returns the facts of `summary.json`."""
-    need_sionna()
+    if find_spec("sionna") is None:
+        raise ValueError("gsparc.commands.link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
     RunSettings.of(config)
     torch.manual_seed(int(config.seed))
     run_dir = run_directory()
