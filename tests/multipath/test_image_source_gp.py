@@ -231,7 +231,7 @@ def test_visibility_behind_a_pillar_is_learned(tmp_path):
 
 @pytest.mark.slow
 def test_a_furnished_room(tmp_path):
-    told, data, fold = furnished(600)
+    told, data, fold = furnished(450)
     method = ImageSourceGP(searches=1, budget_s=400)  # of which a quiet machine needs a fraction
     method.fit(data, fold, FitContext(tmp_path))
     # The farthest wall may stay a wavelength off: a phase of its own makes up for it.

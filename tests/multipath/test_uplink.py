@@ -115,7 +115,7 @@ def test_peers_answer_and_keep(make, tmp_path) -> None:
     assert torch.allclose(again.answer(batch).mean, before)
 
 
-@pytest.mark.parametrize("inputs", ["own", "all"])
+@pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
 def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
     """A Gram matrix of zeros ended in the library's words about singular matrices."""
     data = city("all")
