@@ -154,10 +154,7 @@ def test_a_wheel_installed_elsewhere_trains(tmp_path):
     home.mkdir()
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
     build = [*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", str(wheels), str(ROOT)]
-    build += [
-        f"-Cbuild-dir={tmp_path / 'build'}",
-        "-Ccmake.define.GSPARC_PORTABLE=ON",
-    ]  # quicker
+    build += [f"-Cbuild-dir={tmp_path / 'build'}", "-Ccmake.define.GSPARC_PORTABLE=ON"]  # quicker to build
     made = subprocess.run(build, capture_output=True, text=True, cwd=tmp_path)
     if made.returncode and "scikit_build_core" in made.stderr:
         pytest.skip("the build requirements of the wheel are not installed here")

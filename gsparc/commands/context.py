@@ -15,14 +15,17 @@ from gsparc.methods.method import FitContext
 
 
 def context_of(
-    config: DictConfig, trainer: partial[Trainer], callbacks: Callable[[], Sequence[Callback]], **others: Any
+    config: DictConfig,
+    trainer: partial[Trainer] | None = None,
+    callbacks: Callable[[], Sequence[Callback]] | None = None,
+    **others: Any,
 ) -> FitContext:
     """The context of a fit: `seed`, `budget_s`, `init_from`, `dataset.batch_size` and what is given.
 
     Args:
         config: a composed configuration.
-        trainer: makes a Trainer from further options, once per fold.
-        callbacks: makes them anew, once per Trainer.
+        trainer: makes a Trainer from further options, once per fold; None: as `config` says.
+        callbacks: makes them anew, once per Trainer; None: as `config` says.
         **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
     """
     init_from = config.get("init_from")
@@ -31,8 +34,8 @@ def context_of(
         budget_s=config.budget_s,
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
-        trainer=trainer,
-        callbacks=callbacks,
+        trainer=trainer or instantiate(config.trainer, _partial_=True),
+        callbacks=callbacks or partial(callbacks_of, config.get("callbacks")),
         config_yaml=OmegaConf.to_yaml(config, resolve=True),
         **others,
     )

@@ -103,9 +103,9 @@ class SpectrumMetrics(SampleMetric):
     def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
         """See the base class."""
         return {
-            "ssim": _mean(samples["ssim"]),
-            "ssim_median": _mean(samples["ssim"], np.nanmedian),
-            **{name: _mean(samples[name]) for name in ("ssim_gauss", "psnr_db", "mse", "mae")},
+            "ssim": _statistic(samples["ssim"]),
+            "ssim_median": _statistic(samples["ssim"], np.nanmedian),
+            **{name: _statistic(samples[name]) for name in ("ssim_gauss", "psnr_db", "mse", "mae")},
             "nmse": _ratio(samples["mse"], samples["target_power"]),
             "samples": len(samples["mse"]),
         }
@@ -150,11 +150,11 @@ class ChannelMetrics(SampleMetric):
         return {
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "nmse_scalar": _ratio(samples["scalar_error_power"], samples["target_power"]),
-            "snr_db": _mean(samples["snr_db"]),
-            **{f"snr_db_p{p}": _mean(samples["snr_db"], np.nanquantile, p / 100) for p in (10, 50, 90)},
-            "mse": _mean(samples["mse"]),
-            "mae": _mean(samples["mae"]),
-            "power_mae_db": _mean(np.abs(samples["power_db"])),
+            "snr_db": _statistic(samples["snr_db"]),
+            **{f"snr_db_p{p}": _statistic(samples["snr_db"], np.nanquantile, p / 100) for p in (10, 50, 90)},
+            "mse": _statistic(samples["mse"]),
+            "mae": _statistic(samples["mae"]),
+            "power_mae_db": _statistic(np.abs(samples["power_db"])),
             "silent_samples": silent,
             "samples": len(samples["mse"]),
         }
@@ -189,12 +189,12 @@ class PowerMetrics(SampleMetric):
         floored, silent = int((samples["prediction"] <= 0).sum()), int((samples["target"] <= 0).sum())
         if floored or silent:
             log.warning("%d predictions and %d targets without power (no decibels there)", floored, silent)
-        squared = _mean(samples["error_db"] ** 2)
+        squared = _statistic(samples["error_db"] ** 2)
         return {
             "rmse_db": None if squared is None else float(np.sqrt(squared)),
-            "mae_db": _mean(np.abs(samples["error_db"])),
+            "mae_db": _statistic(np.abs(samples["error_db"])),
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
-            "mse": _mean(samples["mse"]),
+            "mse": _statistic(samples["mse"]),
             "silent_samples": silent,
             "samples": len(samples["target"]),
         }
@@ -257,8 +257,8 @@ def _nonzero(entries: np.ndarray) -> np.ndarray:
     return np.where(entries > 0, entries, np.nan)
 
 
-def _mean(values: np.ndarray, of: Callable[..., Any] = np.nanmean, *share: float) -> float | None:
-    """The mean of what is known, or another figure `of` it; None where nothing is."""
+def _statistic(values: np.ndarray, of: Callable[..., Any] = np.nanmean, *share: float) -> float | None:
+    """The mean of the values that are not NaN, or another statistic `of` them; None where there are none."""
     return None if np.isnan(values).all() else float(of(values, *share))
 
 

@@ -15,7 +15,7 @@ from gsparc.ops import Cutoff, SphereGrid, freeze, make_plan, mean_weights
 GRID = SphereGrid.hemisphere(10, 20)
 
 
-def check(got):
+def assert_nothing_is_seen(got):
     assert (got["image"] == 0).all() and (got["transmittance"] == 1).all() and not got["visible"].any()
     assert all((value == 0).all() for name, value in got.items() if name.startswith("d_"))
 
@@ -27,7 +27,7 @@ def test_no_gaussians(backend, projection, hides, count):
     scene = random_scene(n=0, hides=hides)
     got = render(scene, poses(count), GRID, backend, projection=projection)
     assert got["image"].shape == (3, 2, 10, 20) and got["d_means"].shape == (0, 3)
-    check(got)
+    assert_nothing_is_seen(got)
 
 
 def test_equals_float64(backend):
@@ -37,13 +37,15 @@ def test_equals_float64(backend):
 def test_all_below_the_horizon(backend):
     scene = random_scene(n=20, size=0.1)
     under = replace(scene, means=scene.means * 0.1 - torch.tensor([0.0, 0.0, 5.0]).double())
-    check(render(under, origin(), GRID, backend))
+    assert_nothing_is_seen(render(under, origin(), GRID, backend))
 
 
 @pytest.mark.parametrize("relative", [False, True])
 def test_all_transparent(backend, relative):
     scene, cut = random_scene(n=20), Cutoff(relative=relative)
-    check(render(replace(scene, opacities=0 * scene.opacities), origin(), GRID, backend, cutoff=cut))
+    assert_nothing_is_seen(
+        render(replace(scene, opacities=0 * scene.opacities), origin(), GRID, backend, cutoff=cut)
+    )
 
 
 def test_weights_and_frozen_views_of_nothing(backend):

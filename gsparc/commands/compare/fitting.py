@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.compare.cells import Cell, Contender, key
-from gsparc.commands.context import callbacks_of, context_of
+from gsparc.commands.context import context_of
 from gsparc.commands.settings import plain
 from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.data.load import load, split_for
@@ -201,10 +200,8 @@ def fill(prepared: Prepared) -> Filled:
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
 
     folds = split if prepared.scored else replace(split, folds=split.folds[:1])
-    trainer = instantiate(config.trainer, _partial_=True)
-    context = context_of(config, trainer, partial(callbacks_of, config.get("callbacks")), run_dir=folder)
     found = fit_and_score(
-        partial(build, config.model), data, folds, in_folders(context),
+        partial(build, config.model), data, folds, in_folders(context_of(config, run_dir=folder)),
         eval_on="test" if prepared.scored else None, keep=keep,
     )  # fmt: skip
     facts: dict[str, Any] = {f"test/{name}": value for name, value in found.figures.items()}

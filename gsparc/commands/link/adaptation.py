@@ -136,14 +136,14 @@ class Adaptation:
         parts = []
         for some in sinr.split(CHUNK):
             tones = some[:, None, None, :, None, None].expand(-1, 28, 1, -1, 1, 1)
-            parts.append(self._told(len(some), sinr=tones)[2][..., 0])
+            parts.append(self._of_every_mcs(len(some), sinr=tones)[2][..., 0])
         return 10 * torch.cat(parts).cpu().log10()
 
     def _fails(self, effective_db: Tensor) -> Tensor:
         """Transport-block error rates (n, 28); infinite where there is no such MCS."""
         allocated = torch.full((len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32)
         effective = (10 ** (effective_db / 10))[..., None]
-        told = self._told(len(effective), sinr_eff=effective, num_allocated_re=allocated)
+        told = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
         return told[3][..., 0].cpu().double()
 
     def _highest(self, fails: Tensor) -> Tensor:
@@ -169,8 +169,8 @@ class Adaptation:
         best = carried.max(1)
         return torch.where(best.values > 0, best.indices, lowest), most - best.values
 
-    def _told(self, count: int, **given: Tensor) -> tuple[Tensor, ...]:
-        """What Sionna says of every MCS of the table at `count` positions."""
+    def _of_every_mcs(self, count: int, **given: Tensor) -> tuple[Tensor, ...]:
+        """Sionna's PHY abstraction of every MCS of the table at `count` positions."""
         every = torch.arange(28, dtype=torch.int32)[None, :, None].expand(count, -1, -1)
         table = {"mcs_table_index": 1, "mcs_category": 0, "check_mcs_index_validity": False}
         return self.abstraction(every, **given, **table)

@@ -51,7 +51,7 @@ def band(found: Channels) -> Band:
 def task(config: DictConfig) -> dict[str, Any]:
     """All three experiments on one checkpoint; returns the facts of `summary.json`."""
     if find_spec("sionna") is None:
-        raise ValueError("gsparc.commands.link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
+        raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
     RunSettings.of(config)
     torch.manual_seed(int(config.seed))
     run_dir = run_directory()
@@ -59,9 +59,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     if data.site.kind != "csi" or data.site.subcarriers_hz is None:
-        raise ValueError(
-            f"gsparc.commands.link needs complex channels with their frequencies, not {data.site.kind}"
-        )
+        raise ValueError(f"gsparc link needs complex channels with their frequencies, not {data.site.kind}")
     started = time.perf_counter()
     shape, tones = settings["pusch"], data.site.subcarriers_hz
     antenna, last = int(config.antenna), data.target.shape[1]

@@ -7,14 +7,13 @@ accuracy under its own name, seconds of training, milliseconds of a query and th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.table import Table
 
-from gsparc.commands.context import callbacks_of, context_of
+from gsparc.commands.context import context_of
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.figure import draw
@@ -56,9 +55,7 @@ def task(config: DictConfig) -> list[Row]:
     study = study_of(config)
     data = load(plain(config.dataset))
     split = split_for(plain(config.split), data)
-    trainer = instantiate(config.trainer, _partial_=True)
-    context = context_of(config, trainer, partial(callbacks_of, config.get("callbacks")), run_dir=run_dir)
-    rows = study.run(data, split, context)
+    rows = study.run(data, split, context_of(config, run_dir=run_dir))
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split), **machine_facts(), **provenance(),
         "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,

@@ -85,7 +85,7 @@ def altered(sound: Path, to: Path, **changes: object) -> Path:
     return to
 
 
-def refused_everywhere(path: Path, file: Path, run: Path, says: str) -> None:
+def assert_refused_everywhere(path: Path, file: Path, run: Path, says: str) -> None:
     """`gsparc.load`, `gsparc evaluate` and `train.py ckpt_path=`."""
     with pytest.raises(CheckpointError, match=says) as refused:
         gsparc.load(path)
@@ -112,7 +112,7 @@ def test_nothing_executes(sound, tmp_path, name, place):
 @pytest.mark.parametrize("name", ["os.system", "eval", "Path.touch"])
 def test_commands_refuse_them_in_one_line(sound, tmp_path, name):
     path = altered(sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)[name]})
-    refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
+    assert_refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
     given = [
         "dataset=own",
         f"dataset.file={sound[1]}",
@@ -163,7 +163,7 @@ def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
 )
 def test_content_that_does_not_fit(sound, tmp_path, changes, says):
     path = altered(sound[0], tmp_path / "odd.ckpt", **changes)
-    refused_everywhere(path, sound[1], tmp_path / "run", says)
+    assert_refused_everywhere(path, sound[1], tmp_path / "run", says)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
@@ -171,7 +171,7 @@ def test_cut_short(sound, tmp_path, share):
     content = sound[0].read_bytes()
     path = tmp_path / "cut.ckpt"
     path.write_bytes(content[: int(share * len(content))])
-    refused_everywhere(path, sound[1], tmp_path / "run", "not a gsparc checkpoint, or cut short")
+    assert_refused_everywhere(path, sound[1], tmp_path / "run", "not a gsparc checkpoint, or cut short")
 
 
 def other_files() -> dict[str, bytes]:
@@ -195,7 +195,7 @@ def other_files() -> dict[str, bytes]:
 def test_files_of_other_kinds(sound, tmp_path, kind):
     path = tmp_path / "other.ckpt"
     path.write_bytes(other_files()[kind])
-    refused_everywhere(path, sound[1], tmp_path / "run", r"other\.ckpt: ")
+    assert_refused_everywhere(path, sound[1], tmp_path / "run", r"other\.ckpt: ")
 
 
 def test_flipped_bytes_are_refused_or_harmless(sound, tmp_path):
