@@ -15,7 +15,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, write_split
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.open_runs import open_files
-from gsparc.evaluation.summary import provenance, results_table, write_samples, write_summary
+from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
 from gsparc.methods import checkpoint
 
 
@@ -45,6 +45,7 @@ def evaluate_files(
     found = evaluate(
         run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines, cache=cache
     )
+    found.facts["split/foreign"] = run.foreign
     return found, run.data, run.split
 
 
@@ -67,5 +68,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    show(run_dir, results_table(facts, facts["model/name"], title, config.eval_on))
+    shown = results_table(facts, facts["model/name"], title, config.eval_on)
+    show(run_dir, shown, lines=remarks(facts, config.eval_on))
     return facts

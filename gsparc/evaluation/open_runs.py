@@ -13,6 +13,7 @@ import numpy as np
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Split
+from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.methods import checkpoint
 from gsparc.methods.method import Method
 from gsparc.methods.predictor import SAME_PLACE_M
@@ -28,13 +29,22 @@ class Opened:
         methods: one per fold.
         stored: contents of their files.
         data: in the models' local coordinates and units.
-        split: the folds the methods were trained on.
+        split: the folds the methods were trained on, or others that were asked for.
+        foreign: what differs from what the methods were trained on, one clause; None: nothing.
+        learned: test rows of which it is known that the methods have learned from them.
     """
 
     methods: list[Method]
     stored: list[checkpoint.Stored]
     data: Measurements
     split: Split
+    foreign: str | None = None
+    learned: int = 0
+
+    def facts(self) -> dict[str, Any]:
+        """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
+        own = {"split/foreign": self.foreign, "model/name": self.methods[0].name}
+        return dataset_facts(self.data) | split_facts(self.split) | own
 
 
 def open_files(
@@ -58,8 +68,10 @@ def open_files(
     data = aligned(module.measurements, stored[0].site)
     whole = split_for(_settings("split", stored[0], split), data)
     chosen = _folds(whole, stored)
-    _warn_if_seen(stored[0], data, whole)
-    return Opened([method for method, _ in loaded], stored, data, chosen)
+    foreign, learned = _foreign(stored, data, whole, chosen)
+    if foreign is not None:
+        log.warning("%s was trained on %s", stored[0].path, foreign)
+    return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned)
 
 
 def _settings(group: str, stored: checkpoint.Stored, given: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -92,14 +104,22 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
 
 
-def _warn_if_seen(stored: checkpoint.Stored, data: Measurements, split: Split) -> None:
-    """A test set that differs from the one kept apart in training may hold rows the model has learned."""
-    before = stored.extra.get("split_sha256")
-    if data.site.sha256 != stored.site.sha256:
-        text = "%s was trained on other data than %s (content hashes differ)"
-        log.warning(text, stored.path, data.site.name)
-    elif before not in (None, split.sha256):
-        log.warning("%s was trained on another split: its test rows may have been TRAINED on", stored.path)
+def _foreign(
+    stored: Sequence[checkpoint.Stored], data: Measurements, whole: Split, chosen: Split
+) -> tuple[str | None, int]:
+    """What was trained on instead, and how many of these test rows the models have learned from."""
+    if data.site.sha256 != stored[0].site.sha256:
+        return f"other data than {data.site.name} (content hashes differ)", 0
+    if stored[0].extra.get("split_sha256") in (None, whole.sha256):
+        return None, 0
+    try:
+        before = _folds(split_for(_settings("split", stored[0], None), data), stored)
+    except ValueError:  # a split file that is gone
+        return "another split; its test rows may have been TRAINED on", 0
+    pairs = list(zip(before.folds, chosen.folds, strict=True))
+    seen = [np.isin(fold.test, np.concatenate([old.train, old.val])) for old, fold in pairs]
+    learned, count = int(np.concatenate(seen).sum()), sum(map(len, seen))
+    return f"another split ({before.name}): {learned} of these {count} test rows were TRAINED on", learned
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:

@@ -98,8 +98,10 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
-    """Stand-ins, and a busy machine."""
+    """Stand-ins, rows that were learned from, and a busy machine."""
     found = []
+    if facts.get("split/foreign"):
+        found.append(f"the model was trained on {facts['split/foreign']}")
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here is about it")

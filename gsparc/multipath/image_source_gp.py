@@ -117,7 +117,7 @@ class ImageSourceGP(FramedMethod):
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
-        cache = SearchCache(context.run_dir, context.resume, self._key(data, known))
+        cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
         started -= cache.spent_s
         budget = Budget(started, self._budget(len(known), context.budget_s))
         row_sets = self._row_sets(data, known, self.searches)
@@ -143,10 +143,11 @@ class ImageSourceGP(FramedMethod):
             notes.append(f"{self.name}: clutter: {these}")
         return FitReport(time.monotonic() - started, tuple(notes))
 
-    def _key(self, data: Measurements, known: np.ndarray) -> str:
-        """Hash of what a search depends on; neither the budget nor the number of searches."""
-        facts = (data.site.sha256, self.search_rows, self.row_limit, self.offsets, self.clutter, self.seed)
-        return sha256(f"{facts} {self.settings} ".encode() + known.tobytes()).hexdigest()[:24]
+    def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
+        """What a search depends on; neither the budget nor the number of searches."""
+        settings = (self.search_rows, self.row_limit, self.offsets, self.clutter, self.settings)
+        rows = sha256(known.tobytes()).hexdigest()
+        return {"data": data.site.sha256, "rows": rows, "seed": str(self.seed), "settings": str(settings)}
 
     def _budget(self, measurements: int, given_s: float | None) -> float:
         if given_s is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,7 +40,7 @@ class SearchCache:
     Args:
         folder: of the run; None or an empty path for no cache.
         resume: file of an interrupted run, or None.
-        key: hash of what searches depend on; a file of another key is refused.
+        depends_on: what searches depend on, by name; a file with other values is refused.
 
     Attributes:
         spent_s: training time of the interrupted run up to its last finished search [s].
@@ -48,9 +49,12 @@ class SearchCache:
         ValueError: `resume` holds no searches, or those of other data or settings.
     """
 
-    def __init__(self, folder: Path | None = None, resume: Path | None = None, key: str = "") -> None:
+    def __init__(
+        self, folder: Path | None = None, resume: Path | None = None,
+        depends_on: Mapping[str, str] | None = None,
+    ) -> None:  # fmt: skip
         self._path = None if folder is None or folder == Path() else folder / FILE
-        self._key = key
+        self._depends_on = dict(depends_on or {})
         self._kept: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
         self.spent_s = 0.0
@@ -61,13 +65,14 @@ class SearchCache:
     def _open(self, file: Path) -> None:
         try:
             stored = torch.load(file, weights_only=True)
-            key, kept, spent = str(stored["key"]), dict(stored[SEARCHES]), float(stored["spent_s"])
+            before, kept, spent = dict(stored["depends_on"]), dict(stored[SEARCHES]), float(stored["spent_s"])
         except Exception as error:  # any error of a damaged or foreign file
             raise ValueError(
                 f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"
             ) from error
-        if key != self._key:
-            raise ValueError(f"ckpt_path={file}: is of other data, rows or settings; start without it")
+        other = [name for name, value in self._depends_on.items() if before.get(name) != value]
+        if other:
+            raise ValueError(f"ckpt_path={file}: is of other {', '.join(other)}; start without it")
         self._kept, self.spent_s = kept, spent
         log.info("reusing %d cached searches (%.0f s of training time)", len(kept), spent)
 
@@ -85,4 +90,4 @@ class SearchCache:
                 return
             spent = time.monotonic() - self._started
             with whole_file(self._path) as partial, partial.open("wb") as file:
-                torch.save({"key": self._key, "spent_s": spent, SEARCHES: self._kept}, file)
+                torch.save({"depends_on": self._depends_on, "spent_s": spent, SEARCHES: self._kept}, file)

@@ -28,6 +28,7 @@ from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.origin import Origin
 from gsparc.ops import Pose
 from gsparc.training import reduce
 from gsparc.training.auto_settings import Choices, resolve, settled
@@ -103,12 +104,15 @@ class LearnedField(Method):
         self.choices, reasons = resolve(self.settings, self.warm_start, data.site)
         for reason in reasons:
             log.info("%s", reason)
+        origin = Origin.of(data, fold, context)
         resumed = None if context.resume is None else interrupted(context.resume)
+        if resumed is not None:
+            origin.refuse_other(resumed)
         marks = {} if resumed is None else resumed.extra
         stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
         self._billed_s = 0.0
         if stage == "train":
-            seconds += self._stage("train", data, fold, context, seconds)
+            seconds += self._stage("train", origin, data, fold, context, seconds)
             self._calibrate(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
@@ -116,13 +120,13 @@ class LearnedField(Method):
             every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
-            seconds += self._stage("refit", data, every, again, seconds, self.fitted().confidence)
+            seconds += self._stage("refit", origin, data, every, again, seconds, self.fitted().confidence)
         self._frozen = None
         return FitReport(seconds)
 
     def _stage(
-        self, stage: str, data: Measurements, fold: Fold, context: FitContext, earlier_s: float,
-        confidence: Confidence | None = None,
+        self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
+        earlier_s: float, confidence: Confidence | None = None,
     ) -> float:  # fmt: skip
         """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
         folder, resume = context.run_dir, context.resume
@@ -157,7 +161,7 @@ class LearnedField(Method):
             pace = Pace(steps, end - earlier_s - prepared)
         module = self.module(steps, folder, pace)
         module.prepared_seconds = earlier_s + prepared
-        marks = {"stage": stage, "earlier_s": earlier_s + prepared}
+        marks = {"stage": stage, "earlier_s": earlier_s + prepared, **origin.marks()}
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         return prepared + run_stage(module, data, fold, context, files)
 

@@ -6,10 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from campaigns import brief, compose, spectra
 
-from gsparc.commands.calibrate.command import figures, tables
+from gsparc.commands.calibrate.command import collect, figures, tables
 from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.commands.calibrate.trial import Trial, best_kind, cells, divided, divisible, trials
+from gsparc.commands.train import train
 from gsparc.methods.confidence_scores import Evidence, gather, joined
 from gsparc.methods.method import FitContext
 from gsparc.methods.risk_threshold import Promise, Threshold, choose, levels_of, spread_out
@@ -170,3 +172,14 @@ def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
     facts = figures(exact, [], Promise())
     assert facts["confidence/learned/area_below_distance"] is None
     assert tables(facts | {"dataset/name": "d", "model/name": "m"}, exact, [])[0].row_count == 2
+
+
+def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
+    """With another split a threshold was chosen on rows whose errors the model had been fitted to."""
+    file = spectra(tmp_path / "own.npz")
+    settings = [s for s in brief(file, "model=nearest") if not s.startswith("model.")]
+    _, objects = train(compose(*settings), tmp_path / "run")
+    path = str(objects.checkpoints[0])
+    assert len(collect([path], {}, {})[0]) == len(objects.split.folds[0].test)
+    with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the split of its train"):
+        collect([path], {}, {"name": "block"})

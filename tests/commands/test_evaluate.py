@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+import re
 import subprocess
 import sys
 
@@ -18,6 +19,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.data.load import load, split_for
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.summary import remarks
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.nearest import Nearest
@@ -124,8 +126,11 @@ def test_an_interrupt_is_not_an_error(tmp_path, monkeypatch, capsys):
 def test_another_subset_and_split(trained, caplog):
     found, _, _ = evaluate_files([trained], eval_on="val", baselines=["nearest"])
     assert found.facts["val/samples"] == found.facts["split/val"] and not caplog.records
-    _, _, split = evaluate_files([trained], split={"name": "block"})
-    assert split.name == "block" and "may have been TRAINED on" in caplog.text
+    found, _, split = evaluate_files([trained], split={"name": "block"})
+    assert split.name == "block" and "were TRAINED on" in caplog.text
+    said = re.match(r"another split \(random\): (\d+) of these (\d+) test", found.facts["split/foreign"])
+    assert 0 < int(said[1]) < int(said[2]) == found.facts["split/test"]
+    assert any("were TRAINED on" in line for line in remarks(found.facts))
 
 
 def test_data_centred_elsewhere_are_moved_not_misread(trained, room):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -159,6 +160,50 @@ def test_a_missing_checkpoint_is_named(tmp_path):
     file = spectra(tmp_path / "own.npz")
     with pytest.raises(ValueError, match=r"gone\.ckpt: no such file"):
         train(compose(*brief(file, "ckpt_path=gone.ckpt")), tmp_path / "run")
+
+
+@pytest.fixture(scope="module")
+def interrupted(tmp_path_factory):
+    """A file of spectra, and what an interrupted run of `split=random` on it left."""
+    folder = tmp_path_factory.mktemp("interrupted")
+    file = spectra(folder / "own.npz")
+    often = "callbacks.checkpoint.every_n_train_steps=10"
+    train(compose(*brief(file, "model.refit=false", often)), folder / "run")
+    return file, folder / "run" / "last.ckpt"
+
+
+@pytest.mark.parametrize(
+    "change,said",
+    [
+        ("split=block", r"split\.name=random \(here block\)"),
+        ("split.seed=3", r"split\.seed=0 \(here 3\)"),
+        ("seed=3", r"seed=0 \(here 3\)"),
+        ("model.field.count=41", r"model\.field\.count=\d+ \(here 41\)"),
+        ("model.emission.hidden=7", r"model\.emission\.hidden=\d+ \(here 7\)"),
+        ("dataset.batch_size=5", r"dataset\.batch_size=\d+ \(here 5\)"),
+    ],
+)
+def test_a_run_goes_on_with_the_same_split_seed_and_settings_or_not_at_all(
+    interrupted, tmp_path, change, said
+):
+    """Rows learned before were tested on: 29 or 41 dB were shown where 20 are true."""
+    file, last = interrupted
+    with pytest.raises(ValueError, match=rf"last\.ckpt: was trained with {said}"):
+        train(compose(*brief(file, "model.refit=false", change, f"ckpt_path={last}")), tmp_path)
+    assert not (tmp_path / "summary.json").exists()
+
+
+def test_a_run_goes_on_with_the_same_data_or_not_at_all(interrupted, tmp_path):
+    _, last = interrupted
+    other = spectra(tmp_path / "other.npz", origin=1.0)
+    with pytest.raises(ValueError, match=r"was trained with dataset\.file=.*own\.npz \(here .*other\.npz\)"):
+        train(compose(*brief(other, "model.refit=false", f"ckpt_path={last}")), tmp_path / "run")
+
+
+def test_settings_of_the_rhythm_may_change_and_are_named(interrupted, tmp_path, caplog):
+    file, last = interrupted
+    train(compose(*brief(file, "model.refit=false", "trainer.max_steps=25", f"ckpt_path={last}")), tmp_path)
+    assert re.search(r"which had trainer\.max_steps=\d+ \(here 25\)", caplog.text)
 
 
 def start(file: Path, folder: Path, *more: str) -> subprocess.Popen:

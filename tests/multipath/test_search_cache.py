@@ -60,7 +60,7 @@ def test_finished_searches_are_reused(tmp_path, counted):
 def test_searches_of_another_run_are_refused(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     _fit(data, fold, tmp_path, searches=1)
-    with pytest.raises(ValueError, match="other data, rows or settings"):
+    with pytest.raises(ValueError, match="is of other seed; start without it"):
         _fit(data, fold, tmp_path / "b", tmp_path / "last.ckpt", seed=5)
     (tmp_path / "last.ckpt").write_bytes(b"not a file of ours")
     with pytest.raises(ValueError, match="holds no finished searches"):

@@ -17,8 +17,7 @@ from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.argos import published_figures, published_normalisation
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of
 from gsparc.evaluation.summary import provenance, shown, table, write_summary
 from gsparc.methods.confidence import Trusted, keep, threshold_of
@@ -37,16 +36,13 @@ def collect(
     parts, seen = [], np.zeros(0, np.int64)
     facts: dict[str, Any] = {}
     for path in paths:
-        run = open_files([path], dataset, split)
+        run = _unseen(path, dataset, split)
         fold = run.split.folds[0]
         rows = np.setdiff1d(rows_of(fold, "test"), seen)
         if len(rows):
             parts.append(gather(run.methods[0], run.data, fold, rows))
         seen = np.concatenate([seen, rows])
-        facts = facts or {
-            **_published(run.methods[0], run.data, fold),
-            **dataset_facts(run.data), **split_facts(run.split), "model/name": run.methods[0].name
-        }  # fmt: skip
+        facts = facts or _published(run.methods[0], run.data, fold) | run.facts()
     return joined(parts), facts
 
 
@@ -60,7 +56,7 @@ def store(
     seed: int,
 ) -> Trusted:
     """Choose and calibrate on the checkpoint's own test rows, and keep it with the model."""
-    run = open_files([path], dataset, split)
+    run = _unseen(path, dataset, split)
     method, data, fold = run.methods[0], run.data, run.split.folds[0]
     evidence = gather(method, data, fold, rows_of(fold, "test"))
     used, found, _, _ = accept(evidence, promise, kind, spatial, seed)
@@ -68,6 +64,14 @@ def store(
     stored = Trusted(used, threshold, promise, known_positions(data, fold), position_kernel(data, fold))
     keep(path, stored)
     return stored
+
+
+def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
+    """A checkpoint with test rows that it has not learned from: on others no promise would hold."""
+    run = open_files([path], dataset, split)
+    if run.learned:
+        raise ValueError(f"{path} was trained on {run.foreign}; calibrate with the split of its training")
+    return run
 
 
 def _published(method: Method, data: Measurements, fold: Fold) -> dict[str, float]:

@@ -30,7 +30,6 @@ from gsparc.commands.link.study import (
 from gsparc.commands.link.tables import tables
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.resource_grid import SUBCARRIERS_PER_BLOCK, centred
@@ -77,7 +76,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     accepted = score >= threshold.value
     bad = promise.bad(evidence.error[test])
     facts: dict[str, Any] = {
-        **dataset_facts(data), **split_facts(run.split), "model/name": method.name, "seed": int(config.seed),
+        **run.facts(), "seed": int(config.seed),
         "positions": len(rows), "confidence/kind": kind, "accepted": float(accepted.mean()),
         "promise/alpha": promise.alpha, "promise/delta": promise.delta, "promise/limit_db": promise.limit_db,
         "promise/bad_among_accepted": float(bad[accepted].mean()) if accepted.any() else None,

@@ -21,7 +21,6 @@ from gsparc.commands.tradeoff.sweep import Candidate, sweep
 from gsparc.data.files import platform_cache
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import baseline
-from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import rows_of, score
@@ -71,8 +70,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     draw(points, shown, beside, figure, title, run_dir / "tradeoff.png")
     facts = {
         **_facts(points, best, figure, beside, copy_ms),
-        **machine_facts(), **peak_memory(), **provenance(), **dataset_facts(data), **split_facts(run.split),
-        "model/name": method.name,
+        **machine_facts(), **peak_memory(), **provenance(), **run.facts(),
         "ckpt": str(config.ckpt),
         "seed": run.stored[0].configuration.get("seed"),
         "time/includes": "one query end to end: world position in, physical units out; warm",
