@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -128,7 +129,8 @@ def read(path: str | Path) -> Stored:
     """Read a checkpoint onto the CPU; runs no code from the file.
 
     Raises:
-        CheckpointError: missing, not a checkpoint, damaged, hostile, or of a newer gsparc.
+        CheckpointError: missing, not a checkpoint, damaged, hostile, of a newer gsparc, or holding numbers
+            that are NaN or infinite.
     """
     path = Path(path)
     if path.is_dir():
@@ -161,6 +163,10 @@ def read(path: str | Path) -> Stored:
         raise CheckpointError(
             f"{path}: written in schema {version}, this gsparc reads up to {SCHEMA_VERSION}; update gsparc"
         )
+    for part in ("site", "state"):
+        where = non_finite(content.get(part), part)
+        if where is not None:  # its checksum is right: it was written like this
+            raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
     try:
         return Stored(
             method=str(content["method"]),
@@ -235,6 +241,21 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
     return Site(**values)
+
+
+def non_finite(value: Any, where: str) -> str | None:
+    """The place of the first number that is NaN or infinite; None: all are finite."""
+    if isinstance(value, Tensor):
+        wrong = ~torch.isfinite(value)
+        return f"{where}{wrong.nonzero()[0].tolist()}" if wrong.any() else None
+    if isinstance(value, float):
+        return None if math.isfinite(value) else where
+    parts: Iterable[tuple[str, Any]] = ()
+    if isinstance(value, Mapping):
+        parts = ((f"{where}.{key}", one) for key, one in value.items())
+    elif isinstance(value, (list, tuple)):
+        parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
+    return next((found for name, one in parts if (found := non_finite(one, name)) is not None), None)
 
 
 def _plain(value: Any, where: str) -> Any:

@@ -18,13 +18,16 @@ def interrupted(path: Path) -> checkpoint.Stored:
     """What an interrupted training left.
 
     Raises:
-        ValueError: when the file holds a finished model without a trainer's state.
+        ValueError: when the file holds a finished model without a trainer's state, or one that is not finite.
     """
     stored = checkpoint.read(path)
     if "trainer" not in stored.extra:
         raise ValueError(
             f"{path} holds a finished model, not a training state: resume from last.ckpt instead"
         )
+    wrong = checkpoint.non_finite(stored.extra["trainer"].get("optimizer_states"), "optimizer_states")
+    if wrong is not None:
+        raise checkpoint.CheckpointError(f"{path}: {wrong} is NaN or infinite; resume from an earlier file")
     return stored
 
 

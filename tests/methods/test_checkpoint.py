@@ -218,3 +218,20 @@ def test_what_is_not_the_model_is_named(tmp_path):
     (tmp_path / "model.ckpt").touch()
     with pytest.raises(CheckpointError, match=r"a folder; say .*model\.ckpt"):
         checkpoint.read(tmp_path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("part", ["state", "site"])
+def test_numbers_that_are_not_finite_are_refused_by_name(fitted, tmp_path, part, value):
+    """With a right checksum they gave NaN pixels, wrong finite ones, and a confidence of NaN."""
+    file = tmp_path / "m.ckpt"
+    checkpoint.save(file, fitted[0])
+    content = torch.load(file, weights_only=True)
+    tensors = {
+        k: v for k, v in content[part].items() if isinstance(v, torch.Tensor) and v.is_floating_point()
+    }
+    name, tensor = next(iter(tensors.items()))
+    tensor.view(-1)[0] = value
+    torch.save(content, file)
+    with pytest.raises(CheckpointError, match=rf"m\.ckpt: {part}\.{name}\[0.*\] is NaN or infinite"):
+        checkpoint.read(file)
