@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
+from gsparc.commands.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, one_line
 
 
@@ -48,6 +49,9 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     except KeyboardInterrupt as interrupt:
         _say(str(interrupt) or "interrupted")
         sys.exit(130)
+    except InUse as busy:
+        _say(str(busy))
+        sys.exit(1)
     except (_Failed, Exception) as failure:
         error = failure.error if isinstance(failure, _Failed) else failure
         if before == "1":
@@ -55,6 +59,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         _say(one_line(error))
         sys.exit(1)
     finally:
+        release()
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before

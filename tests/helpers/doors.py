@@ -12,7 +12,7 @@ from unittest import mock
 
 from ledger import LEDGER
 
-WHOLE = re.compile(r"\.hydra(/.*)?|[\w.]+\.log|split\.json")  # notes of a run before it computes anything
+WHOLE = re.compile(r"\.hydra(/.*)?|\.lock|[\w.]+\.log|split\.json")  # notes of a run before it computes anything
 
 
 @dataclass(frozen=True)
