@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsparc.ops import built, calls
 from gsparc.ops.operators import KERNELS, contiguous, kernel, operator
+from gsparc.ops.transforms import beyond_kernels
 
 
 def channels(
@@ -45,8 +46,8 @@ def channels(
             f"got {gains.dtype}, {steering.dtype}, {delays.dtype}"
         )
     tones = [first_hz, step_hz]
-    single = gains.dtype in (torch.float32, torch.float64)
-    if single and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
+    served = gains.dtype in (torch.float32, torch.float64) and not beyond_kernels(gains, steering, delays)
+    if served and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
         return channels_op(gains, steering, delays, tones, subcarriers)
     return summed(gains, steering, delays, tones, subcarriers)
 

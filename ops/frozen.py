@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsparc.ops import backends
 from gsparc.ops.geometry import SphereGrid
+from gsparc.ops.transforms import carries_tangent
 
 
 class StalePlan(RuntimeError):
@@ -49,6 +50,8 @@ class FrozenPlan:
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
         """As `render`, of features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
+        if carries_tangent(seen):
+            raise RuntimeError("a frozen view has no derivatives: composite the plan it was made from")
         batch = seen if seen.dim() == 3 else seen.unsqueeze(0)
         samples, count, channels = batch.shape
         columns = batch.transpose(0, 1).reshape(count, samples * channels)

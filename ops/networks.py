@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gsparc.ops import backends, built, calls
 from gsparc.ops.operators import contiguous, empty_like, kernel, operator
+from gsparc.ops.transforms import beyond_kernels
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
@@ -19,7 +20,8 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         weight1, bias1: (N, E, H), (N, H).
         weight2, bias2: (N, H, C), (N, C).
     """
-    if encoded.requires_grad or encoded.dtype != weight1.dtype:
+    plain = encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2)
+    if plain or encoded.dtype != weight1.dtype:
         return products(encoded, weight1, bias1, weight2, bias2)
     kernels = built.kernels()
     fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None

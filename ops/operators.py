@@ -20,6 +20,7 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
+from gsparc.ops.transforms import carries_tangent
 
 KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
 """What computes an operator, by type of device and name; see `kernel`."""
@@ -86,7 +87,31 @@ def _unpacked(packed: tuple[Sequence[float]]) -> KernelSettings:
     return _named(tuple(packed[0]))
 
 
-def operator(shapes: Callable[..., Any]) -> CustomOpDef:
+class Operator:
+    """An operator of torch that refuses what it would answer with zeros in silence.
+
+    Attributes:
+        defined: the operator as torch knows it.
+    """
+
+    def __init__(self, defined: CustomOpDef) -> None:
+        self.defined = defined
+        self.register_autograd = defined.register_autograd
+
+    def __call__(self, *flat: Any) -> Any:
+        """Call it (RuntimeError for tangents of forward mode, which a kernel does not see)."""
+        if carries_tangent(*flat):
+            raise RuntimeError(
+                f"{self.defined._qualname} has no forward-mode derivative; take backend='reference'"
+            )
+        return self.defined(*flat)
+
+
+def _no_second_derivative(ctx, *slopes):
+    raise RuntimeError("kernels have no second derivatives: take backend='reference', or torch.func.hessian")
+
+
+def operator(shapes: Callable[..., Any]) -> Operator:
     """Define `gsparc::NAME` of a function `NAME_op`.
 
     Each field of a named tuple becomes an argument; `KernelSettings` become one list of numbers (`packed`),
@@ -127,7 +152,9 @@ def operator(shapes: Callable[..., Any]) -> CustomOpDef:
     compute.__doc__ = shapes.__doc__
     defined = custom_op(f"gsparc::{name}", compute, mutates_args=())
     defined.register_fake(lambda *flat: _outputs(shapes(*grouped(flat)), flat[0]))
-    return defined
+    if name.endswith("_backward"):
+        defined.register_autograd(_no_second_derivative)
+    return Operator(defined)
 
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])

@@ -5,13 +5,14 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends, validation
+from gsparc.ops import backends, reference_by_rows, validation
 from gsparc.ops.frozen import FrozenPlan
 from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.projection import Projection
 from gsparc.ops.results import Raster, Weights
 from gsparc.ops.settings import IMAGE_CUTOFF, Cutoff, Optics
+from gsparc.ops.transforms import beyond_kernels
 
 
 def make_plan(
@@ -50,12 +51,12 @@ def make_plan(
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
+    validation.transforms(gaussians, pose)
     with torch.no_grad():
         chosen = backends.choose(backend, means.device)
         optics = Optics(projection, low_pass, compensate, near, cutoff)
-        return chosen.make_plan(
-            validation.strongest(gaussians), ids, validation.poses(pose, means), grid, optics
-        )
+        still = Gaussians._make(None if tensor is None else tensor.detach() for tensor in gaussians)
+        return chosen.make_plan(validation.strongest(still), ids, validation.poses(pose, means), grid, optics)
 
 
 def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
@@ -80,6 +81,7 @@ def composite(
 ) -> Raster:
     """Blend features front to back over a plan made from the same Gaussians; differentiable in every tensor.
 
+    Under `torch.func` (`jvp`, `jacrev`, `hessian`) and in forward mode plain PyTorch computes it, slowly.
     `features` is (N, C) or (B, N, C), real. With one pose the weights are formed once for all B C channels.
 
     Raises:
@@ -88,8 +90,11 @@ def composite(
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     values = validation.features(features, means, plan.pose)
     trained = any(tensor is not None and tensor.requires_grad for tensor in (*gaussians, features))
-    means2d = plan.means2d.clone().requires_grad_() if trained and torch.is_grad_enabled() else plan.means2d
-    image, transmittance = backends.named(plan.backend).composite(plan, gaussians, values, means2d)
+    plain = beyond_kernels(*gaussians, features)
+    trained = trained and torch.is_grad_enabled() and not plain
+    means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
+    backend = reference_by_rows if plain else backends.named(plan.backend)
+    image, transmittance = backend.composite(plan, gaussians, values, means2d)
     return Raster(image, transmittance, plan.radii, plan.visible, means2d)
 
 
@@ -141,7 +146,8 @@ def mean_weights(
         ValueError, TypeError: as `composite`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
-    return Weights(*backends.named(plan.backend).mean_weights(plan, gaussians))
+    backend = reference_by_rows if beyond_kernels(*gaussians) else backends.named(plan.backend)
+    return Weights(*backend.mean_weights(plan, gaussians))
 
 
 @torch.no_grad()

@@ -47,16 +47,22 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
     return torch.cat(images).unflatten(-1, size), torch.stack(transmittances).unflatten(-1, size)
 
 
-def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
-    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    means, shares = [], []
+def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+    """Sums over pixels of alpha T and of alpha, both (P, N)."""
+    seen, total = [], []
     no_shift = torch.zeros_like(plan.means2d)
     for index in range(plan.num_poses):
         weights, alpha, _ = _weights(plan, index, gaussians, no_shift)
         inverse = torch.argsort(plan.buffers[0][index])
-        means.append(weights.mean(1)[inverse])
-        shares.append(visible_share(weights.sum(1), alpha.sum(1))[inverse])
-    return torch.stack(means), torch.stack(shares)
+        seen.append(weights.sum(1)[inverse])
+        total.append(alpha.sum(1)[inverse])
+    return torch.stack(seen), torch.stack(total)
+
+
+def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
+    """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
+    seen, total = weight_sums(plan, gaussians)
+    return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:

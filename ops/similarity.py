@@ -9,11 +9,14 @@ from torch import Tensor
 
 from gsparc.ops import built, calls
 from gsparc.ops.operators import kernel, layout, operator
+from gsparc.ops.transforms import beyond_kernels
 
 
 def served(images: Tensor) -> bool:
     """Whether a kernel supports these images: float32, on a device whose kernels are loaded."""
     device = images.device.type
+    if beyond_kernels(images):
+        return False
     loaded = device in calls.libraries or (device == "cpu" and built.kernels() is not None)
     return images.dtype == torch.float32 and loaded
 

@@ -8,6 +8,7 @@ from torch import Tensor
 from gsparc.ops import built
 from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, WIDEST
+from gsparc.ops.transforms import carries_tangent, mapped
 
 
 class UnsoundGaussian(ValueError):
@@ -47,6 +48,18 @@ def gaussians(
     ):
         raise ValueError(f"ids must be ({n},) int64 on {means.device}, got {tuple(ids.shape)} {ids.dtype}")
     return given
+
+
+def transforms(gaussians: Gaussians, pose: Pose) -> None:
+    """Refuse a pose whose gradient is asked for, which would be none, and Gaussians under `torch.vmap`."""
+    ends = (pose.position, pose.rotation)
+    wanted = torch.is_grad_enabled() and any(part.requires_grad for part in ends)
+    if wanted or carries_tangent(*ends):
+        raise ValueError("a pose has no gradients here: detach it, or move the Gaussians instead")
+    if mapped(*gaussians, *ends):
+        raise ValueError(
+            "torch.vmap over Gaussians or poses is not possible: give P poses, or features (B, N, C)"
+        )
 
 
 def finite(gaussians: Gaussians, pose: Pose) -> None:

@@ -12,7 +12,9 @@ from unittest import mock
 
 from ledger import LEDGER
 
-WHOLE = re.compile(r"\.hydra(/.*)?|\.lock|[\w.]+\.log|split\.json")  # notes of a run before it computes anything
+WHOLE = re.compile(
+    r"\.hydra(/.*)?|\.lock|[\w.]+\.log|split\.json"
+)  # notes of a run before it computes anything
 
 
 @dataclass(frozen=True)

@@ -71,9 +71,9 @@ def test_bit_identical_for_any_threads():
 
 def test_operators_obey_the_rules():
     inputs = [tensor.requires_grad_() for tensor in sources(2, 3, 2)]
-    opcheck(channels_op, (*inputs, list(TONES), 3))
+    opcheck(channels_op.defined, (*inputs, list(TONES), 3))
     plain = [tensor.detach() for tensor in inputs]
-    opcheck(channels_backward_op, (torch.ones(2, 2, 3, 2, dtype=torch.float64), *plain, list(TONES)))
+    opcheck(channels_backward_op.defined, (torch.ones(2, 2, 3, 2, dtype=torch.float64), *plain, list(TONES)))
 
 
 def test_float32_delays_are_refused():

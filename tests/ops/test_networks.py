@@ -68,9 +68,9 @@ def test_bit_identical_for_any_threads():
 
 def test_operators_obey_the_rules():
     encoded, *layers = weights((3, 5, 4, 8, 2))
-    opcheck(networks_op, (encoded, *[layer.requires_grad_() for layer in layers]))
+    opcheck(networks_op.defined, (encoded, *[layer.requires_grad_() for layer in layers]))
     plain = [layer.detach() for layer in layers]
-    opcheck(networks_backward_op, (torch.ones(3, 5, 2, dtype=torch.float64), encoded, *plain))
+    opcheck(networks_backward_op.defined, (torch.ones(3, 5, 2, dtype=torch.float64), encoded, *plain))
     assert torch.autograd.gradcheck(lambda *w: networks(encoded, *w), layers)
 
 

@@ -36,10 +36,10 @@ def test_opcheck(hides):
     leaves = [tensor.clone().requires_grad_() for tensor in model]
     hidden = scene.extinctions.clone().requires_grad_() if hides else None
     features, means2d = scene.features.clone().requires_grad_(), plan.means2d.clone().requires_grad_()
-    opcheck(operators.plan_op, (*model, None, None, *view, settings))
+    opcheck(operators.plan_op.defined, (*model, None, None, *view, settings))
     rest = (*view, *plan.buffers, settings)
-    opcheck(operators.composite_op, (means2d, *leaves, hidden, features, *rest))
-    opcheck(operators.weights_op, (*leaves, hidden, *rest))
+    opcheck(operators.composite_op.defined, (means2d, *leaves, hidden, features, *rest))
+    opcheck(operators.weights_op.defined, (*leaves, hidden, *rest))
 
 
 @pytest.mark.parametrize("hides", [False, True], ids=["plain", "extinctions"])
@@ -53,9 +53,11 @@ def test_opcheck_of_the_gradients(hides, behind):
     raster = composite(plan, *model, scene.features, extinctions=scene.extinctions)
     light = torch.ones_like(raster.transmittance) if behind else None
     images = (torch.ones_like(raster.image), light, raster.image, raster.transmittance)
-    opcheck(operators.composite_backward_op, (*images, *common, scene.features, *view))
+    opcheck(operators.composite_backward_op.defined, (*images, *common, scene.features, *view))
     seen = operators.weights_op(*common, *view)
-    opcheck(operators.weights_backward_op, (*[torch.ones_like(part) for part in seen], *common, *view))
+    opcheck(
+        operators.weights_backward_op.defined, (*[torch.ones_like(part) for part in seen], *common, *view)
+    )
 
 
 def test_bare_import_is_refused_with_a_reason():

@@ -1,0 +1,38 @@
+"""What torch's function transforms do to a tensor that reaches the rasterizer: tangents, vmap, nesting."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch._C import _functorch
+from torch.autograd import forward_ad
+
+
+def carries_tangent(*values: Any) -> bool:
+    """Whether a tensor among `values` is differentiated in forward mode, by `torch.func.jvp` for example."""
+    if forward_ad._current_level < 0:  # no forward mode anywhere: this is asked at every call
+        return False
+    tensors = (v for v in values if isinstance(v, Tensor) and v.is_floating_point())
+    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+
+
+def mapped(*values: Any) -> bool:
+    """Whether `torch.vmap` has hidden an axis of a tensor among `values`."""
+    for value in values if transforming() else ():
+        while isinstance(value, Tensor) and _functorch.is_functorch_wrapped_tensor(value):
+            if _functorch.is_batchedtensor(value):
+                return True
+            value = _functorch.get_unwrapped(value)
+    return False
+
+
+def transforming() -> bool:
+    """Whether a transform of `torch.func` is under way."""
+    return torch._C._are_functorch_transforms_active()
+
+
+def beyond_kernels(*values: Any) -> bool:
+    """Whether plain PyTorch must compute what a kernel would answer without its derivative, or not at all."""
+    return transforming() or carries_tangent(*values)

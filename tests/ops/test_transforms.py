@@ -1,0 +1,144 @@
+"""Forward mode, second derivatives and `torch.func` over the rasterizer: right, or refused in words."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from rasters import random_scene
+from torch.autograd import forward_ad
+from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
+
+from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops.channels import channels
+from gsparc.ops.networks import networks
+from gsparc.ops.operators import composite_op, view_of
+from gsparc.training.losses import ssim
+
+GRID = SphereGrid.hemisphere(9, 18)
+POSE = Pose.identity(torch.zeros(3, dtype=torch.float64))
+BACKENDS = pytest.mark.parametrize("backend", ["reference", "cpu"])
+
+
+@pytest.fixture
+def model():
+    scene = random_scene(n=6, samples=1)
+    parts = (scene.means, scene.quats, scene.scales, scene.opacities, scene.features[0])
+    return tuple(part.double() for part in parts)
+
+
+def image(backend):
+    return lambda *model: rasterize(*model, POSE, GRID, backend=backend).image
+
+
+def shares(backend):
+    return lambda *model: mean_weights(make_plan(*model[:4], POSE, GRID, backend=backend), *model[:4]).share
+
+
+def tangents(values):
+    draw = torch.Generator().manual_seed(1)
+    return tuple(torch.randn(value.shape, generator=draw, dtype=torch.float64) for value in values)
+
+
+@BACKENDS
+@pytest.mark.parametrize("made", [image, shares], ids=["image", "share"])
+def test_forward_mode_was_zero_in_silence(model, made, backend):
+    """By the kernels 0; by the reference the footprints' motion counted twice."""
+    function, directions = made(backend), tangents(model)
+    found = jvp(function, model, directions)[1]
+    step = 1e-6
+    ahead, behind = (
+        function(*(v + sign * step * d for v, d in zip(model, directions, strict=True))) for sign in (1, -1)
+    )
+    assert found.abs().max() > 1e-3
+    assert torch.allclose(found, (ahead - behind) / (2 * step), atol=1e-5 * float(found.abs().max()))
+    with forward_ad.dual_level():
+        duals = [forward_ad.make_dual(v, d) for v, d in zip(model, directions, strict=True)]
+        assert torch.allclose(forward_ad.unpack_dual(function(*duals)).tangent, found, rtol=1e-12)
+
+
+@BACKENDS
+def test_transforms_agree_with_autograd(model, backend):
+    slope = tangents((image(backend)(*model),))[0]
+    leaves = [part.clone().requires_grad_() for part in model]
+    wanted = torch.autograd.grad(image(backend)(*leaves), leaves, slope)
+    found = vjp(image(backend), *model)[1](slope)
+    for one, other in zip(found, wanted, strict=True):
+        assert torch.allclose(one, other, rtol=1e-9, atol=1e-10)
+
+    def power(means):
+        return image(backend)(means, *model[1:]).square().sum((0, 2, 3))
+
+    assert torch.allclose(jacrev(power)(model[0]), jacfwd(power)(model[0]), rtol=1e-9, atol=1e-10)
+
+
+@BACKENDS
+def test_a_batch_of_features_may_be_mapped(model, backend):
+    features = torch.stack([model[4], 2 * model[4]])
+    found = vmap(lambda values: image(backend)(*model[:4], values))(features)
+    assert torch.allclose(found[1], 2 * found[0]) and torch.allclose(found[0], image(backend)(*model))
+
+
+@BACKENDS
+def test_gaussians_cannot_be_mapped(model, backend):
+    with pytest.raises(ValueError, match=r"vmap over Gaussians or poses is not possible: give P poses"):
+        vmap(lambda values: image(backend)(values, *model[1:]))(torch.stack([model[0], model[0]]))
+
+
+def test_second_derivatives_by_either_road(model):
+    def power(backend):
+        return lambda opacities: image(backend)(*model[:3], opacities, model[4]).square().sum()
+
+    leaf = model[3].clone().requires_grad_()
+    (slope,) = torch.autograd.grad(power("reference")(leaf), leaf, create_graph=True)
+    rows = [torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in slope]
+    assert torch.allclose(hessian(power("cpu"))(model[3]), torch.stack(rows), rtol=1e-8, atol=1e-9)
+    (slope,) = torch.autograd.grad(power("cpu")(leaf), leaf, create_graph=True)
+    with pytest.raises(RuntimeError, match=r"kernels have no second derivatives: take backend='reference'"):
+        torch.autograd.grad(slope.sum(), leaf)
+
+
+@BACKENDS
+@pytest.mark.parametrize("part", ["position", "rotation"])
+def test_a_pose_had_no_gradient_and_no_word(model, backend, part):
+    parts = {"position": POSE.position.clone(), "rotation": POSE.rotation.clone()}
+    pose = Pose(**{**parts, part: parts[part].requires_grad_()})
+    with pytest.raises(ValueError, match="a pose has no gradients here: detach it"):
+        rasterize(*model, pose, GRID, backend=backend)
+    with torch.no_grad():
+        rasterize(*model, pose, GRID, backend=backend)
+
+
+def test_an_operator_by_itself_and_a_frozen_view_refuse(model):
+    plan = make_plan(*model[:4], POSE, GRID)
+    view = freeze(plan, *model[:4], version=0)
+    with forward_ad.dual_level():
+        features = forward_ad.make_dual(model[4], torch.ones_like(model[4]))
+        with pytest.raises(RuntimeError, match="gsparc::composite has no forward-mode derivative"):
+            composite_op(plan.means2d, *model[:4], None, features[None], *view_of(plan))
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives"):
+            view.render(features, 0)
+        assert forward_ad.unpack_dual(composite(plan, *model[:4], features).image).tangent.abs().max() > 0
+
+
+def test_networks_channels_and_similarity_have_forward_mode():
+    draw = torch.Generator().manual_seed(0)
+
+    def random(*shape):
+        return torch.rand(shape, generator=draw, dtype=torch.float64)
+
+    layers = (random(2, 3), random(4, 3, 5), random(4, 5), random(4, 5, 2), random(4, 2))
+    sources = (random(2, 4, 2), random(4, 3, 2), 1e-8 * random(4))
+    images = (random(1, 12, 13).float(), random(1, 12, 13).float())
+    for function, values, step in (
+        (networks, layers, 1e-6),
+        (lambda *parts: channels(*parts, 2.4e9, 1e6, 3), sources, None),
+        (lambda image: ssim(image, images[1]), images[:1], 1e-3),
+    ):
+        directions = tuple(torch.ones_like(v) * (1e-9 if v.max() < 1e-6 else 1) for v in values)
+        found = jvp(function, values, directions)[1]
+        step = step or 1e-4
+        ends = [
+            function(*(v + s * step * d for v, d in zip(values, directions, strict=True))) for s in (1, -1)
+        ]
+        wanted = (ends[0] - ends[1]) / (2 * step)
+        assert found.abs().max() > 0 and torch.allclose(found, wanted, rtol=2e-2 if step > 1e-4 else 1e-4)
