@@ -78,14 +78,13 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
     """Scores (n,) of `Evidence` as confidences (n,) in [0, 1] in the same order."""
     if kind == "learned":
         return score
-    if kind == "gp_variance":
-        return np.clip(1 + score, 0, 1)
-    return 1 / (1 - score)  # an expected error, or a distance in metres, of 1 is a confidence of a half
+    # An expected error, a variance in the prior's, or a distance in metres, of 1 is a confidence of a half.
+    return 1 / (1 - np.minimum(score, 0))
 
 
 def keep(path: str | Path, trusted: Trusted) -> None:
     """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
-    checkpoint.amend(path, {KEY: asdict(trusted)})
+    checkpoint.amend(path, {KEY: {**asdict(trusted), "unclipped": True}})
 
 
 def kept(extra: Mapping[str, Any]) -> Trusted:
@@ -96,7 +95,11 @@ def kept(extra: Mapping[str, Any]) -> Trusted:
     promise = None if found["promise"] is None else Promise(**found["promise"])
     kernel = None if found["kernel"] is None else Kernel(**found["kernel"])
     known = np.asarray(found["known"], np.float64)
-    return Trusted(found["kind"], float(found["threshold"]), promise, known, kernel)
+    kind, threshold = found["kind"], float(found["threshold"])
+    if kind == "gp_variance" and not found.get("unclipped") and threshold <= 1:
+        # Earlier versions kept 1 - variance, cut off at 0: there every place was accepted, now none is.
+        threshold = float(as_confidence(kind, np.array(threshold - 1))) if threshold > 0 else float("inf")
+    return Trusted(kind, threshold, promise, known, kernel)
 
 
 def threshold_of(kind: str, found: Threshold) -> float:

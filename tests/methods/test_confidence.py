@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -52,3 +54,25 @@ def test_what_was_never_stored_is_said(site) -> None:
     keep(file, Trusted("learned", 0.5, Promise(), known_positions(data, fold), position_kernel(data, fold)))
     with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
         gsparc.load(file, confidence="distance").accepts(tx=world)
+
+
+@pytest.mark.parametrize("kind", ["gp_variance", "distance"])
+def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None:
+    """Variances above 1 were cut off: a threshold there accepted a place 900 km away."""
+    data, fold, file = site
+    known, kernel = known_positions(data, fold), replace(position_kernel(data, fold), noise=0.5)
+    laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
+    keep(file, Trusted(kind, float(laxest), Promise(), known, kernel))
+    near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
+    assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()
+
+
+def test_a_threshold_that_was_cut_off_accepts_nobody(site) -> None:
+    data, fold, file = site
+    known, kernel = known_positions(data, fold), position_kernel(data, fold)
+    for stored, meant in ((0.75, 1 / 1.25), (0.0, np.inf)):
+        keep(file, Trusted("gp_variance", stored, Promise(), known, kernel))
+        extra = checkpoint.read(file).extra["confidence"]
+        del extra["unclipped"]
+        checkpoint.amend(file, {"confidence": extra})
+        assert gsparc.load(file).trusted.threshold == pytest.approx(meant)
