@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +12,15 @@ import torch
 
 from gsparc.data.limits import SHARE, Checked, setting, whole
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(eq=False)
 class OpacityReset(Checked, L.Callback):
     """sigma_i <- min(sigma_i, ceiling) every `interval` steps until `stop`; Adam's moments follow.
+
+    Validation falls by several decibels and takes about an interval to recover: where fewer steps are left,
+    there is no reset.
 
     Args:
         interval: steps between resets.
@@ -30,6 +36,10 @@ class OpacityReset(Checked, L.Callback):
         """Reset when the schedule says so."""
         step = trainer.global_step
         if step == 0 or step > self.stop or step % self.interval:
+            return
+        if step + self.interval > module.total_steps:
+            left = module.total_steps - step
+            log.info("no opacity reset at step %d: %d steps are too few to recover in", step, left)
             return
         field, ceiling = module.model.gaussians, math.log(self.ceiling / (1 - self.ceiling))
         with torch.no_grad():

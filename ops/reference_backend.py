@@ -24,6 +24,10 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
         orders.append(reference.depth_order(seen, ids))
         centers.append(torch.where(seen.present[:, None], seen.center, 0.0))
         visible.append((alpha > 0).any(1))
+        if ids is not None:
+            ranks = orders[-1][visible[-1][orders[-1]]]
+            if bool(((seen.distance[ranks].diff() == 0) & (ids[ranks].diff() == 0)).any()):
+                validation.raise_for_ids()
         radii.append(torch.where(visible[-1], reference.radii(seen, strongest, optics), 0.0))
     return Plan(
         *(pose, grid, optics, "reference"),

@@ -12,6 +12,9 @@ from gsparc.ops.projection import HORIZON_COSINE, PROJECTIONS, Projection
 FARTHEST = 1e6
 """Largest coordinate of a Gaussian [m]; ops see local coordinates, float32 no squares of 1e19."""
 
+SKEW = 2e-3
+"""How far the products of the columns of a pose's rotation may be from those of a rotation."""
+
 WIDEST = 1e5
 """Largest standard deviation of a Gaussian [m]; at the near cut its determinant in px still is a float32."""
 

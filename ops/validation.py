@@ -7,8 +7,8 @@ from torch import Tensor
 
 from gsparc.ops import built
 from gsparc.ops.geometry import Gaussians, Pose
-from gsparc.ops.settings import FARTHEST, WIDEST
-from gsparc.ops.transforms import carries_tangent, mapped
+from gsparc.ops.settings import FARTHEST, SKEW, WIDEST
+from gsparc.ops.transforms import carries_tangent, mapped, transforming
 
 
 class UnsoundGaussian(ValueError):
@@ -64,7 +64,10 @@ def transforms(gaussians: Gaussians, pose: Pose) -> None:
 
 def finite(gaussians: Gaussians, pose: Pose) -> None:
     """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
-    if not all(bool(torch.isfinite(part).all()) for part in (pose.position, pose.rotation)):
+    turns = pose.rotation.mT @ pose.rotation - torch.eye(3).to(pose.rotation)
+    right_handed = torch.linalg.det(pose.rotation) > 0
+    near = (pose.position.abs() <= FARTHEST).all() & (turns.abs() <= SKEW).all() & right_handed.all()
+    if not bool(near):  # NaN is not either
         raise_for_pose()
     means, quats, scales, strongest, _ = gaussians
     valid = {
@@ -89,9 +92,11 @@ def strongest(gaussians: Gaussians) -> Gaussians:
 
 
 def raise_for_status(status: int) -> None:
-    """Raise for a plan's status: UNSOUND_POSE, 4 * Gaussian + index of the parameter, or -1 if valid."""
+    """Raise for a plan's status: UNSOUND_POSE, EQUAL_IDS, 4 * Gaussian + parameter, or -1 if valid."""
     if status == built.kernels().UNSOUND_POSE:
         raise_for_pose()
+    if status == built.kernels().EQUAL_IDS:
+        raise_for_ids()
     if status >= 0:
         raise_for(Gaussians._fields[status % 4], status // 4)
 
@@ -109,8 +114,16 @@ def raise_for(name: str, index: int) -> None:
 
 
 def raise_for_pose() -> None:
-    """Raise for a pose that is not finite (ValueError)."""
-    raise ValueError("a pose is not finite; look at the positions and rotations of this batch")
+    """Raise for a pose that is none (ValueError)."""
+    raise ValueError(
+        f"a pose is not finite, not within {FARTHEST:.0e} m, or its matrix is no rotation; "
+        "look at the positions and rotations of this batch"
+    )
+
+
+def raise_for_ids() -> None:
+    """Raise for Gaussians that no order tells apart (ValueError)."""
+    raise ValueError("Gaussians at one distance have equal ids, so nothing orders them; give each its own id")
 
 
 def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
@@ -120,6 +133,10 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
         raise ValueError(
             f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
         )
+    looked_at = values.device.type == "cpu" and not transforming()  # a GPU is not waited for: NaN stays NaN
+    if looked_at and not bool(torch.isfinite(values).all()):
+        bad = (~torch.isfinite(values)).any(-1)
+        raise_for("features", int(bad.nonzero()[0, -1]))
     poses = len(pose)
     if values.dim() == 2:
         return values.expand(poses, *values.shape)

@@ -106,7 +106,7 @@ class Gsparc(LearnedField):
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
             self._weigh_directional()
-        return FitReport(report.seconds + sum(d.seconds for d in self.decisions), report.notes)
+        return replace(report, seconds=report.seconds + sum(d.seconds for d in self.decisions))
 
     @staticmethod
     def _named(effect: str | None, site: Site) -> str | None:

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from gsparc.data.describe import describe, read_any
 from gsparc.data.errors import DataError
+from gsparc.data.load import split_for
 
 
 def check(path: str, console: Console) -> bool:
@@ -25,6 +26,11 @@ def check(path: str, console: Console) -> bool:
         _line(console, f"{topic:<12}{sentence}")
     for note in reading.notes:
         _line(console, f"{'note':<12}{note}")
+    try:
+        split_for({"name": "random"}, reading.data).check()
+    except DataError as error:
+        _line(console, f"{path}: readable, but too small to train on ({error})")
+        return False
     _line(console, f"{path}: good")
     return True
 

@@ -20,7 +20,7 @@ def context_of(
     callbacks: Callable[[], Sequence[Callback]] | None = None,
     **others: Any,
 ) -> FitContext:
-    """The context of a fit: `seed`, `budget_s`, `init_from`, `dataset.batch_size` and what is given.
+    """The context of a fit: seed, budget, `init_from`, `dataset.batch_size`, and what is given.
 
     Args:
         config: a composed configuration.
@@ -32,6 +32,7 @@ def context_of(
     return FitContext(
         seed=int(config.seed),
         budget_s=config.budget_s,
+        budget_clock=config.get("budget_clock", "wall"),
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
         trainer=trainer or instantiate(config.trainer, _partial_=True),

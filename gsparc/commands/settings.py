@@ -25,12 +25,16 @@ class RunSettings(Checked):
         threads: CPU threads; None takes what torch finds.
         eval_on: rows that are scored.
         baselines: names of methods.
+        budget_s: seconds of training, or of timing; None: as the rest is configured.
+        budget_clock: `wall` or `processor`.
     """
 
     seed: int = setting(0, whole(0, 2**32 - 1))
     threads: int | None = setting(None, or_null(whole(1)))
     eval_on: str = setting("test", choice("train", "val", "test"))
     baselines: tuple[str, ...] = ()
+    budget_s: float | None = setting(None, or_null(POSITIVE))
+    budget_clock: str = setting("wall", choice("wall", "processor"))
 
     @classmethod
     def of(cls, config: DictConfig) -> RunSettings:
@@ -43,8 +47,14 @@ class RunSettings(Checked):
         assert isinstance(given, dict)
         known: dict[str, Any] = {f.name: given[f.name] for f in fields(cls) if f.name in given}
         found = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
-        clip = (given.get("trainer") or {}).get("gradient_clip_val")
-        or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
+        trainer = given.get("trainer") or {}
+        or_null(POSITIVE).check(
+            "trainer.gradient_clip_val", trainer.get("gradient_clip_val")
+        )  # Lightning takes any
+        if trainer.get("accelerator") in ("gpu", "cuda") and not torch.cuda.is_available():
+            raise SettingError(
+                f"trainer.accelerator={trainer['accelerator']}: there is no GPU here; say trainer=cpu"
+            )
         if "model" in config:
             build(config.model)  # its parts check themselves, and so do callbacks
         for node in (config.get("callbacks") or {}).values():

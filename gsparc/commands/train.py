@@ -39,8 +39,6 @@ from gsparc.methods.registry import build
 
 log = logging.getLogger(__name__)
 
-LEAST_ROWS = 4  # fewer training rows than this teach nothing
-
 
 @dataclass(frozen=True)
 class Objects:
@@ -105,7 +103,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=list(config.baselines), cache=platform_cache(),
         )  # fmt: skip
-        facts = {**found.facts, **provenance(), "seed": int(config.seed)}
+        limited = config.get("budget_clock", "wall") if fitted.time_limited else None
+        facts = {**found.facts, **provenance(), "seed": int(config.seed), "model/limited_by_clock": limited}
         for logger in loggers:
             logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
     title = f"{data.site.name}: test rows of {methods[0].name}"
@@ -120,10 +119,11 @@ def _data(config: DictConfig) -> DataModule:
     path, start = config.ckpt_path, config.get("init_from")
     if path is not None and not Path(path).exists():  # before anything is read or simulated
         raise ValueError(f"ckpt_path={path}: no such file")
+    module = datamodule(config.dataset)
+    module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         if not OmegaConf.is_missing(config.dataset, key) and config.dataset.get(key):
             config.dataset[key] = str(Path(config.dataset[key]).resolve())
-    module = datamodule(config.dataset)
     if start is not None:
         try:
             module.measurements = aligned(module.measurements, checkpoint.read(start).site)
@@ -135,12 +135,7 @@ def _data(config: DictConfig) -> DataModule:
 def _split(config: DictConfig, data: Measurements, file: Path) -> Split:
     """The folds, written to `file`; none without rows to learn from or to test on."""
     split = split_for(plain(config.split), data)
-    for number, fold in enumerate(split.folds):
-        if len(fold.train) < LEAST_ROWS or not len(fold.test):
-            raise ValueError(
-                f"split={split.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} test "
-                f"rows; at least {LEAST_ROWS} and 1 are needed"
-            )
+    split.check()
     write_split(file, split, len(data), data.site.sha256)
     return split
 

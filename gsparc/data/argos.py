@@ -74,7 +74,7 @@ def load_argos(
     if align:
         csi = aligned(csi, tones)
     scale = rounded_rms(csi)
-    csi = (csi / scale).astype(np.complex64)
+    csi = (csi.astype(np.complex128) / scale).astype(np.complex64)
     uplink, target = csi[..., :UPLINK], np.ascontiguousarray(csi[:, chosen, UPLINK:])
     split = _split(root, len(csi))
     where = _positions(root, positions, encode, uplink, split)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from functools import cached_property
@@ -11,8 +12,11 @@ import lightning.pytorch as pl
 import numpy as np
 import torch
 
+from gsparc.data import outliers
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold
+
+log = logging.getLogger(__name__)
 
 
 def steps_per_epoch(pool_size: int, batch_size: int) -> int:
@@ -130,8 +134,11 @@ class DataModule(pl.LightningDataModule, ABC):
 
     @cached_property
     def measurements(self) -> Measurements:
-        """All measurements, read when first asked for."""
-        return self.load()
+        """All measurements, read when first asked for; rows far beyond all others are warned of."""
+        data = self.load()
+        for said in outliers.warnings(data):
+            log.warning("%s: %s", self.name, said)
+        return data
 
     def use(self, fold: Fold, seed: int = 0) -> Self:
         """Show the rows of `fold`, training rows in the order of `seed`; returns itself."""

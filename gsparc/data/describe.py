@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data import outliers
 from gsparc.data.errors import DataError
 from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
@@ -51,6 +52,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("neighbours", _neighbours(moving, site.wavelength)),
     ]
     lines += [("units?", hint) for hint in suspicious_values(data)]
+    lines += [("outliers?", said) for said in outliers.warnings(data)]
     carrier = "unknown; give frequency_hz, and effects that need the phase become available"
     if site.carrier_hz is not None:
         carrier = f"{site.carrier_hz / 1e9:.6g} GHz, wavelength {site.wavelength:.4g} m"

@@ -6,6 +6,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+MOST = 300  # characters of a message: what was found may be a whole file in one line
+
+
+def shortened(text: str) -> str:
+    """A text without its middle when it is long."""
+    return text if len(text) <= MOST else f"{text[: MOST // 2]} ... {text[-MOST // 3 :]}"
+
 
 class DataError(ValueError):
     """Input that was refused at load; nothing half-loaded exists when it is raised.
@@ -36,7 +43,7 @@ class Problems(list[str]):
 
         Returns None, so that a reader that has nothing to return can end with it; so does `add_rows`.
         """
-        self.append(f"{where}: {what}")
+        self.append(f"{where}: {shortened(what)}")
 
     def add_rows(self, where: str | Path, rows: Iterable[str], what: str) -> Any:
         """Note `what` for each of `rows` (as a user names them), at most `LIMIT` of them."""

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
 import yaml
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
@@ -16,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
+from gsparc.data.outliers import outliers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, SplitSettings, make_split, read_split
 
@@ -80,7 +82,8 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     if config.get("name") == "file":
         return read_split(config["path"], len(data), data.site.sha256)
     settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
-    return make_split(data.moving, settings, data.release_split)
+    wrong = np.concatenate([np.zeros(0, np.int64), *outliers(data).values()])
+    return make_split(data.moving, settings, data.release_split, wrong)
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:

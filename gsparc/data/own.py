@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
+from gsparc.data.outliers import loud, peaks
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import LIGHT, Kind, Measurements
@@ -139,6 +140,9 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, values, mask)
+    if scale > 0:
+        huge = "beyond float32 in units of the other rows; is it damaged?"
+        check.refuse_rows(measured, ~np.isfinite(target), huge)
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
@@ -289,7 +293,8 @@ def _scaled(name: str, values: np.ndarray, mask: np.ndarray | None) -> tuple[np.
     if name == "rssi_db":
         values = 10 ** (values / 10) * (1 if mask is None else mask)
     if name == "spectrum":
-        largest = float(values.max())
+        highest = peaks(values)
+        largest = float(highest[~loud(highest)].max(initial=0.0))
         scale = 1.0 if 0.1 <= largest <= 1 else largest
     elif name == "csi":
         scale = rounded_rms(values, mask)
@@ -297,7 +302,11 @@ def _scaled(name: str, values: np.ndarray, mask: np.ndarray | None) -> tuple[np.
         scale = rounded_rms(np.sqrt(values), mask) ** 2
     if scale <= 0:
         return values, 0.0
-    return (values / scale).astype(np.complex64 if name == "csi" else np.float32), scale
+    if (
+        name == "csi"
+    ):  # in double precision: in complex64 units of 1e-42 have a digit or two, and no reciprocal
+        return (values.astype(np.complex128) / scale).astype(np.complex64), scale
+    return (values / scale).astype(np.float32), scale
 
 
 __all__ = ["DataError", "Reading", "from_arrays", "interpret", "load_own", "write_own"]

@@ -62,6 +62,9 @@ class Checker:
     def measurement(self) -> str | None:
         """Which of spectrum, csi, rssi, rssi_db to read: the only one, or the one that an attribute names."""
         present, named = self.given(*MEASUREMENTS), self.raw.attributes.get("measurement")
+        if named is not None and named not in present:
+            there = " and ".join(present) or "none of these"
+            self.refuse("measurement", f"{named!r} names no measurement of this file, which holds {there}")
         if len(present) == 1:
             return present[0]
         if named in present:

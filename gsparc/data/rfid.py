@@ -9,6 +9,7 @@ train_index.txt, test_index.txt   optional, both or none: one number per line
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +26,8 @@ from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
+NUMBER = re.compile(r"\s*[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
+LONGEST = 18  # digits of an index
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
@@ -148,11 +151,8 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     positions = np.full((len(rows) - 1, 3), np.nan)
     readable: list[int] = []
     for i, row in enumerate(rows[1:]):
-        try:
-            values = [float(cell) for cell in row]
-        except ValueError:
-            values = []
-        if len(values) != 3:
+        values = [float(cell) for cell in row if NUMBER.fullmatch(cell)]
+        if not len(values) == len(row) == 3:
             problems.add(f"{path}, line {i + 2}", f"expected three numbers x,y,z, found {','.join(row)!r}")
             continue
         positions[i] = values
@@ -229,7 +229,7 @@ def _read_index(path: Path, count: int | None, problems: Problems) -> np.ndarray
         if not text:
             continue
         where = f"{path}, line {number}"
-        if not (text.isascii() and text.isdigit()):
+        if not (text.isascii() and text.isdigit() and len(text) <= LONGEST):
             problems.add(where, f"expected the number of a spectrum like 00001, found {line.strip()!r}")
             continue
         index = int(text)

@@ -6,8 +6,10 @@ import difflib
 import hashlib
 import json
 import logging
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -20,6 +22,7 @@ log = logging.getLogger(__name__)
 NAMES = ("random", "grouped", "block", "sparse")
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
+LEAST_ROWS = 4  # fewer training rows than this teach nothing
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,15 @@ class Split:
     folds: tuple[Fold, ...]
     sha256: str
 
+    def check(self) -> None:
+        """Refuse folds that teach nothing, or test nothing (DataError)."""
+        for number, fold in enumerate(self.folds):
+            if len(fold.train) < LEAST_ROWS or not len(fold.test):
+                raise DataError(
+                    f"split={self.name}: fold {number} has {len(fold.train)} training and {len(fold.test)} "
+                    f"test rows; at least {LEAST_ROWS} and 1 are needed"
+                )
+
 
 @dataclass(frozen=True)
 class SplitSettings:
@@ -68,6 +80,7 @@ class SplitSettings:
         train_count: thin each fold's training rows to this many (validation included); None keeps all.
         thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
         spacing_m: keep only training rows at least this far apart, before the other two [m]; None keeps all.
+        leave_out: rows that are neither learned from nor tested on, or `outliers`.
     """
 
     name: str = "random"
@@ -83,6 +96,7 @@ class SplitSettings:
     train_count: int | None = None
     thin: float = 1.0
     spacing_m: float | None = None
+    leave_out: Sequence[int] | Literal["outliers"] = ()
 
     def __post_init__(self) -> None:
         if self.name not in NAMES:
@@ -101,6 +115,9 @@ class SplitSettings:
         ):
             if not good:
                 raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
+        rows = self.leave_out
+        if rows != "outliers" and (isinstance(rows, str) or any(type(r) is not int or r < 0 for r in rows)):
+            raise DataError(f"split.leave_out={rows}: expected outliers, or numbers of rows like [3, 17]")
         if self.folds < 2 or self.stretches_per_fold < 1:
             raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
         if len(self.corner) != 2 or set(self.corner) - set("+-"):
@@ -111,6 +128,7 @@ def make_split(
     positions: np.ndarray,
     settings: SplitSettings,
     release_split: tuple[np.ndarray, np.ndarray] | None = None,
+    outliers: np.ndarray | None = None,
 ) -> Split:
     """Split rows by the positions of the moving end.
 
@@ -118,11 +136,17 @@ def make_split(
         positions: (S, 3) [m] of the moving end.
         settings: how.
         release_split: (train, test) rows that the release names; used by `random` only.
+        outliers: (n,) rows that `leave_out=outliers` means.
 
     Raises:
-        DataError: a fold would have no training, or no test rows.
+        DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
     """
     rows = len(positions)
+    absent = np.array(outliers if settings.leave_out == "outliers" else settings.leave_out, dtype=np.int64)
+    if len(absent) and absent.max() >= rows:
+        raise DataError(f"split.leave_out: row {absent.max()} of rows 0 to {rows - 1}")
+    if len(absent):
+        return _of_the_rest(np.setdiff1d(np.arange(rows), absent), positions, settings, release_split)
     if settings.name == "grouped":
         pairs = _grouped(positions, settings)
     elif settings.name == "block":
@@ -225,6 +249,22 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
         log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
     return Split(name, folds, stored_hash)
+
+
+def _of_the_rest(
+    rest: np.ndarray,
+    positions: np.ndarray,
+    settings: SplitSettings,
+    release_split: tuple[np.ndarray, np.ndarray] | None,
+) -> Split:
+    """The split of rows `rest` (n,) sorted, as if there were no others."""
+    named = None
+    if release_split is not None:
+        train, test = (np.searchsorted(rest, np.intersect1d(part, rest)) for part in release_split)
+        named = train, test
+    found = make_split(positions[rest], replace(settings, leave_out=()), named)
+    folds = tuple(Fold(*(rest[part] for part in vars(fold).values())) for fold in found.folds)
+    return Split(found.name, folds, indices_hash(folds))
 
 
 def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -21,11 +21,16 @@ WIDE = 120
 
 
 def open_console() -> Console:
-    """Console without line breaks in sentences; tables as wide as the terminal, or `WIDE` in a log."""
-    terminal = Console(soft_wrap=True)
+    """Console without line breaks in sentences; tables as wide as the terminal, or `WIDE` in a log.
+
+    Without markup: square brackets of a path or a title are no style.
+    """
+    terminal = Console(soft_wrap=True, markup=False)
     if terminal.is_terminal or "COLUMNS" in os.environ:
         return terminal
-    return Console(soft_wrap=True, width=WIDE)  # a log has no width: 80 columns cut headings short
+    return Console(
+        soft_wrap=True, markup=False, width=WIDE
+    )  # a log has no width: 80 columns cut headings short
 
 
 def one_line(error: BaseException) -> str:

@@ -72,6 +72,7 @@ def evaluate(
     scores = score(methods, data, split, eval_on)
     others = {name: baseline(name, data, split, eval_on, cache) for name in baselines}
     facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
+    facts |= {f"{eval_on}/{k}": v for k, v in scores.decided_by().items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
     for name, other in others.items():
         own = {**other.scores.figures(), "skill": _skill(other.scores, others)}

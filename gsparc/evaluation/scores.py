@@ -14,6 +14,8 @@ from gsparc.methods.method import Method
 
 SUBSETS = ("train", "val", "test")
 CHUNK = 64  # rows predicted at a time
+FEW = 10  # rows: one of fewer may well be most of the error
+TINY = np.finfo(np.float64).tiny
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,25 @@ class Scores:
     def figures(self) -> dict[str, float | None]:
         """Flat figures over all folds together."""
         return type(metrics_for(self.kind)).summary(self.samples)
+
+    def decided_by(self) -> dict[str, float | int]:
+        """The row that alone makes more than half of all error or power, and a figure that no row decides.
+
+        `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /
+        |h|^2; empty where no row weighs so much, or there are few.
+        """
+        error, power = self.samples.get("error_power", self.samples["mse"]), self.samples["target_power"]
+        known = np.isfinite(error) & (power > 0)
+        if known.sum() < FEW:
+            return {}
+        error, power, row = error[known], power[known], self.row[known]
+        shares = np.maximum(error / max(error.sum(), TINY), power / power.sum())
+        worst = int(shares.argmax())
+        if shares[worst] <= 0.5:
+            return {}
+        median = float(np.median(error / power))
+        found = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
+        return {f"decided_by/{name}": value for name, value in found.items()}
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a file."""

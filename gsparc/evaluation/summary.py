@@ -94,21 +94,39 @@ def shown(value: float | None, form: str) -> str:
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Remarks on a table: stand-ins, a busy machine, a baseline that is better."""
-    return run_conditions(facts) + better_baseline(facts, prefix)
+    return run_conditions(facts) + decided_by_a_row(facts, prefix) + better_baseline(facts, prefix)
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
-    """Stand-ins, rows that were learned from, and a busy machine."""
+    """Stand-ins, rows that were learned from, a training that seconds ended, and a busy machine."""
     found = []
     if facts.get("split/foreign"):
         found.append(f"the model was trained on {facts['split/foreign']}")
     if facts.get("dataset/stand_in"):
         release = facts["dataset/stand_in"]
         found.append(f"SIMULATED stand-in: the {release} release was not found; no figure here is about it")
+    if facts.get("model/limited_by_clock"):
+        repeat = "fixed steps or searches repeat exactly"
+        if facts["model/limited_by_clock"] == "wall":
+            repeat = f"budget_clock=processor does not count what others do, {repeat}"
+        found.append(f"seconds ended the training, so the result depends on this machine: {repeat}")
     load = facts.get("machine/load")
     if load is not None and load > BUSY:
         found.append(f"the machine was busy (load {load:.1f} per core): times are inflated, ratios less so")
     return found
+
+
+def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
+    """The row that alone decides sums over all rows, if one does, and the median beside them."""
+    row, share, median = (
+        facts.get(f"{prefix}/decided_by/{name}") for name in ("row", "share", "nmse_median")
+    )
+    if row is None:
+        return []
+    return [
+        f"row {row} alone makes {share:.1%} of the error or power that nmse and mse add up: is it measured "
+        f"right? The median row's NMSE is {median:.3g}"
+    ]
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

@@ -63,7 +63,7 @@ class Stored:
         """
         try:
             loaded = yaml.safe_load(self.config) or {}
-        except yaml.YAMLError:
+        except (yaml.YAMLError, RecursionError, ValueError):
             damaged = f"{self.path}: its configuration is not YAML; the file is damaged"
             raise CheckpointError(damaged) from None
         return renamed(loaded) if isinstance(loaded, dict) else {}

@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.methods.time_budget import Clock, TimeBudget
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
@@ -42,10 +43,12 @@ class FitReport:
     Attributes:
         seconds: training time without validation, testing or pictures [s].
         notes: what a reader must know (early stop, dropped components), one line each.
+        time_limited: whether seconds ended it, so that another machine's result may differ.
     """
 
     seconds: float
     notes: tuple[str, ...] = ()
+    time_limited: bool = False
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class FitContext:
         run_dir: where the fit may write.
         seed: of whatever is random and has no seed of its own.
         budget_s: seconds of training; None: as the method is configured.
+        budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         resume: what an interrupted run left, to go on from.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -72,6 +76,7 @@ class FitContext:
     run_dir: Path = Path()
     seed: int = 0
     budget_s: float | None = None
+    budget_clock: Clock = "wall"
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16
@@ -84,10 +89,16 @@ class FitContext:
     def __post_init__(self) -> None:
         if self.budget_s is not None and not 0 < self.budget_s < float("inf"):
             raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
+        if self.budget_clock not in get_args(Clock):
+            raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
         if type(self.batch_size) is not int or self.batch_size < 1:
             raise ValueError(
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
             )
+
+    def time_budget(self, seconds: float, spent_s: float = 0.0) -> TimeBudget:
+        """So many seconds of this context's clock, of which some were spent before [s]."""
+        return TimeBudget(seconds, self.budget_clock, spent_s)
 
 
 class Method(ABC):

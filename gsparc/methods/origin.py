@@ -17,7 +17,8 @@ from gsparc.methods.method import FitContext
 log = logging.getLogger(__name__)
 
 DECIDING = ("model", "dataset.batch_size")  # settings that a run must share with what it goes on from
-RHYTHM = ("trainer", "callbacks", "budget_s")  # settings that may change on the way, and are then named
+RHYTHM = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
+"""Settings that may change on the way, and are then named."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +77,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
         return []
     one, two = dict(_leaves(before)), dict(_leaves(now))
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
+    under = [k for k in under if keys is RHYTHM or k not in RHYTHM]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
 
 

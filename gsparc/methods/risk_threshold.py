@@ -37,6 +37,11 @@ class Promise:
         if not (0 < self.alpha < 1 and 0 < self.delta < 1):
             raise ValueError(f"promise: alpha={self.alpha} and delta={self.delta} must lie between 0 and 1")
 
+    @property
+    def least(self) -> int:
+        """Positions that must be accepted, all of them good, before anything can be promised."""
+        return int(np.ceil(np.log(self.delta) / np.log1p(-self.alpha)))
+
     def bad(self, relative_error: np.ndarray) -> np.ndarray:
         """Whether predictions (n,) are bad."""
         return relative_error > 10 ** (self.limit_db / 10)
@@ -86,12 +91,11 @@ def choose(
     1965; approximate, where the test without groups is exact). A level too strict to be tested (no outcome
     could reject: fewer than log delta / log(1 - alpha) accepted) is passed over, and spends nothing.
     """
-    least = int(np.ceil(np.log(promise.delta) / np.log1p(-promise.alpha)))
     found = Threshold(float("inf"), 0, 0)
     for level in levels:
         taken = score >= level
         accepted, wrong = int(taken.sum()), int(bad[taken].sum())
-        if accepted < least:
+        if accepted < promise.least:
             continue
         effect = 1.0 if group is None else design_effect(bad[taken], group[taken])
         if _tail(wrong / effect, accepted / effect, promise.alpha) > promise.delta:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath import refine_phase
 from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
@@ -26,31 +26,13 @@ CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no th
 LAST_START, ROUNDS_END = 0.6, 0.8  # of the budget: no search starts, no search adds sources after
 
 
-@dataclass(frozen=True)
-class Budget:
-    """Wall-clock time for searching.
-
-    Attributes:
-        started: `time.monotonic()` of the fit.
-        seconds: for all searches; see `LAST_START` and `ROUNDS_END`.
-    """
-
-    started: float
-    seconds: float
-
-    @property
-    def spent(self) -> float:
-        """[s]"""
-        return time.monotonic() - self.started
-
-
 def search_many(
     row_sets: list[Rows],
     transmitter: Tensor,
     settings: SearchSettings,
     seed: int,
     noise_floor: float,
-    budget: Budget,
+    budget: TimeBudget,
     clutter: bool,
     cache: SearchCache,
     stage: str = "search",
@@ -65,7 +47,7 @@ def search_many(
         settings: of every search.
         seed: of the first search; the others count on.
         noise_floor: known variance of the noise, in units of the rows' power.
-        budget: of all together.
+        budget: of all together; see `LAST_START` and `ROUNDS_END`.
         clutter: search for occluding boxes and finite mirrors, too.
         cache: of finished searches, under the name of `stage`.
         stage: distinguishes searches of one fit.
@@ -76,19 +58,16 @@ def search_many(
     def search(number: int) -> Member | None:
         if done := cache.find(f"{stage} {number}"):
             return done
-        late = number > 0 and budget.spent > LAST_START * budget.seconds
-        if late or at_noise_floor(errors, noise_floor):
+        if at_noise_floor(errors, noise_floor) or (number > 0 and budget.over(LAST_START)):
             return None
         rows = row_sets[number]
-        deadline = budget.started + ROUNDS_END * budget.seconds
-        scene = Search(rows, transmitter, settings, seed + number, deadline).run()
+        scene = Search(rows, transmitter, settings, seed + number, partial(budget.over, ROUNDS_END)).run()
         phased = PhasedScene.of(rows, scene, QUADRATURE)
         phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor)
         phased = refine_phase.refine(rows, phased, 20, noise_floor)
         if clutter and phased.quadrature < 1:
             generator = torch.Generator().manual_seed(seed + number)
-            latest = budget.started + budget.seconds
-            phased = find_clutter(rows, phased, generator, deadline=latest, noise_floor=noise_floor)
+            phased = find_clutter(rows, phased, generator, late=budget.over, noise_floor=noise_floor)
         error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
         left_out = float(error.abs().square().sum() / rows.target.abs().square().sum())
         log.info(

@@ -20,6 +20,7 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.diffraction import (
     Edges,
     diffracted,
@@ -28,7 +29,7 @@ from gsparc.multipath.diffraction import (
     fit_edge_gains,
     subtract_edges,
 )
-from gsparc.multipath.ensemble import Budget, at_noise_floor, ensemble_weights, search_many
+from gsparc.multipath.ensemble import at_noise_floor, ensemble_weights, search_many
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
@@ -119,7 +120,7 @@ class ImageSourceGP(FramedMethod):
             )
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
         started -= cache.spent_s
-        budget = Budget(started, self._budget(len(known), context.budget_s))
+        budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent_s)
         row_sets = self._row_sets(data, known, self.searches)
         found = self._search(row_sets, self.settings, budget, self.clutter, cache)
         if self.look_for_edges:
@@ -130,6 +131,7 @@ class ImageSourceGP(FramedMethod):
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
         ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
+        ended += ", ended by the time budget" if budget.limited else ""
         notes.append(f"{self.name}: {len(found)} of {self.searches} searches ({ended}), {counts} sources")
         scene = self.members[0].scene
         counted = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
@@ -141,7 +143,7 @@ class ImageSourceGP(FramedMethod):
         if len(clutter):
             these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
             notes.append(f"{self.name}: clutter: {these}")
-        return FitReport(time.monotonic() - started, tuple(notes))
+        return FitReport(time.monotonic() - started, tuple(notes), budget.limited)
 
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
@@ -157,14 +159,14 @@ class ImageSourceGP(FramedMethod):
         return min(max(SECONDS_PER_ROW * measurements**1.5, MIN_BUDGET_S), MAX_BUDGET_S)
 
     def _search(
-        self, row_sets: list[Rows], settings: SearchSettings, budget: Budget, clutter: bool,
+        self, row_sets: list[Rows], settings: SearchSettings, budget: TimeBudget, clutter: bool,
         cache: SearchCache, stage: str = "search",
     ) -> list[Member]:  # fmt: skip
         transmitter, floor = self._transmitter(), self.noise_floor
         return search_many(row_sets, transmitter, settings, self.seed, floor, budget, clutter, cache, stage)
 
     def _search_with_edges(
-        self, row_sets: list[Rows], found: list[Member], held: Rows, cache: SearchCache, budget: Budget
+        self, row_sets: list[Rows], found: list[Member], held: Rows, cache: SearchCache, budget: TimeBudget
     ) -> tuple[list[Member], Rows]:
         """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
         scene, rows = found[0].phased.scene, row_sets[0]
@@ -174,9 +176,10 @@ class ImageSourceGP(FramedMethod):
             return found, held
         log.info("%d edges; searching again on the residual", len(edges))
         remaining = max(budget.seconds - budget.spent, EDGE_BUDGET * budget.seconds)
-        budget = Budget(time.monotonic(), remaining)
+        more = TimeBudget(remaining, budget.clock)
         row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
-        with_edges = self._search(row_sets, self.settings, budget, self.clutter, cache, "beside edges")
+        with_edges = self._search(row_sets, self.settings, more, self.clutter, cache, "beside edges")
+        budget.limited |= more.limited
         power = float(row_sets[0].target.abs().square().mean())  # leave-one-out errors are relative to it
         # the edges' gains were fitted to every row: ask for a clear margin
         if with_edges[0].left_out * power > MAX_EDGE_ERROR * found[0].left_out:
@@ -198,7 +201,7 @@ class ImageSourceGP(FramedMethod):
         aligned = self._remove_offsets(data, known, self._transmitter()[None], torch.ones(1, self.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
-            now, rows = Budget(time.monotonic(), MIN_BUDGET_S), self._row_sets(aligned, known, 1)
+            now, rows = TimeBudget(MIN_BUDGET_S), self._row_sets(aligned, known, 1)
             phased = self._search(rows, few, now, False, SearchCache())[0].phased
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)

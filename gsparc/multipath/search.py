@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -71,13 +71,14 @@ class Search:
         transmitter: (3,) float64 [m].
         settings: how.
         seed: of the candidates.
-        deadline: `time.monotonic()` after which no new round starts.
+        late: asked after every round; no other starts when it says so.
     """
 
     def __init__(
-        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int, deadline: float = math.inf
-    ) -> None:
-        self.rows, self.settings, self.deadline = rows, settings, deadline
+        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
+        late: Callable[[], bool] = lambda: False,
+    ) -> None:  # fmt: skip
+        self.rows, self.settings, self.late = rows, settings, late
         self.generator = torch.Generator().manual_seed(seed)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
@@ -101,7 +102,7 @@ class Search:
             free = not added
             if free:
                 added = self._add_free()
-            if not added or time.monotonic() > self.deadline:
+            if not added or self.late():
                 break
             self._refine(s.steps)
             if free or number % 2:

@@ -91,7 +91,7 @@ class TrainedPeer(Method):
         self._train(data, rows, began)
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        return FitReport(time.perf_counter() - started, (note,))
+        return FitReport(time.perf_counter() - started, (note,), time_limited=self.steps != self.max_steps)
 
     def _train(self, data: Measurements, rows: np.ndarray, began: float) -> None:
         network = self.fitted()

@@ -23,6 +23,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext
+from gsparc.methods.time_budget import clock_of
 from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.time_budget import Budget, Stretched
 
@@ -140,7 +141,7 @@ def run_stage(
     callbacks, pace = list(context.callbacks()), module.pace
     if pace is not None:
         stretched = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
-        callbacks = [Budget(pace), *stretched]
+        callbacks = [Budget(pace, clock_of(context.budget_clock)), *stretched]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)

@@ -122,7 +122,7 @@ class LearnedField(Method):
             again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
             seconds += self._stage("refit", origin, data, every, again, seconds, self.fitted().confidence)
         self._frozen = None
-        return FitReport(seconds)
+        return FitReport(seconds, time_limited=context.budget_s is not None)
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,

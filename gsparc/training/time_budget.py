@@ -7,6 +7,7 @@ its schedule the training is.
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import lightning.pytorch as L
@@ -46,19 +47,20 @@ class Budget(L.Callback):
 
     Args:
         pace: told after every step.
+        now: the clock that is billed [s].
     """
 
-    def __init__(self, pace: Pace) -> None:
-        self.pace = pace
+    def __init__(self, pace: Pace, now: Callable[[], float] | None = None) -> None:
+        self.pace, self.now = pace, now or time.perf_counter
         self.seconds = 0.0
         self._since: float | None = None
 
     def _go(self) -> None:
-        self._since = time.perf_counter()
+        self._since = self.now()
 
     def _halt(self) -> None:
         if self._since is not None:
-            self.seconds += time.perf_counter() - self._since
+            self.seconds += self.now() - self._since
         self._since = None
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
@@ -84,7 +86,7 @@ class Budget(L.Callback):
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds spent, so that a resumed run has only the rest."""
-        running = 0.0 if self._since is None else time.perf_counter() - self._since
+        running = 0.0 if self._since is None else self.now() - self._since
         return {"seconds": self.seconds + running}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

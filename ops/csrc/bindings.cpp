@@ -31,6 +31,7 @@ NB_MODULE(_native, module) {
     module.attr("MOMENTS") = kMoments;
     module.attr("STRIP_ROWS") = kStripRows;
     module.attr("UNSOUND_POSE") = kUnsoundPose;
+    module.attr("EQUAL_IDS") = kEqualIds;
     module.attr("TILE_WIDTH") = kTileWidth;
     module.attr("TILE_HEIGHT") = kTileHeight;
     module.attr("SIMILARITY_WIDTH") = kSimilarityWidth;

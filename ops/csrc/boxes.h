@@ -4,11 +4,12 @@
 
 #include "kernels.h"
 #include "pixels.h"
+#include "pose.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {
 
-constexpr double kFarthest = 1e6, kWidest = 1e5;  // FARTHEST and WIDEST in settings.py [m]
+constexpr double kWidest = 1e5;  // WIDEST in settings.py [m]
 
 template <class S> GSPARC_HD int unsound(const Gaussian<S>& g, S opacity) {
     const S big = sizeof(S) == 4 ? S(3.4e38) : S(1.7e308);

@@ -31,7 +31,8 @@ constexpr int kRecord = 12;     // scalars of one footprint, see pixels.h
 constexpr int kMoments = 9;     // scalars of Moments
 constexpr int kLanes = 16;      // most pixels done at a time by any instruction set
 
-constexpr int64_t kUnsoundPose = int64_t(1) << 62;  // what a plan returns of a pose; of a Gaussian 4 i + parameter
+// What a plan returns of a pose, and of equal ids at one distance; of a Gaussian 4 i + parameter.
+constexpr int64_t kUnsoundPose = int64_t(1) << 62, kEqualIds = int64_t(1) << 61;
 
 // A strip is kStripRows rows of the image, the unit of work. Row-wise strips let azimuth wrap without tiles.
 constexpr int kStripRows = 4;

@@ -9,6 +9,7 @@
 
 #include "kernels.h"
 #include "pool.h"
+#include "pose.h"
 #include "workspace.h"
 
 namespace gsparc {
@@ -118,10 +119,8 @@ private:
 
 template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     const int64_t count = a.count;
-    const auto finite = [](S x) { return std::isfinite(x); };
-    if (!std::all_of(a.model.positions, a.model.positions + 3 * a.poses, finite) ||
-        !std::all_of(a.model.rotations, a.model.rotations + 9 * a.poses, finite))
-        return kUnsoundPose;
+    for (int pose = 0; pose < a.poses; ++pose)
+        if (!sound_pose(a.model.positions + 3 * pose, a.model.rotations + 9 * pose)) return kUnsoundPose;
     const Workspace<S> depths(a.poses * count);
     const Workspace<Box> boxes(a.poses * count);
     constexpr int chunk = kBinned;
@@ -153,6 +152,16 @@ template <class S> int64_t make_plan(const PlanArgs<S>& a) {
     };
     if (a.poses == 1) order(0, 0);
     else parallel_for(a.poses, a.threads, order);
+    auto alike = [&](int32_t x, int32_t y) { return a.ids[x] == a.ids[y]; };
+    const auto at_id = [&](int64_t at) { return by_id.empty() ? int32_t(at) : by_id[at]; };
+    bool twice = false;
+    for (int64_t at = 1; a.ids && at < count; ++at) twice |= alike(at_id(at - 1), at_id(at));
+    for (int pose = 0; twice && pose < a.poses; ++pose) {
+        const int32_t* ranks = a.order + pose * count;
+        const S* far = depths.data + pose * count;
+        for (int rank = 1; rank < a.shown[pose]; ++rank)
+            if (far[ranks[rank - 1]] == far[ranks[rank]] && alike(ranks[rank - 1], ranks[rank])) return kEqualIds;
+    }
     const Bins bins(a.poses, a.count, a.strips);
     std::vector<int32_t> per_bin(bins.size());
     std::vector<int64_t> per_chunk(a.poses * chunks);

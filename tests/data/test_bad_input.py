@@ -181,9 +181,24 @@ def test_own_spectrum(spectrum_arrays, case):
 def test_attributes(spectrum_arrays):
     for attributes, pattern in (({"normalisation": "maximum"}, "expected one of max, minmax"),
                                 ({"convergence_error": -1.0}, "at least 0"),
-                                ({"convergence_error": "low"}, "finite number")):  # fmt: skip
+                                ({"convergence_error": "low"}, "finite number"),
+                                ({"measurement": "spectra"}, "'spectra' names no measurement of this file, "
+                                                             "which holds spectrum")):  # fmt: skip
         with pytest.raises(DataError, match=pattern):
             from_arrays(spectrum_arrays, attributes)
+
+
+@pytest.mark.parametrize("unit", [1e-42, 1e-38, 1e38])
+def test_channels_in_units_at_the_edge_of_float32(csi_arrays, unit):
+    """Dividing in complex64 by a scale of 1e-42 gave NaN or a digit or two."""
+    plain = from_arrays(csi_arrays)
+    tiny = from_arrays(
+        {**csi_arrays, "csi": (csi_arrays["csi"].astype(np.complex128) * unit).astype(np.complex64)}
+    )
+    assert np.isfinite(tiny.target).all()
+    found = tiny.target.astype(np.complex128) * tiny.site.target_scale / unit
+    wanted = plain.target.astype(np.complex128) * plain.site.target_scale
+    assert np.abs(found - wanted).max() < (1e-6 if unit >= 1e-38 else 2e-3) * np.abs(wanted).max()
 
 
 def test_decibels_beyond_reason():

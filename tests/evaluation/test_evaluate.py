@@ -11,7 +11,7 @@ import torch
 from gsparc.evaluation.baseline_cache import BASELINES, baseline
 from gsparc.evaluation.evaluate import evaluate, paired_differences
 from gsparc.evaluation.scores import score
-from gsparc.evaluation.summary import write_samples, write_summary
+from gsparc.evaluation.summary import decided_by_a_row, write_samples, write_summary
 from gsparc.methods.idw import InverseDistance
 from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitContext, Method, Prediction
@@ -226,3 +226,20 @@ def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, mo
     facts = evaluate(method, None, data, split, eval_on="val", baselines=(), clock=QUICK).facts
     assert facts["time/render_ms_batch64"] is None and facts["time/render_ms_p50"] > 0
     assert 64 not in {len(asked) for asked in method.asked}
+
+
+@pytest.mark.parametrize("kind", ["csi", "rssi"])
+def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_path, kind):
+    """NMSE was 7e13 by one row, without a word."""
+    data, split = campaign(kind, 60), folds(60)
+    methods, seconds = fit_all(InverseDistance, data, split, tmp_path)
+    quiet = evaluate(methods, seconds, data, split, baselines=(), clock=QUICK).facts
+    assert not any("decided_by" in key for key in quiet) and not decided_by_a_row(quiet)
+    row, target = int(split.folds[0].test[2]), data.target.copy()
+    target[row] *= 1e6
+    loud = dataclasses.replace(data, target=target)
+    facts = evaluate(methods, seconds, loud, split, baselines=(), clock=QUICK).facts
+    assert facts["test/decided_by/row"] == row and facts["test/decided_by/share"] > 0.999
+    assert 0 < facts["test/decided_by/nmse_median"] < 3
+    assert decided_by_a_row(facts)[0].startswith(f"row {row} alone makes 100.0% of the error or power")
+    write_summary(tmp_path / "summary.json", facts)

@@ -33,7 +33,7 @@ SETTINGS = (
     "callbacks.densify.stop=35",
     "callbacks.densify.grad_threshold=1e-5",
     "callbacks.densify.max_gaussians=200",
-    "callbacks.reset.interval=25",
+    "callbacks.reset.interval=20",
 )
 ROWS = 60
 

@@ -19,8 +19,8 @@ POSE = Pose.identity(torch.zeros(3, dtype=torch.float64))
 BACKENDS = pytest.mark.parametrize("backend", ["reference", "cpu"])
 
 
-@pytest.fixture
-def model():
+def field():
+    """Parameters of six Gaussians, without a fixture: other backends run these tests too."""
     scene = random_scene(n=6, samples=1)
     parts = (scene.means, scene.quats, scene.scales, scene.opacities, scene.features[0])
     return tuple(part.double() for part in parts)
@@ -41,8 +41,9 @@ def tangents(values):
 
 @BACKENDS
 @pytest.mark.parametrize("made", [image, shares], ids=["image", "share"])
-def test_forward_mode_was_zero_in_silence(model, made, backend):
+def test_forward_mode_was_zero_in_silence(made, backend):
     """By the kernels 0; by the reference the footprints' motion counted twice."""
+    model = field()
     function, directions = made(backend), tangents(model)
     found = jvp(function, model, directions)[1]
     step = 1e-6
@@ -57,7 +58,8 @@ def test_forward_mode_was_zero_in_silence(model, made, backend):
 
 
 @BACKENDS
-def test_transforms_agree_with_autograd(model, backend):
+def test_transforms_agree_with_autograd(backend):
+    model = field()
     slope = tangents((image(backend)(*model),))[0]
     leaves = [part.clone().requires_grad_() for part in model]
     wanted = torch.autograd.grad(image(backend)(*leaves), leaves, slope)
@@ -72,19 +74,23 @@ def test_transforms_agree_with_autograd(model, backend):
 
 
 @BACKENDS
-def test_a_batch_of_features_may_be_mapped(model, backend):
+def test_a_batch_of_features_may_be_mapped(backend):
+    model = field()
     features = torch.stack([model[4], 2 * model[4]])
     found = vmap(lambda values: image(backend)(*model[:4], values))(features)
     assert torch.allclose(found[1], 2 * found[0]) and torch.allclose(found[0], image(backend)(*model))
 
 
 @BACKENDS
-def test_gaussians_cannot_be_mapped(model, backend):
+def test_gaussians_cannot_be_mapped(backend):
+    model = field()
     with pytest.raises(ValueError, match=r"vmap over Gaussians or poses is not possible: give P poses"):
         vmap(lambda values: image(backend)(values, *model[1:]))(torch.stack([model[0], model[0]]))
 
 
-def test_second_derivatives_by_either_road(model):
+def test_second_derivatives_by_either_road():
+    model = field()
+
     def power(backend):
         return lambda opacities: image(backend)(*model[:3], opacities, model[4]).square().sum()
 
@@ -99,7 +105,8 @@ def test_second_derivatives_by_either_road(model):
 
 @BACKENDS
 @pytest.mark.parametrize("part", ["position", "rotation"])
-def test_a_pose_had_no_gradient_and_no_word(model, backend, part):
+def test_a_pose_had_no_gradient_and_no_word(backend, part):
+    model = field()
     parts = {"position": POSE.position.clone(), "rotation": POSE.rotation.clone()}
     pose = Pose(**{**parts, part: parts[part].requires_grad_()})
     with pytest.raises(ValueError, match="a pose has no gradients here: detach it"):
@@ -108,7 +115,8 @@ def test_a_pose_had_no_gradient_and_no_word(model, backend, part):
         rasterize(*model, pose, GRID, backend=backend)
 
 
-def test_an_operator_by_itself_and_a_frozen_view_refuse(model):
+def test_an_operator_by_itself_and_a_frozen_view_refuse():
+    model = field()
     plan = make_plan(*model[:4], POSE, GRID)
     view = freeze(plan, *model[:4], version=0)
     with forward_ad.dual_level():

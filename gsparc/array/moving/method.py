@@ -27,6 +27,7 @@ from gsparc.methods.gp import Kernel, choose_kernel
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import FitContext, FitReport, Prediction, PredictsVariance
 from gsparc.methods.target_rows import to_real
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.physics.lags import BLOCK, Lags
 
 log = logging.getLogger(__name__)
@@ -73,7 +74,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name = seed, name
         self.trends: list[Trend] = []
-        self._budget_s: float | None = None
+        self._budget: TimeBudget | None = None
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Find sources, fit their powers and the residual.
@@ -84,7 +85,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         problem = site_problem(data)
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
-        self._budget_s = context.budget_s
+        self._budget = None if context.budget_s is None else context.time_budget(context.budget_s)
         return super().fit(data, fold, context)
 
     def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
@@ -113,7 +114,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         space = self.lags()
         self.positions = positions
         self.exponent, lags = self._lags(space, targets)
-        budget_s, longest = self._budget_s, 0.0
+        budget, longest = self._budget, 0.0
         # sum over searches of leave-one-out images
         modelled = np.zeros((len(targets), *space.image), dtype=np.float32)
         self.trends, errors = [], []
@@ -129,10 +130,10 @@ class MovingArrayField(Interpolator, PredictsVariance):
                 "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
                 self.name, len(errors), len(trend.sources), trend.kernel.length, errors[-1], now - begin,
             )  # fmt: skip
-            if budget_s is None:
+            if budget is None:
                 done = len(errors) == self.searches
             else:
-                late = now - begin + longest > BUDGET_SHARE * budget_s
+                late = budget.over(BUDGET_SHARE - longest / budget.seconds)
                 done = late or (len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2])
             if done:
                 break

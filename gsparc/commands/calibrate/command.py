@@ -11,7 +11,7 @@ from rich.table import Table
 
 from gsparc.commands.calibrate.curves import bounded, perfect_area, rank_correlation, risk_coverage
 from gsparc.commands.calibrate.pictures import draw
-from gsparc.commands.calibrate.trial import How, Trial, accept, divisible, trials
+from gsparc.commands.calibrate.trial import How, Trial, accept, divisible, too_few, trials
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.argos import published_figures, published_normalisation
@@ -130,7 +130,8 @@ def task(config: DictConfig) -> dict[str, Any]:
     facts["seed"] = config.seed
     write_summary(run_dir / "summary.json", facts)
     draw(evidence, found, f"{known['dataset/name']}, {known['model/name']}", run_dir / "confidence.png")
-    stored_lines = []
+    few = too_few(len(evidence), promise)
+    stored_lines = [] if few is None else [few]
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for path in paths:

@@ -105,6 +105,17 @@ def divisible(evidence: Evidence, how: How) -> bool:
     return 0 < first < second < count
 
 
+def too_few(count: int, promise: Promise) -> str | None:
+    """What is missing for any promise on so many positions; None where there are enough."""
+    needed = int(np.ceil(promise.least / SHARES[1]))
+    if count >= needed:
+        return None
+    return (
+        f"{count} test positions can promise nothing: alpha={promise.alpha:g}, delta={promise.delta:g} need "
+        f"{promise.least} good ones to calibrate on, {needed} in all; measure more, or promise less"
+    )
+
+
 def _units(evidence: Evidence, how: How) -> np.ndarray:
     """What each position (n,) is dealt out with: itself, or its patch."""
     return np.arange(len(evidence)) if how == "random" else cells(evidence.position)

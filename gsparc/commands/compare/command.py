@@ -119,6 +119,9 @@ def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | 
                 left -= one.expected_s
                 try:
                     found = fill(one)
+                except KeyboardInterrupt:
+                    kept = "interrupted; finished cells are kept: the same command goes on with the others"
+                    raise KeyboardInterrupt(kept) from None
                 except (ValueError, RuntimeError) as error:
                     log.warning("%s cannot be filled: %s", one.cell, one_line(error))
                     continue

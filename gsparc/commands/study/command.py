@@ -55,7 +55,10 @@ def task(config: DictConfig) -> list[Row]:
     study = study_of(config)
     data = load(plain(config.dataset))
     split = split_for(plain(config.split), data)
-    rows = study.run(data, split, context_of(config, run_dir=run_dir))
+    try:
+        rows = study.run(data, split, context_of(config, run_dir=run_dir))
+    except KeyboardInterrupt:  # whose advice is that of a training, which can be gone on with
+        raise KeyboardInterrupt("the study was interrupted; it keeps nothing to go on from") from None
     facts: dict[str, Any] = {
         **dataset_facts(data), **split_facts(split), **machine_facts(), **provenance(),
         "seed": settings.seed, "study/rounds": study.rounds, "study/base": study.base,

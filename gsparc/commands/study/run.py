@@ -28,6 +28,7 @@ class Outcome:
         figures: accuracies pooled over folds, as in `Scores.figures`; empty when it was not scored.
         score_s: seconds that scoring took [s].
         notes: what the first fold's fit said.
+        time_limited: whether seconds ended a fit: on another machine the result may be another.
     """
 
     methods: tuple[Method, ...]
@@ -36,6 +37,7 @@ class Outcome:
     figures: dict[str, float | None]
     score_s: float
     notes: tuple[str, ...]
+    time_limited: bool = False
 
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
         """The same fits scored on other data, such as displaced queries."""
@@ -73,7 +75,7 @@ def fit_and_score(
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
-    methods, seconds, processor, notes = [], [], [], []
+    methods, seconds, processor, notes, limited = [], [], [], [], False
     for number, fold in enumerate(split.folds):
         there, rows = (data, fold) if learned is None else learned(data, fold)
         method, settings = make(), context(number)
@@ -81,11 +83,12 @@ def fit_and_score(
         report = method.fit(there, rows, settings)
         processor.append(time.process_time() - before)
         seconds.append(report.seconds)
+        limited |= report.time_limited
         notes += [note for note in report.notes if number == 0]
         methods.append(method)
         if keep is not None:
             keep(number, method, report)
-    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes))
+    found = Outcome(tuple(methods), tuple(seconds), tuple(processor), {}, 0.0, tuple(notes), limited)
     return found if eval_on is None else found.scored_on(data, split, eval_on)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -67,7 +67,7 @@ def find_clutter(
     phased: PhasedScene,
     generator: torch.Generator,
     settings: ClutterSearch = ClutterSearch(),
-    deadline: float = math.inf,
+    late: Callable[[], bool] = lambda: False,
     noise_floor: float = JITTER,
 ) -> PhasedScene:
     """The phased scene with clutter, or unchanged when the likelihood gains too little.
@@ -77,13 +77,13 @@ def find_clutter(
         phased: from the final refinement of a search.
         generator: of the candidates.
         settings: thresholds and effort.
-        deadline: `time.monotonic()` after which nothing new is tried.
+        late: asked again and again; nothing new is tried when it says so.
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
     bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
     fresh = replace(phased, scene=bare, quadrature=quadrature)
-    found = _ClutterSearcher(rows, fresh, generator, settings, noise_floor).run(deadline)
+    found = _ClutterSearcher(rows, fresh, generator, settings, noise_floor).run(late)
     before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
     return found if after < before - settings.progress else phased
 
@@ -152,18 +152,18 @@ class _ClutterSearcher:
         self._set_scene(replace(found, scene=replace(found.scene, clutter=tidy)))
 
     # ---- the loop ----
-    def run(self, deadline: float) -> PhasedScene:
+    def run(self, late: Callable[[], bool]) -> PhasedScene:
         s, start = self.settings, self.nll
         best = start, self.phased
         for epoch in range(s.epochs):
             before = self.nll
             for move in (self._mirrors, self._patches, self._boxes, self._words):
-                if time.monotonic() < deadline:
+                if not late():
                     move()
             self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
             self._drop()
             self._refactor(self.phased)
-            if time.monotonic() < deadline:
+            if not late():
                 self._relocate_boxes()
                 self._descend(10)
                 self._drop()
@@ -180,7 +180,7 @@ class _ClutterSearcher:
                 epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
                 self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility,
             )  # fmt: skip
-            if time.monotonic() > deadline or self.nll > before - s.progress:
+            if late() or self.nll > before - s.progress:
                 break
         return best[1]
 

@@ -60,20 +60,18 @@ template <class S, class P> __global__ void project_kernel(View<S> v, Model<S> m
         one.visible[i] = false, one.depths[i] = 0;
     }
     if (i == 0) {
-        bool finite = true;
-        for (int k = 0; k < 3; ++k) finite &= fabs(model.positions[3 * pose + k]) <= S(3e38);
-        for (int k = 0; k < 9; ++k) finite &= fabs(model.rotations[9 * pose + k]) <= S(3e38);
-        if (!finite) atomicMin(out.wrong, static_cast<unsigned long long>(kUnsoundPose));
+        const bool sound = sound_pose(model.positions + 3 * pose, model.rotations + 9 * pose);
+        if (!sound) atomicMin(out.wrong, static_cast<unsigned long long>(kUnsoundPose));
     }
     if (!one.visible[i]) v.boxes[at] = {0, 0, 0, 0};
     out.keys[at] = depth_key<S>(pose, one.visible[i], one.depths[i]), out.values[at] = int32_t(i);
 }
 
-// Makes `sorted` 0 where an id is smaller than that before it: once a warp, for atomics on one address queue up.
+// Makes `sorted` 0 where an id is no larger than that before it: once a warp, for atomics on one address queue up.
 __global__ void look_for_disorder(const int64_t* ids, int count, unsigned long long* sorted) {
     const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-    const bool smaller = i > 0 && i < count && ids[i] < ids[i - 1];
-    if (warp_any(smaller) && threadIdx.x % kWarp == 0) atomicMin(sorted, 0ull);
+    const bool disorder = i > 0 && i < count && ids[i] <= ids[i - 1];
+    if (warp_any(disorder) && threadIdx.x % kWarp == 0) atomicMin(sorted, 0ull);
 }
 
 // Heap sort of a run of equal depths by id: rare, so one thread does it, in place.
@@ -96,8 +94,8 @@ GSPARC_HD void sort_run(int32_t* run, int64_t length, const int64_t* ids) {
     }
 }
 
-// The sort was stable by row; where ids are not in the order of the rows, equal depths go by id.
-template <class S> __global__ void break_ties(int32_t* order, const uint64_t* keys, const int64_t* ids, const unsigned long long* sorted, int poses, int count) {
+// The sort was stable by row; where ids are not in the order of the rows, equal depths go by id, and equal ids are `wrong`.
+template <class S> __global__ void break_ties(int32_t* order, const uint64_t* keys, const int64_t* ids, const unsigned long long* sorted, unsigned long long* wrong, int poses, int count) {
     const uint32_t at = blockIdx.x * kThreads + threadIdx.x;
     if (at >= uint32_t(poses) * count || *sorted) return;
     const int64_t base = at / count * count, end = base + count;
@@ -105,6 +103,8 @@ template <class S> __global__ void break_ties(int32_t* order, const uint64_t* ke
     int64_t last = int64_t(at) + 1;
     while (last < end && keys[last] == keys[at]) ++last;
     if (last - at > 1) sort_run(order + at, last - at, ids);
+    for (int64_t next = int64_t(at) + 1; next < last; ++next)
+        if (ids[order[next - 1]] == ids[order[next]]) atomicMin(wrong, static_cast<unsigned long long>(kEqualIds));
 }
 
 // Tiles that a box touches, each once: a box that would wrap into its own first tile was widened to the circle.
@@ -258,7 +258,7 @@ template <class S> int64_t plan(const Call& call) {
     }
     if (ids) {
         steps.then([&] { return launch(look_for_disorder, blocks_for(v.count), 1, kThreads, stream, ids, v.count, sorted); });
-        steps.then([&] { return launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, sorted, v.poses, v.count); });
+        steps.then([&] { return launch(break_ties<S>, blocks_for(all), 1, kThreads, stream, v.order, keys, ids, sorted, out.wrong, v.poses, v.count); });
     }
     steps.then([&] { return list<S>(v, stream, keys, counts, nullptr, nullptr); });
     steps.then([&] { return running_sums(temp, sum_bytes, counts, sums, all, stream); });

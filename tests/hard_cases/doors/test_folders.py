@@ -93,5 +93,14 @@ def test_train(release, case, tmp_path):
 
 
 def test_the_sound_one_is_read(release):
+    for name in ("train_index.txt", "test_index.txt"):
+        (release / name).unlink()
     answer = knock(lambda: check([str(release)]), "check", [])
     assert answer.status == 0 and answer.out[-1].endswith("good")
+
+
+def test_three_rows_are_no_good(release):
+    """`gsparc check` said good, and training then refused them."""
+    (release / "train_index.txt").write_text("00001\n00003\n")
+    answer = knock(lambda: check([str(release)]), "check", [])
+    assert answer.status == 1 and "readable, but too small to train on (split=random" in answer.out[-1]

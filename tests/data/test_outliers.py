@@ -1,0 +1,107 @@
+"""One wrong row among many: named, without a say in scales, left out when asked for."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from campaigns import channels, powers, spectra
+
+from gsparc.commands.check import main as check
+from gsparc.data.load import load, split_for
+from gsparc.data.outliers import far, loud, outliers
+
+MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
+KINDS = pytest.mark.parametrize("kind", MAKERS)
+
+
+def spoilt(kind, folder, row, **change):
+    """A clean file and one of which an array was changed in one row; both as measurements."""
+    clean = MAKERS[kind](folder / "clean.npz")
+    with np.load(clean) as stored:
+        arrays = {name: stored[name].copy() for name in stored.files}
+    for name, factor in change.items():
+        if name == "rssi" and "rssi_db" in arrays:
+            arrays["rssi_db"][row] += 10 * np.log10(factor)
+        else:
+            arrays[name][row] = arrays[name][row] * factor
+    np.savez(folder / "own.npz", **arrays)
+    return [load({"name": "own", "file": str(file)}) for file in (clean, folder / "own.npz")]
+
+
+@KINDS
+def test_one_row_at_1e8_rescales_nothing(kind, tmp_path, caplog, capsys):
+    """PSNR rose to 51 dB while the NMSE was 7e13, without a warning; `gsparc check` said good."""
+    clean, wrong = spoilt(kind, tmp_path, 5, **{kind: 1e8})
+    others = np.delete(np.arange(len(clean)), 5)
+    assert wrong.site.target_scale == clean.site.target_scale
+    assert np.array_equal(wrong.target[others], clean.target[others])
+    assert "row 5: measure far more power than all others" in caplog.text
+    assert check([str(tmp_path / "own.npz")]) == 0
+    assert "row 5: measure far more power" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["spectrum", "csi"])
+def test_a_flipped_byte_is_the_same(kind, tmp_path, caplog):
+    """The exponent's highest bit of a single number."""
+    clean, wrong = spoilt(kind, tmp_path, 0)
+    path = tmp_path / "own.npz"
+    with np.load(path) as stored:
+        arrays = {name: stored[name].copy() for name in stored.files}
+    arrays[kind] = arrays[kind].astype(np.complex64 if kind == "csi" else np.float32)
+    values = arrays[kind].reshape(-1)
+    values.view(np.uint8)[values.real.dtype.itemsize - 1] ^= 0x40
+    np.savez(path, **arrays)
+    wrong = load({"name": "own", "file": str(path)})
+    assert wrong.site.target_scale == clean.site.target_scale and "row 0: measure far" in caplog.text
+
+
+@KINDS
+def test_a_position_2e6_m_off_moves_nothing(kind, tmp_path, caplog):
+    clean, _ = spoilt(kind, tmp_path, 0)
+    name = f"{clean.site.moving_end}_position"
+    with np.load(tmp_path / "clean.npz") as stored:
+        arrays = {key: stored[key].copy() for key in stored.files}
+    arrays[name][7] += [2e6, 0, 0]
+    np.savez(tmp_path / "own.npz", **arrays)
+    wrong = load({"name": "own", "file": str(tmp_path / "own.npz")})
+    assert np.allclose(wrong.site.origin, clean.site.origin, atol=0.5)
+    assert np.ptp(wrong.site.box, axis=0).max() < 10
+    assert "row 7: lie far outside the region of all others" in caplog.text
+
+
+@pytest.mark.parametrize("split", ["random", "grouped", "block", "sparse"])
+def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
+    clean, wrong = spoilt("csi", tmp_path, 5, csi=1e8)
+    assert outliers(wrong) and not outliers(clean)
+    kept = split_for({"name": split, "leave_out": "outliers"}, wrong)
+    for fold in kept.folds:
+        assert 5 not in np.concatenate([fold.train, fold.val, fold.test])
+    same = split_for({"name": split, "leave_out": [5]}, clean)
+    assert same.sha256 == kept.sha256 != split_for({"name": split}, clean).sha256
+    assert (
+        split_for({"name": split, "leave_out": "outliers"}, clean).sha256
+        == split_for({"name": split}, clean).sha256
+    )
+
+
+@pytest.mark.parametrize("rows", ["outlier", [-1], [1.5], [999]])
+def test_rows_that_cannot_be_left_out_are_refused(rows, tmp_path):
+    clean, _ = spoilt("rssi", tmp_path, 0)
+    with pytest.raises(ValueError, match=r"split\.leave_out"):
+        split_for({"name": "random", "leave_out": rows}, clean)
+
+
+def test_real_dynamics_are_no_outliers():
+    """Free space from 3 cm to 30 m is 60 dB, and a silent half leaves nothing suspicious."""
+    distance = np.geomspace(0.03, 30, 200)
+    assert not loud(1 / distance).any()
+    assert not loud(np.where(np.arange(200) % 2, 1 / distance, 0)).any() and not loud(np.zeros(9)).any()
+    assert loud(np.append(1 / distance, 1e12)).nonzero()[0].tolist() == [200]
+    track = np.stack([np.linspace(0, 5e3, 300), np.zeros(300), np.zeros(300)], 1)
+    assert not far(track).any() and not far(np.zeros((5, 3))).any()
+
+
+def test_a_row_beyond_float32_is_refused(tmp_path):
+    """Its target would be infinite, in units of the other rows."""
+    with pytest.raises(ValueError, match=r"csi, row 5: beyond float32 in units of the other rows"):
+        spoilt("csi", tmp_path, 5, csi=1e200)

@@ -1,0 +1,70 @@
+"""What no picture can be made of is refused at the rasterizer, on every backend that runs here."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from rasters import poses, random_scene
+
+from gsparc.ops import Pose, SphereGrid, UnsoundGaussian, rasterize
+
+GRID = SphereGrid.hemisphere(9, 18)
+BACKENDS = pytest.mark.parametrize("backend", ["reference", "cpu"])
+
+
+def drawn(backend, pose=None, ids=None, **change):
+    scene = random_scene(n=6, samples=2)
+    parts = {
+        name: getattr(scene, name).clone() for name in ("means", "quats", "scales", "opacities", "features")
+    }
+    for name, (index, value) in change.items():
+        parts[name][index] = value
+    return rasterize(*parts.values(), poses(2) if pose is None else pose, GRID, ids=ids, backend=backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_features_that_are_not_finite(backend, value):
+    with pytest.raises(UnsoundGaussian, match="Gaussian 4 has features that are not finite") as refused:
+        drawn(backend, features=((1, 4, 0), value))
+    assert refused.value.index == 4
+
+
+@BACKENDS
+@pytest.mark.parametrize("far", [2e6, 1e30, float("nan")])
+def test_a_pose_far_away(backend, far):
+    pose = poses(2)
+    pose.position[1, 2] = far
+    with pytest.raises(ValueError, match=r"a pose is not finite, not within 1e\+06 m, or its matrix is no"):
+        drawn(backend, pose)
+
+
+@BACKENDS
+@pytest.mark.parametrize("wrong", ["zero", "twice", "mirrored", "sheared", "a column twice"])
+def test_a_pose_that_is_no_rotation(backend, wrong):
+    rotation = poses(2).rotation
+    drawn(backend, Pose(poses(2).position, rotation + 5e-4))  # the rounding of a file written by hand
+    matrix = {
+        "zero": torch.zeros(3, 3),
+        "twice": 2 * torch.eye(3),
+        "mirrored": torch.diag(torch.tensor([1.0, 1, -1])),
+        "sheared": torch.eye(3) + torch.tensor([[0, 0.01, 0], [0, 0, 0], [0, 0, 0]]),
+        "a column twice": torch.tensor([[1.0, 1, 0], [0, 0, 0], [0, 0, 1]]),
+    }[wrong]
+    with pytest.raises(ValueError, match="its matrix is no rotation"):
+        drawn(backend, Pose(poses(2).position, torch.stack([rotation[0], matrix.to(rotation)])))
+
+
+@BACKENDS
+def test_equal_ids_at_one_place_have_no_order(backend):
+    """The picture depended on the order of the rows."""
+    scene = random_scene(n=6, samples=2)
+    twin = {"means": (3, scene.means[2])}
+    ids = torch.tensor([0, 1, 2, 3, 4, 5])
+    drawn(backend, ids=ids, **twin)
+    for order in (slice(None), torch.tensor([5, 4, 3, 2, 1, 0])):
+        twice = ids.clone()
+        twice[3] = 2
+        drawn(backend, ids=twice)  # at different distances they do have one
+        with pytest.raises(ValueError, match="Gaussians at one distance have equal ids"):
+            drawn(backend, ids=twice[order] if isinstance(order, slice) else (7 - twice), **twin)
