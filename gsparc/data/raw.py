@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import struct
@@ -20,6 +21,7 @@ from gsparc.data.files import whole_file
 from gsparc.data.hdf5_probe import read_error
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
+DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
 # What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
 DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, TypeError, KeyError),
@@ -96,6 +98,22 @@ def _write_hdf5(path: Path, raw: Raw) -> None:
                 stored.attrs["units"] = np.bytes_(raw.units[name], "utf-8")
         for name, value in raw.attributes.items():
             file.attrs[name] = np.bytes_(value, "utf-8") if isinstance(value, str) else value
+        file.attrs[DIGEST] = np.bytes_(
+            _digest(raw), "utf-8"
+        )  # HDF5 has no checksums of numbers and attributes
+
+
+def _digest(raw: Raw) -> str:
+    """SHA-256 of names, values, units and attributes, the same before writing and after reading."""
+    digest = hashlib.sha256()
+    for name, array in sorted(raw.arrays.items()):
+        text = array.dtype.kind in "US"
+        content = "\0".join(array.ravel()).encode() if text else np.ascontiguousarray(array).tobytes()
+        head = f"{name} {'text' if text else array.dtype.str} {array.shape} {raw.units.get(name)};"
+        digest.update(head.encode() + content)
+    for name, value in sorted(raw.attributes.items()):
+        digest.update(f"{name}={np.asarray(_plain(value)).tolist()!r};".encode())
+    return digest.hexdigest()
 
 
 def _read_npz(path: Path) -> Raw:
@@ -144,7 +162,15 @@ def _read_hdf5(path: Path) -> Raw:
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
     except DAMAGED as error:
         raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({_one_line(error)})") from None
-    return Raw({k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}, attributes, units)
+    arrays = {k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}
+    written = attributes.pop(DIGEST, None)
+    raw = Raw(arrays, attributes, units)
+    if written is not None and written != _digest(raw):
+        raise DataError(
+            f"{path}: its content is not what was written; take a good copy, or, if you have changed it "
+            f"yourself, delete the attribute {DIGEST}"
+        )
+    return raw
 
 
 def _plain(value: Any) -> Any:
