@@ -126,7 +126,7 @@ def test_a_small_budget_ends_after_the_first_search(tmp_path):
     finally:
         torch.set_num_threads(threads)
     assert len(method.members) == 1
-    assert "1 of 3 searches (within 0 s)" in report.notes[0]
+    assert "1 of 3 searches (within 0 s, ended by the time budget)" in report.notes[0]
 
 
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
