@@ -1,4 +1,7 @@
-"""`python sanitized.py MODULE.so PYTEST_ARGUMENTS...`: tests on a build of the kernels that is watched."""
+"""`python sanitized.py MODULE.so ISA PYTEST_ARGUMENTS...`: tests on a build of the kernels that is watched.
+
+Exit status 99: this machine has no such instruction set.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,9 @@ def main() -> int:
     from gsparc.ops import native
 
     assert native._native.__file__ == sys.argv[1]
-    return int(pytest.main(sys.argv[2:]))
+    if not module.use_instruction_set(sys.argv[2]):
+        return 99
+    return int(pytest.main(sys.argv[3:]))
 
 
 if __name__ == "__main__":
