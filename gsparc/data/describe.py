@@ -100,7 +100,7 @@ def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
 
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
-    found, site = _units(np.concatenate([data.tx, data.rx_position])), data.site
+    found, site = _units(np.concatenate([data.tx, data.rx_position])) or _units(data.moving), data.site
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:

@@ -1,0 +1,115 @@
+"""Slips of a unit or of a column, at every door that measurements come in by."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaigns import channels, powers, spectra
+from releases import write_release
+
+from gsparc.data.describe import describe, read_any
+from gsparc.data.errors import DataError
+
+
+def own(make):
+    """A file of the schema."""
+
+    def write(folder: Path, change) -> Path:
+        with np.load(make(folder / "sound.npz")) as stored:
+            arrays = {name: stored[name].copy() for name in stored.files}
+        for end in ("tx_position", "rx_position"):
+            arrays[end] = change(arrays[end])
+        np.savez(folder / "own.npz", **arrays)
+        return folder / "own.npz"
+
+    return write
+
+
+def newrf(folder: Path, change) -> Path:
+    """A room in NeWRF's layout."""
+    with np.load(channels(folder / "sound.npz", shape="S")) as stored:
+        arrays = dict(stored)
+    places = {"tx_pos": change(arrays["tx_position"]), "rx_pos": change(arrays["rx_position"])}
+    np.savez(folder / "room.npz", csi=arrays["csi"], frequency_hz=arrays["frequency_hz"], **places)
+    return folder / "room.npz"
+
+
+def rfid(folder: Path, change) -> Path:
+    """A folder in the RFID release's layout."""
+    root = write_release(folder / "release")
+    rows = list(csv.reader((root / "tx_pos.csv").open()))
+    places = change(np.array(rows[1:], dtype=float))
+    lines = ["x,y,z", *(",".join(f"{x:.6f}" for x in place) for place in places)]
+    (root / "tx_pos.csv").write_text("\n".join(lines) + "\n")
+    return root
+
+
+DOORS = {
+    "own spectra": own(spectra),
+    "own channels": own(channels),
+    "own powers": own(powers),
+    "newrf": newrf,
+    "rfid": rfid,
+}
+EVERY = pytest.mark.parametrize("door", DOORS)
+
+
+def said(path: Path) -> dict[str, str]:
+    """What is understood of it, by topic."""
+    return dict(describe(read_any(path).data))
+
+
+@EVERY
+def test_the_sound_one_has_no_doubts(tmp_path, door):
+    assert not {"units?", "outliers?"} & set(said(DOORS[door](tmp_path, lambda places: places)))
+
+
+@EVERY
+@pytest.mark.parametrize("factor,unit", [(1e3, "millimetres"), (1e-3, "kilometres")])
+def test_places_in_another_unit_are_doubted(tmp_path, door, factor, unit):
+    found = said(DOORS[door](tmp_path, lambda places: factor * places))
+    assert unit in found["units?"] or (factor > 1 and "centimetres" in found["units?"])
+
+
+@EVERY
+def test_one_place_in_another_unit_is_an_outlier(tmp_path, door):
+    def one(places):
+        changed = np.array(places)
+        if changed.ndim == 2:
+            changed[3] *= 1e4
+        return changed
+
+    assert "lie far outside the region" in said(DOORS[door](tmp_path, one))["outliers?"]
+
+
+@EVERY
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e12])
+def test_a_place_that_is_none_is_refused_by_row(tmp_path, door, value):
+    def wrong(places):
+        changed = np.array(places, dtype=float)
+        if changed.ndim == 2:
+            changed[2, 1] = value
+        return changed
+
+    with pytest.raises(DataError, match=r"(row 2|line 4)"):
+        read_any(DOORS[door](tmp_path, wrong))
+
+
+@pytest.mark.parametrize("door", [name for name in DOORS if name != "rfid"])
+def test_transposed_places_are_refused(tmp_path, door):
+    with pytest.raises(DataError, match=r"transposed\?"):
+        read_any(DOORS[door](tmp_path, lambda places: np.array(places).T))
+
+
+@EVERY
+def test_swapped_columns_are_another_room_of_the_same_size(tmp_path, door):
+    """Nothing can tell x from y; what is said shows both, so that a person can."""
+    for name in ("plain", "turned"):
+        (tmp_path / name).mkdir()
+    plain = said(DOORS[door](tmp_path / "plain", lambda places: places))["moves"]
+    turned = said(DOORS[door](tmp_path / "turned", lambda places: np.array(places)[..., [1, 0, 2]]))["moves"]
+    size = [text.partition("box of ")[2].partition(" m")[0].split(" x ") for text in (plain, turned)]
+    assert size[0] == [size[1][1], size[1][0], size[1][2]]
