@@ -314,6 +314,7 @@ def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
     write_own(path, csi_arrays)
     with h5py.File(path, "a") as file:
         file[b"\xff\xfe\xfd"] = np.ones(3)
+        del file.attrs["content_sha256"]
     assert len(load_own(path)) == 12
 
 
