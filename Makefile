@@ -11,7 +11,7 @@ SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
 
 .DEFAULT_GOAL := help
 RFID ?= ../shared/data/rfid-s23-160
-.PHONY: browser results help setup sionna cuda demo test test-slow hard-cases bench lint typecheck format clean
+.PHONY: browser results help setup sionna cuda demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -55,6 +55,9 @@ test-slow: setup sionna browser ## slow tests: whole training runs, kills, sanit
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
 	$(RUN) -m pytest tests/hard_cases --table docs/hard-cases.md
+
+soak: setup ## half an hour of loads and queries from four threads, with memory watched
+	$(RUN) -m pytest tests/hard_cases/test_soak.py --soak-minutes 30 --timeout 2400 -s
 
 bench: setup ## timings of the kernels as ratios
 	$(RUN) -m gsparc bench

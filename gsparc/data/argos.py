@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.assemble import assemble, rounded_rms
-from gsparc.data.errors import DataError
+from gsparc.data.assemble import assemble, check_positions, rounded_rms
+from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
 from gsparc.data.schema import Measurements
 
@@ -190,8 +190,8 @@ def _split(root: Path, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
     except ValueError as error:
         raise DataError(f"{paths[0].parent}: an index file is not a list of row numbers ({error})") from None
     every = np.concatenate([train, test])
-    if len(np.unique(every)) != len(every) or every.min() < 0 or every.max() >= rows:
-        raise DataError(f"{root}: the index files name a row twice, or one outside 0 to {rows - 1}")
+    if not len(train) or not len(test) or len(np.unique(every)) != len(every) or every.min() < 0 or every.max() >= rows:
+        raise DataError(f"{root}: the index files are empty, name a row twice, or one outside 0 to {rows - 1}")
     return train, test
 
 
@@ -206,8 +206,22 @@ def _positions(
         path = root / "positions.npy"
         if not path.exists():
             raise DataError(f"{path}: missing; true positions exist in the stand-in only")
-        return np.load(path, allow_pickle=False).astype(np.float64)
+        return _true_positions(path, len(uplink))
     if positions != "encoder" or encode is None:
         raise DataError(f"dataset.positions={positions!r}: expected encoder or true")
     rows = np.arange(len(uplink)) if split is None else split[0]
     return encode(uplink, rows)
+
+
+def _true_positions(path: Path, rows: int) -> np.ndarray:
+    try:
+        places = np.load(path, allow_pickle=False).astype(np.float64)
+    except (ValueError, TypeError, OSError) as error:
+        raise DataError(f"{path}: not readable ({' '.join(str(error).split())})") from None
+    if places.shape != (rows, 3):
+        turned = "; transposed?" if places.shape == (3, rows) else ""
+        raise DataError(f"{path}: expected shape ({rows}, 3) [m], found {places.shape}{turned}")
+    problems = Problems(path)
+    check_positions(problems, str(path), places, [f"row {i}" for i in range(rows)])
+    problems.raise_if_any()
+    return places

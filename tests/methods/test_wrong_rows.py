@@ -1,16 +1,27 @@
-"""One wrong training row, for every quick method: refused or finite; left out, as if it had never been."""
+"""One wrong training row, for every method: refused or finite; left out, as if it had never been."""
 
 from __future__ import annotations
 
+from shutil import copytree
+
+import cities
 import numpy as np
 import pytest
 import torch
-from campaigns import channels, powers, spectra
+from campaigns import STILL, channels, compose, powers, spectra
+from contexts import short
+from shoeboxes import scatter
 
+from gsparc.data.argos import load_argos
 from gsparc.data.load import load, split_for
+from gsparc.data.schema import LIGHT
 from gsparc.methods.method import FitContext
-from gsparc.methods.registry import METHODS, method_class
+from gsparc.methods.registry import METHODS, build, method_class
+from gsparc.ops import SphereGrid
+from gsparc.physics.array_response import steering
+from gsparc.simulate.shoebox import Room, trace
 
+ROOM = Room.uniform((4.0, 3.0, 2.5), -0.5)
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi_db": powers}
 QUICK = {  # methods by what they serve, none of which trains for a fixed time
     "spectrum": ("zero", "mean", "nearest", "idw", "gp"),
@@ -77,5 +88,104 @@ def test_kept_it_leaves_finite_answers_or_is_refused(files, tmp_path, kind, name
         assert torch.isfinite(torch.view_as_real(found) if found.is_complex() else found).all()
 
 
-def test_every_quick_method_is_one():
-    assert {name for names in QUICK.values() for name in names} <= set(METHODS)
+def of_an_array(moving):
+    """Spectra of four antennas in a room, as the array would measure them."""
+
+    def made(path):
+        grid, square = SphereGrid.hemisphere(9, 18), 0.25 * np.mgrid[:2, :2, :1].reshape(3, 4).T
+        places = scatter(ROOM, 80, seed=0, margin=0.4)
+        ends = (STILL, places) if moving == "rx" else (places, STILL)
+        heard = trace(ROOM, *ends, np.array([3e8]), max_order=1, array=square).csi[:, :, 0]
+        images = np.abs(heard @ steering(square, grid, LIGHT / 3e8).numpy().conj()).reshape(-1, 9, 18)
+        facts = {"tx_position": ends[0], "rx_position": ends[1], "array_position": square, "carrier_hz": 3e8}
+        np.savez(path, spectrum=images / images.max(), **facts)
+        return path
+
+    return made
+
+
+def with_directions(path):
+    """Channels of one antenna, and where each of the room's first images lies."""
+    walls = np.array([[0, 0, 0], [4, 3, 2.5]])
+    images = [STILL] + [
+        np.where(np.arange(3) == axis, 2 * wall - STILL, STILL) for axis in range(3) for wall in walls
+    ]
+    with np.load(channels(path, shape="S")) as stored:
+        arrays = dict(stored)
+    rays = (np.array(images)[None] - arrays["rx_position"][:, None]).reshape(-1, 3)
+    arrays["path_direction"] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    arrays["path_offsets"] = np.arange(0, len(rays) + 1, len(images))
+    np.savez(path, **arrays)
+    return path
+
+
+SLOW = {  # of data: what makes them, their kind, the methods that train or search there
+    "spectra": (spectra, "spectrum", ("gsrf", "wrfgs", "swiftwrf", "nerf2", "gsparc")),
+    "spectra of a known array": (of_an_array("tx"), "spectrum", ("array", "ngrf", "gsparc")),
+    "spectra of a moving array": (
+        of_an_array("rx"), "spectrum", ("moving_array", "gsparc"),
+    ),
+    "channels": (channels, "csi", ("gsrf", "ngrf", "image_source_gp", "gsparc")),
+    "channels with directions": (with_directions, "csi", ("newrf", "directional_gp", "gsparc")),
+    "powers": (powers, "rssi_db", ("gsparc",)),
+}  # fmt: skip
+UPLINK = ("ridge", "fire", "uplink")
+
+
+def trained(name, data, fold, folder):
+    """Test predictions after a second or two of training."""
+    config = compose(f"model={name}", "budget_s=1.5", *(["model.steps=20"] if name == "fire" else []))
+    method = build(config.model)
+    method.fit(data, fold, short(folder, 4, budget_s=1.5))
+    return method.answer(data.batch(fold.test)).mean
+
+
+def finite_or_refused(name, data, fold, folder):
+    try:
+        found = trained(name, data, fold, folder)
+    except ValueError as refused:
+        assert "\n" not in str(refused)
+    else:
+        assert torch.isfinite(torch.view_as_real(found) if found.is_complex() else found).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [None, *WRONG])
+@pytest.mark.parametrize("what,name", [(what, name) for what in SLOW for name in SLOW[what][2]])
+def test_trained_methods_stay_finite_or_refuse(tmp_path, what, name, wrong):
+    make, kind, _ = SLOW[what]
+    file = make(tmp_path / "sound.npz")
+    if wrong:
+        with np.load(file) as stored:
+            arrays = {key: stored[key].copy() for key in stored.files}
+        WRONG[wrong](arrays, kind)
+        np.savez(file, **arrays)
+    data = load({"name": "own", "file": str(file)})
+    fold = split_for({"name": "random", "seed": 1}, data).folds[0]
+    assert wrong is None or 7 in fold.train
+    if wrong:
+        finite_or_refused(name, data, fold, tmp_path)
+    else:
+        assert len(trained(name, data, fold, tmp_path)) == len(fold.test)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [False, True])
+@pytest.mark.parametrize("name", UPLINK)
+def test_methods_of_the_uplink_stay_finite_or_refuse(tmp_path, name, wrong):
+    root = copytree(cities.folder(), tmp_path / "city")
+    if wrong:
+        csi = np.load(root / "csidata.npy")
+        csi[7] *= 1e8
+        np.save(root / "csidata.npy", csi)
+        (root / "csidata-64.npy").unlink()
+    data = load_argos(root, positions="true")
+    if wrong:
+        finite_or_refused(name, data, cities.fold(), tmp_path)
+    else:
+        assert len(trained(name, data, cities.fold(), tmp_path)) == len(cities.fold().test)
+
+
+def test_no_method_is_forgotten():
+    here = {name for names in (*QUICK.values(), UPLINK, *(cut[2] for cut in SLOW.values())) for name in names}
+    assert here == set(METHODS)
