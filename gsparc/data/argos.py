@@ -190,8 +190,16 @@ def _split(root: Path, rows: int) -> tuple[np.ndarray, np.ndarray] | None:
     except ValueError as error:
         raise DataError(f"{paths[0].parent}: an index file is not a list of row numbers ({error})") from None
     every = np.concatenate([train, test])
-    if not len(train) or not len(test) or len(np.unique(every)) != len(every) or every.min() < 0 or every.max() >= rows:
-        raise DataError(f"{root}: the index files are empty, name a row twice, or one outside 0 to {rows - 1}")
+    if (
+        not len(train)
+        or not len(test)
+        or len(np.unique(every)) != len(every)
+        or every.min() < 0
+        or every.max() >= rows
+    ):
+        raise DataError(
+            f"{root}: the index files are empty, name a row twice, or one outside 0 to {rows - 1}"
+        )
     return train, test
 
 

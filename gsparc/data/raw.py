@@ -116,15 +116,28 @@ def _digest(raw: Raw) -> str:
     return digest.hexdigest()
 
 
+def is_archive(path: Path) -> bool:
+    """Whether a file is a zip archive from its first byte on."""
+    with path.open("rb") as file:
+        if file.read(4) != b"PK\x03\x04":
+            return False
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:  # a damaged directory of a large archive
+        return False
+
+
 def _read_npz(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     name = "the archive"
-    if not zipfile.is_zipfile(path):
+    if not is_archive(path):
         # numpy would take anything else for a pickle and speak of that.
         raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     try:
         with np.load(path, allow_pickle=False) as file:
             for name in file.files:
+                if name in arrays:
+                    raise KeyError("in the archive twice")
                 arrays[name] = file[name]
     except DAMAGED as error:
         fault = f"damaged or not an npz file ({_one_line(error)})"

@@ -7,6 +7,7 @@ import pickle
 import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import yaml
 from torch import Tensor
 
 from gsparc.data.files import whole_file
+from gsparc.data.raw import is_archive
 from gsparc.data.schema import Site
 from gsparc.methods.method import Method
 from gsparc.methods.old_names import OLD_NAMES, renamed
@@ -139,11 +141,10 @@ def read(path: str | Path) -> Stored:
         raise CheckpointError(f"{path}: a folder; {hint}")
     if not path.is_file():
         raise CheckpointError(f"{path}: no such checkpoint")
-    if not zipfile.is_zipfile(path):
-        raise CheckpointError(f"{path}: not a gsparc checkpoint, or cut short")
-    _check_archive(path)
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = torch.load(_checked(path), map_location="cpu", weights_only=True)
+    except CheckpointError:
+        raise
     except pickle.UnpicklingError:
         raise CheckpointError(
             f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could run code"
@@ -181,18 +182,29 @@ def read(path: str | Path) -> Stored:
         raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
 
 
-def _check_archive(path: Path) -> None:
-    """Refuse archives of others and bytes that changed since they were written; torch checks neither."""
+def _checked(path: Path) -> BytesIO:
+    """The archive, written anew from bytes whose checksums are right.
+
+    torch looks at no checksum, and takes entries marked as folders for read without reading them.
+    """
+    clean = BytesIO()
     try:
-        with zipfile.ZipFile(path) as archive:
-            foreign = not any(name.endswith("/data.pkl") for name in archive.namelist())
-            damaged = None if foreign else archive.testzip()
+        if not is_archive(path):
+            raise CheckpointError(f"{path}: not a gsparc checkpoint, or cut short")
+        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(clean, "w") as copy:
+            names = archive.namelist()
+            if not any(name.endswith("/data.pkl") for name in names):
+                raise CheckpointError(f"{path}: an archive, but not a gsparc checkpoint")
+            if len(set(names)) < len(names):
+                raise CheckpointError(f"{path}: damaged (an entry is there twice)")
+            for name in names:
+                copy.writestr(name, archive.read(name))
+    except CheckpointError:
+        raise
     except Exception as error:  # whatever a damaged archive raises
-        raise CheckpointError(f"{path}: cannot be read ({type(error).__name__}: {error})") from None
-    if foreign:
-        raise CheckpointError(f"{path}: an archive, but not a gsparc checkpoint")
-    if damaged is not None:
-        raise CheckpointError(f"{path}: damaged (the checksum of {damaged} is wrong)")
+        raise CheckpointError(f"{path}: damaged ({type(error).__name__}: {error})") from None
+    clean.seek(0)
+    return clean
 
 
 def restore(stored: Stored) -> Method:

@@ -124,7 +124,8 @@ class Kriging(Interpolator, PredictsVariance):
     def _look_up(self, queries: np.ndarray) -> Prediction:
         right = np.ones((len(self.positions) + 1, len(queries)))
         right[:-1] = self._covariance(cdist(self.positions, queries))  # without the nugget: noise is not kept
-        weights = lu_solve(self.system, right)
+        factor, pivots = self.system
+        weights = lu_solve((factor, pivots.copy()), right)  # counted from 1 in place meanwhile
         shares = torch.from_numpy(weights[:-1].T)
         decibels = shares.float() @ torch.from_numpy(self.values)
         left = np.clip(self.variogram.total - (weights * right).sum(0), 0.0, None)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsparc.field.initial import Snapshot
 from gsparc.ops.similarity import served, similarity_op
+from gsparc.ops.transforms import carries_tangent
 
 WINDOW_SIGMA = 1.5  # the Gaussian window of Wang et al. 2004, 11 taps
 WINDOW_RADIUS = 5
@@ -48,6 +49,8 @@ class _Kernel(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx, upstream: Tensor) -> tuple[Tensor, None]:
+        if torch.is_grad_enabled():  # create_graph
+            raise RuntimeError("ssim in float32 has no second derivatives; compute in float64")
         (slope,) = ctx.saved_tensors
         return slope * upstream[:, None, None], None
 
@@ -80,17 +83,19 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5, data range 1.
 
     Args:
-        prediction, target: (B, H, W) in [0, 1]; differentiable in the prediction.
+        prediction, target: (B, H, W) in [0, 1].
 
     Returns:
         (B,) in [-1, 1]. Wang et al. 2004, eq. 13.
 
     Raises:
         ValueError: an image smaller than the window.
+        RuntimeError: a second derivative in float32 outside `torch.func`.
     """
     if not holds_window(prediction):
         raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
     kernel = prediction.dtype == target.dtype and served(prediction)
+    kernel = kernel and not target.requires_grad and not carries_tangent(target)  # it knows one slope
     return (_Kernel.apply if kernel else _written_out)(prediction, target)
 
 

@@ -201,7 +201,44 @@ def test_one_changed_byte_is_seen(fitted, tmp_path):
     content = bytearray(path.read_bytes())
     content[largest.header_offset + len(content) // 100 + 200] ^= 1
     path.write_bytes(content)
-    with pytest.raises(CheckpointError, match="checksum"):
+    with pytest.raises(CheckpointError, match=r"damaged .*CRC"):
+        checkpoint.read(path)
+
+
+def test_an_entry_marked_as_a_folder_is_read_all_the_same(fitted, tmp_path):
+    """torch took such an entry for read and answered with whatever the memory held."""
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    sound = checkpoint.read(path).state
+    content = bytearray(path.read_bytes())
+    entry = content.find(b"PK\x01\x02")
+    while entry >= 0:
+        content[entry + 38] |= 0x10
+        entry = content.find(b"PK\x01\x02", entry + 4)
+    path.write_bytes(content)
+    found = checkpoint.read(path).state
+    for name, value in sound.items():
+        assert torch.equal(found[name], value) if isinstance(value, torch.Tensor) else found[name] == value
+
+
+def test_a_damaged_directory_is_no_traceback(fitted, tmp_path):
+    """`zipfile.is_zipfile` raises on some."""
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    whole = path.read_bytes()
+    for place in range(len(whole) - 120, len(whole)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
+        try:
+            checkpoint.read(path)
+        except CheckpointError as refused:
+            assert "\n" not in str(refused)
+
+
+def test_bytes_in_front_are_not_called_code(fitted, tmp_path):
+    path = tmp_path / "m.ckpt"
+    checkpoint.save(path, fitted[0])
+    path.write_bytes(b"#!" + path.read_bytes())
+    with pytest.raises(CheckpointError, match="not a gsparc checkpoint"):
         checkpoint.read(path)
 
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from gsparc.data.schema import Measurements
+from gsparc.methods import kriging
 from gsparc.methods.idw import InverseDistance
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
@@ -111,3 +112,14 @@ def test_encoding_is_undone(campaign, kind):
 def test_asking_before_fitting_is_an_error():
     with pytest.raises(ValueError, match="fit or restore"):
         method_class("gp")().predict(torch.zeros(1, 3), None)
+
+
+def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypatch):
+    """SciPy counts them from 1 in place while it solves: two threads wrote beside the matrix."""
+    data = campaign("rssi")
+    method = fitted("kriging", data, folds(len(data)).folds[0], tmp_path)
+    seen = []
+    solve = kriging.lu_solve
+    monkeypatch.setattr(kriging, "lu_solve", lambda pair, right: seen.append(pair[1]) or solve(pair, right))
+    method.answer(data.batch(np.arange(3)))
+    assert len(seen) == 1 and not np.shares_memory(seen[0], method.system[1])

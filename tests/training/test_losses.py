@@ -28,6 +28,28 @@ def test_the_written_backward_is_the_derivative():
     assert torch.autograd.gradcheck(lambda x: ssim(x, b), (a,))
 
 
+def test_second_derivatives_are_right_or_refused():
+    """In float32 they were 0, or wrong by half, without a word."""
+    a, b = images(1, 11, 12).requires_grad_(), images(1, 11, 12, seed=1)
+
+    def total(x):
+        return ssim(x, b.to(x.dtype)).sum()
+
+    exact = torch.autograd.functional.hessian(total, a)
+    assert exact.abs().max() > 0.01
+    assert torch.allclose(torch.func.hessian(total)(a.detach().float()).double(), exact, atol=1e-4)
+    with pytest.raises(RuntimeError, match="no second derivatives"):
+        torch.autograd.functional.hessian(total, a.detach().float())
+
+
+def test_the_target_has_a_slope_too():
+    a, b = images(1, 11, 12).float(), images(1, 11, 12, seed=1).float().requires_grad_()
+    ssim(a, b).sum().backward()
+    assert b.grad.abs().max() > 0
+    tangent = torch.func.jvp(lambda t: ssim(a, t), (b.detach(),), (torch.ones_like(a),))[1]
+    assert torch.allclose(tangent, b.grad.sum(), rtol=1e-3)
+
+
 def test_an_image_is_like_itself():
     a = images().float()
     assert torch.allclose(ssim(a, a), torch.ones(3), atol=1e-5)
