@@ -1,37 +1,47 @@
-"""Rows far beyond all others, by median and median absolute deviation: damaged bytes, wrong units, sentinels.
+"""Few rows far beyond all others, with a gap between: damaged bytes, wrong units, sentinels.
 
 They are named where data are checked and read, set no scale, and are learned from and tested on unless
-`split.leave_out=outliers` says otherwise.
+`split.leave_out=outliers` says otherwise. A tail without a gap, or more rows than a few, belongs to the site.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
 from gsparc.data.schema import Measurements
 
-LOUD_DB = 60.0  # above the median row: twice the range of a room with a receiver beside its transmitter
-SPREADS = 10.0  # median absolute deviations scaled to a normal's standard deviation
-FAR = 100.0  # times the median distance from the median place
+FEW = 0.02  # share of the rows, at least one row
+GAP_DB = 50.0  # to the next row: no step of a receiver between two of its neighbours is as high
+FAR = 10.0  # times the farthest distance of the others from the median place
+FAR_M = 50.0  # and this much farther: in a small box nothing is far
 NAMED = 5  # rows in a message
 
 
 def loud(peaks: np.ndarray) -> np.ndarray:
-    """Rows (S,) bool whose largest magnitude `peaks` (S,) is far above the others'; silent rows are not."""
+    """Rows (S,) bool whose largest magnitude `peaks` (S,) is far above all others'; silent rows are not."""
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
     known = np.isfinite(level)
-    if not known.any():
-        return np.zeros(len(level), bool)
-    middle = np.median(level[known])
-    spread = 1.4826 * np.median(np.abs(level[known] - middle))
-    return known & (level > middle + max(LOUD_DB, SPREADS * spread))
+    found = np.zeros(len(level), bool)
+    found[known] = _few_beyond(level[known], lambda inner, outer: outer - inner > GAP_DB)
+    return found
 
 
 def far(positions: np.ndarray) -> np.ndarray:
-    """Rows (S,) bool of `positions` (S, 3) [m] that lie far outside the region of the others."""
+    """Rows (S,) bool of `positions` (S, 3) [m] that lie far outside the region of all others."""
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    return distance > FAR * np.median(distance)
+    return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
+
+
+def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.ndarray:
+    """The most, but few, largest of `values` (n,) above which there is a gap, as (n,) bool."""
+    order = np.argsort(values, kind="stable")
+    for count in range(min(max(1, int(FEW * len(values))), len(values) - 1), 0, -1):
+        if gap(values[order[-count - 1]], values[order[-count]]):
+            return np.isin(np.arange(len(values)), order[-count:])
+    return np.zeros(len(values), bool)
 
 
 def peaks(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:

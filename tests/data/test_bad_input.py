@@ -2,6 +2,8 @@
 # ruff: noqa: E501 (a case is a row of a table)
 
 import json
+import warnings
+import zipfile
 
 import h5py
 import numpy as np
@@ -307,6 +309,23 @@ def test_encrypted_entry_is_refused(tmp_path, csi_arrays):
     path.write_bytes(bytes(content))
     with pytest.raises(DataError, match=r"damaged or not an npz file.*encrypted"):
         load_own(path)
+
+
+def test_an_array_twice_in_an_archive_is_refused(tmp_path, csi_arrays):
+    """The second was taken without a word."""
+    np.savez(tmp_path / "a.npz", **csi_arrays)
+    with zipfile.ZipFile(tmp_path / "a.npz", "a") as archive, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Python warns of the name
+        archive.writestr("csi.npy", archive.read("csi.npy"))
+    with pytest.raises(DataError, match=r"csi: damaged .*twice"):
+        load_own(tmp_path / "a.npz")
+
+
+def test_bytes_before_an_archive_are_not_called_objects(tmp_path, csi_arrays):
+    np.savez(tmp_path / "a.npz", **csi_arrays)
+    (tmp_path / "a.npz").write_bytes(b"#!" + (tmp_path / "a.npz").read_bytes())
+    with pytest.raises(DataError, match="damaged or not an npz archive"):
+        load_own(tmp_path / "a.npz")
 
 
 def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
@@ -105,3 +107,33 @@ def test_a_row_beyond_float32_is_refused(tmp_path):
     """Its target would be infinite, in units of the other rows."""
     with pytest.raises(ValueError, match=r"csi, row 5: beyond float32 in units of the other rows"):
         spoilt("csi", tmp_path, 5, csi=1e200)
+
+
+@pytest.mark.parametrize(
+    "others", [np.full(60, -200.0), -174 + np.sin(np.arange(60.0))], ids=["sentinel", "thermal floor"]
+)
+def test_rows_with_signal_are_no_outliers_among_rows_without(others):
+    """Where most rows stood at a floor, all rows with signal were called outliers and left out of scale."""
+    heard = np.linspace(-95, -50, 40)
+    assert not loud(10 ** (np.concatenate([others, heard]) / 20)).any()
+    assert loud(10 ** (np.append(heard, 20.0) / 20)).sum() == 1
+
+
+def test_a_robot_that_waits_makes_no_outliers():
+    """With most rows at one place the median distance is 0, and everything else was far."""
+    places = np.random.default_rng(0).uniform(0, [10, 10, 2], (100, 3))
+    places[:60] = 5.0
+    assert not far(places).any()
+    places[99] = [300, 5, 1]
+    assert np.flatnonzero(far(places)).tolist() == [99]
+
+
+def test_passing_a_station_is_no_outlier():
+    """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
+    file = Path(__file__).parents[2] / ".." / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+    if not file.is_file():
+        pytest.skip(f"{file.name} is not here")
+    with np.load(file) as stored:
+        powers_db = stored["rssi_db"]
+    for column in powers_db.T:
+        assert not loud(10 ** (column[np.isfinite(column)] / 20)).any()
