@@ -83,7 +83,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         return read_split(config["path"], len(data), data.site.sha256)
     settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
     wrong = np.concatenate([np.zeros(0, np.int64), *outliers(data).values()])
-    return make_split(data.moving, settings, data.release_split, wrong)
+    return make_split(data.moving, settings, data.release_split, wrong, data.place, data.station)
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:

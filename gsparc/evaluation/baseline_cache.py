@@ -16,6 +16,7 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, Method
+from gsparc.methods.per_station import for_links
 from gsparc.methods.registry import method_class
 
 log = logging.getLogger(__name__)
@@ -62,7 +63,7 @@ def baseline(
     for number, fold in enumerate(split.folds):
         found = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
         if found is None:
-            method = method_class(name)()
+            method = for_links(method_class(name), data)
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
             report = method.fit(data, known, FitContext(folder or Path()))

@@ -22,6 +22,7 @@ class Interpolator(Method):
     The query is the position of the moving end; orientations are not used.
     """
 
+    both_ends = True
     stored: ClassVar[tuple[str, ...]] = ()  # attributes that are learned, by their names in a checkpoint
     shape: tuple[int, ...] = ()
     seen = 0
@@ -43,9 +44,9 @@ class Interpolator(Method):
         return self._look_up(self._queries(tx, rx).detach().numpy())
 
     def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Places (B, 3) float64 [m] of the moving end."""
+        """Places (B, 3) float64 [m] of the moving end, or (B, 6) of both."""
         assert self.site is not None
-        return self.site.moving(tx, rx).expand(len(tx), 3).cpu().double()
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def state(self) -> dict[str, Any]:
         """Target shape, number of rows, and what the subclass learned."""

@@ -182,4 +182,4 @@ def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
     path = str(objects.checkpoints[0])
     assert len(collect([path], {}, {})[0]) == len(objects.split.folds[0].test)
     with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the split of its train"):
-        collect([path], {}, {"name": "block"})
+        collect([path], {}, {"name": "corner"})

@@ -21,7 +21,7 @@ def _disjoint(fold, rows):
     return len(np.unique(every)) == len(every) and every.min() >= 0 and every.max() < rows
 
 
-@pytest.mark.parametrize("name", ["random", "grouped", "block", "sparse"])
+@pytest.mark.parametrize("name", ["random", "grouped", "corner", "sparse"])
 def test_a_split_is_a_pure_function_of_positions_and_settings(name):
     positions = _walk()
     first = make_split(positions, SplitSettings(name))
@@ -74,7 +74,7 @@ def test_grouped_orders_scattered_rows_into_slabs():
 @pytest.mark.parametrize("corner", ["--", "-+", "+-", "++"])
 def test_block_is_a_rectangle_in_a_corner(corner):
     positions = np.random.default_rng(0).uniform(0, 2, (500, 3))
-    fold = make_split(positions, SplitSettings("block", corner=corner)).folds[0]
+    fold = make_split(positions, SplitSettings("corner", corner=corner)).folds[0]
     assert len(fold.test) == 100
     toward = np.array([1 if c == "+" else -1 for c in corner])
     centre = (positions[fold.test, :2].mean(axis=0) - 1) * toward

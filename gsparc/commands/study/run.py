@@ -12,6 +12,7 @@ from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.scores import score
 from gsparc.methods.method import FitContext, FitReport, Method
+from gsparc.methods.per_station import for_links
 from gsparc.methods.timing import ClockSettings, cycling, interleaved
 
 QUERIES = 64  # different positions asked for
@@ -78,7 +79,7 @@ def fit_and_score(
     methods, seconds, processor, notes, limited = [], [], [], [], False
     for number, fold in enumerate(split.folds):
         there, rows = (data, fold) if learned is None else learned(data, fold)
-        method, settings = make(), context(number)
+        method, settings = for_links(make, there), context(number)
         before = time.process_time()
         report = method.fit(there, rows, settings)
         processor.append(time.process_time() - before)

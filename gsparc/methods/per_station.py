@@ -1,0 +1,182 @@
+"""One copy of a method for each station, and one over all stations for those that it never heard.
+
+Methods know one static end. Measurements with several are several such sites that share their places: a copy
+is fitted to the rows of each. A station without training rows is answered by a copy that takes both ends for
+moving, so that its query is (tx, rx), where the method can do that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.ops import Pose
+
+SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
+UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
+
+
+def for_links(make: Callable[[], Method], data: Measurements) -> Method:
+    """`make()`, or a copy of it for each station where there are several.
+
+    Raises:
+        ValueError: both ends move, and the method knows one that does.
+    """
+    method = make()
+    if data.site.stations is not None and len(data.site.stations) > 1:
+        return PerStation(make)
+    if data.site.static_end is None and not method.both_ends:
+        raise ValueError(
+            f"{method.name}: both ends of these measurements move; it needs one that stands still"
+        )
+    return method
+
+
+def of_station(site: Site, number: int) -> Site:
+    """The site as one station sees it; of `UNHEARD`, with both ends moving."""
+    assert site.stations is not None
+    if number == UNHEARD:
+        return replace(site, stations=None, static_end=None, static_position=None)
+    stations = site.stations
+    carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
+    rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
+    return replace(
+        site, name=f"{site.name}, station {stations.name[number]}", stations=None, carrier_hz=carrier,
+        static_position=stations.position[number], rx_rotation=rotation,
+    )  # fmt: skip
+
+
+class PerStation(Method):
+    """Copies of a method by station.
+
+    Args:
+        make: makes an unfitted copy.
+    """
+
+    def __init__(self, make: Callable[[], Method]) -> None:
+        self._make = make
+        first = make()
+        self.name, self.effects, self.guesses = first.name, first.effects, first.guesses
+        self.wrapped = first
+        self._copies: dict[int, Method] = {}
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Fit every station that is asked for; seconds are shared equally.
+
+        Raises:
+            ValueError: a station of the test rows has too few training rows, and the method cannot take both
+                ends for moving.
+        """
+        assert data.station is not None and data.site.stations is not None
+        self.site = data.site
+        self._shape = tuple(data.target.shape[1:])
+        heard = np.bincount(data.station[fold.train], minlength=len(data.site.stations)) >= LEAST_ROWS
+        asked = np.bincount(data.station[fold.test], minlength=len(heard)) > 0
+        numbers = [int(t) for t in np.flatnonzero(heard)]
+        if (asked & ~heard).any():
+            if not self.wrapped.both_ends:
+                names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(asked & ~heard)[:3])
+                raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
+            numbers.append(UNHEARD)
+        share = None if context.budget_s is None else context.budget_s / len(numbers)
+        seconds, notes, limited = 0.0, [], False
+        for number in numbers:
+            rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+            copy, part = self._make(), data.subset(rows, of_station(data.site, number))
+            inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
+            where = context.run_dir / f"station{number}" if number != UNHEARD else context.run_dir / "unheard"
+            report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
+            self._copies[number] = copy
+            seconds, limited = seconds + report.seconds, limited or report.time_limited
+            name = "stations never heard" if number == UNHEARD else data.site.stations.name[number]
+            notes += [f"{name}: {note}" for note in report.notes]
+        return FitReport(seconds, tuple(notes), limited)
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Each row by its station's copy."""
+        stations = self._stations(batch.tx, batch.rx) if batch.station is None else batch.station
+        return self._gathered(stations, lambda copy, chosen: copy.answer(_rows(batch, chosen, copy.site)))
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """By the copy of the station that stands at the static end; see `Method.predict`."""
+        everyone = torch.arange(len(tx))
+
+        def ask(copy: Method, chosen: Tensor) -> Prediction:
+            return copy.predict(tx[chosen], _pose(rx, chosen, copy.site))
+
+        return self._gathered(self._stations(tx, rx)[everyone], ask)
+
+    def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands."""
+        assert self.site is not None and self.site.stations is not None
+        ends = tx if self.site.static_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        table = torch.from_numpy(self.site.stations.position)
+        apart, number = torch.cdist(ends.detach().cpu().double(), table).min(dim=1)
+        if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
+            row = int(apart.argmax())
+            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")
+        return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
+
+    def _gathered(self, stations: Tensor, ask: Callable[[Method, Tensor], Prediction]) -> Prediction:
+        parts: list[tuple[Tensor, Prediction]] = []
+        for number in stations.unique().tolist():
+            chosen = (stations == number).nonzero()[:, 0]
+            copy = self._copies.get(number, self._copies.get(UNHEARD))
+            if copy is None:
+                assert self.site is not None and self.site.stations is not None
+                name = self.site.stations.name[number]
+                raise ValueError(f"{self.name}: station {name} had too few training rows")
+            parts.append((chosen, ask(copy, chosen)))
+        order = torch.argsort(torch.cat([chosen for chosen, _ in parts]))
+
+        def joined(name: str) -> Tensor | None:
+            values = [getattr(part, name) for _, part in parts]
+            return None if any(v is None for v in values) else torch.cat(values)[order]
+
+        mean = joined("mean")
+        assert mean is not None
+        return Prediction(mean, joined("confidence"), joined("variance"))
+
+    def state(self) -> dict[str, Any]:
+        """The state of every copy, by its station's number."""
+        return {"per_station": {str(number): copy.state() for number, copy in self._copies.items()}}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site = site
+        for number, part in state["per_station"].items():
+            self._copies[int(number)] = copy = self._make()
+            copy.restore(of_station(site, int(number)), part)
+
+    def size(self) -> int:
+        """That of all copies."""
+        return sum(copy.size() for copy in self._copies.values())
+
+    def __iter__(self) -> Iterator[tuple[int, Method]]:
+        return iter(self._copies.items())
+
+
+def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
+    """The chosen poses; one for all where the receiver is the station."""
+    assert site is not None
+    if not rx.batched:
+        return rx
+    if site.static_end == "rx":
+        return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
+    return Pose(rx.position[chosen], rx.rotation[chosen])
+
+
+def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
+    parts = {
+        name: value if value is None or name in ("rx", "station") else value[chosen]
+        for name, value in vars(batch).items()
+    }
+    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": None})
