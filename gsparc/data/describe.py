@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import read_raw
 from gsparc.data.rfid import load_rfid
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Site
 from gsparc.ops import SphereGrid
 
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
@@ -41,15 +42,13 @@ def read_any(path: str | Path) -> Reading:
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """(topic, sentence) pairs about a dataset."""
     site = data.site
-    moving, extent = data.moving, np.ptp(data.moving, axis=0)
-    # Local coordinates are centred in float64; the world is where the user put it.
-    still = (data.rx_position if site.static_end == "rx" else data.tx)[0] + site.origin
+    places = data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
-        ("stays", f"the {ENDS[site.static_end]}, at ({', '.join(f'{x:.3f}' for x in still)}) m"),
-        ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
-        ("neighbours", _neighbours(moving, site.wavelength)),
+        ("stays", _static(site)),
+        ("moves", _moving(data)),
+        ("neighbours", _neighbours(places, site.wavelength)),
     ]
     lines += [("units?", hint) for hint in suspicious_values(data)]
     lines += [("outliers?", said) for said in outliers.warnings(data)]
@@ -66,7 +65,11 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         lines.append(("array", f"{len(site.array)} receive antennas"))
     if site.target_scale != 1:
         lines.append(("scale", f"stored targets are the measurements divided by {site.target_scale:.4g}"))
-    if data.mask is not None:
+    if data.censored is not None:
+        lines.append(("censored", f"{data.censored.sum()} of {len(data)} powers were too weak to be heard"))
+    if data.run is not None:
+        lines.append(("runs", f"{data.run.max() + 1}, each with an unknown complex factor of its own"))
+    if data.mask is not None and data.censored is None:
         lines.append(("mask", f"{data.mask.mean():.1%} of the entries were measured"))
     if data.directions is not None:
         lines.append(("directions", f"{sum(map(len, data.directions))} directions of arrival"))
@@ -98,9 +101,40 @@ def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
     return text + (f"; {same} rows share their place with another" if same else "")
 
 
+def _static(site: Site) -> str:
+    """Which end stands still, and where in the world."""
+    if site.static_end is None:
+        return "neither end"
+    end = ENDS[site.static_end]
+    if site.stations is not None:
+        extent = " x ".join(f"{e:.2f}" for e in np.ptp(site.stations.position, axis=0))
+        return f"the {end}, {len(site.stations)} stations in a box of {extent} m: {_some(site.stations.name)}"
+    if site.static_position is None:
+        return f"the {end}, at an unknown place"
+    place = site.static_position + site.origin  # local coordinates are centred in float64
+    return f"the {end}, at ({', '.join(f'{x:.3f}' for x in place)}) m"
+
+
+def _moving(data: Measurements) -> str:
+    ends = {"the receiver": data.rx_position, "the transmitter": data.tx}
+    site = data.site
+    if site.static_end is not None:
+        ends = {f"the {ENDS[site.moving_end]}": data.moving}
+    return "; ".join(
+        f"{end}, in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(places, axis=0))} m"
+        for end, places in ends.items()
+    )
+
+
+def _some(names: Sequence[str], count: int = 4) -> str:
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more
+
+
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
-    found, site = _units(np.concatenate([data.tx, data.rx_position])) or _units(data.moving), data.site
+    site, ends = data.site, np.concatenate([data.tx, data.rx_position])
+    found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.own_checks import Checker
+from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
 from gsparc.data.rotation import is_unit, quaternion_to_matrix
 from gsparc.data.schema import End, Links, Stations
 
@@ -29,7 +29,7 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
         return Links(None, run=run)
     end = "transmitter" if few == "tx" else "receiver"
     check.notes.append(f"the {end} stands at {len(table)} places: taken as {len(table)} stations")
-    stations = Stations(table, tuple(f"station {i}" for i in range(len(table))))
+    stations = Stations(table, tuple(str(i) for i in range(len(table))))
     moving = rx if few == "tx" else tx
     place = np.unique(moving, axis=0, return_inverse=True)[1].reshape(-1)
     return Links(few, stations, which.reshape(-1).astype(np.int64), place.astype(np.int64), run=run)
@@ -44,9 +44,7 @@ def station_table(check: Checker) -> Stations | None:
     names = check.raw.arrays.get("station_name")
     if names is not None and not check.fits("station_name", names, (count,)):
         return None
-    called = (
-        tuple(str(n) for n in names) if names is not None else tuple(f"station {i}" for i in range(count))
-    )
+    called = tuple(map(str, range(count) if names is None else names))
     for name in sorted({name for name in called if called.count(name) > 1}):
         return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
     turned = check.real("station_orientation", (count, 4))
@@ -80,6 +78,10 @@ def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: 
     assert links.stations is not None and links.station is not None
     if carriers is None or carriers.ndim == 0:
         return links
+    if not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
+        worst = carriers[np.argmax(~((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)))]
+        check.refuse("carrier_hz", f"{worst:g}; expected Hz (not MHz or GHz)")
+        check.problems.raise_if_any()
     stations, station = links.stations, links.station
     if len(carriers) == len(stations) and len(stations) != rows:
         of_link = carriers[station]

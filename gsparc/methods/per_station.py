@@ -34,9 +34,7 @@ def for_links(make: Callable[[], Method], data: Measurements) -> Method:
     if data.site.stations is not None and len(data.site.stations) > 1:
         return PerStation(make)
     if data.site.static_end is None and not method.both_ends:
-        raise ValueError(
-            f"{method.name}: both ends of these measurements move; it needs one that stands still"
-        )
+        raise ValueError(f"{method.name}: both ends move here; it needs one that stands still")
     return method
 
 

@@ -14,6 +14,7 @@ from gsparc.data.schema import Kind, Site
 from gsparc.methods import checkpoint
 from gsparc.methods.confidence import Trusted, kept
 from gsparc.methods.method import Method
+from gsparc.methods.per_station import of_station
 from gsparc.methods.timing import Call
 from gsparc.ops import Pose
 
@@ -60,6 +61,24 @@ class Predictor:
             f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
             f"the {self.site.moving_end} moves, scene from {low} to {high} m)"
         )
+
+    def at(self, station: str | int) -> Predictor:
+        """The same model asked about one station alone, by name or number.
+
+        >>> gsparc.load("model.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5])
+
+        Raises:
+            ValueError: no station is called that.
+        """
+        stations = self.site.stations
+        if stations is None:
+            raise ValueError(f"at: {self.site.name} has one static end, and no stations")
+        names = [str(number) for number in range(len(stations))]
+        for known in (list(stations.name), names):
+            if str(station) in known:
+                site = of_station(self.site, known.index(str(station)))
+                return Predictor(self.method, site, self._whole, self.point, self.trusted, self.kind)
+        raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
 
     def cycling(self, places: np.ndarray) -> Call:
         """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time."""
@@ -186,11 +205,10 @@ class Predictor:
         places = {
             end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
         }
-        moving, static = self.site.moving_end, self.site.static_end
-        if moving not in places:
-            raise ValueError(
-                f"{moving}= is needed: it is the end that moved when {self.site.name} was measured"
-            )
+        moving, static = self.site.moving_end, self.site.static_end or "tx"
+        for end in (moving,) if self.site.static_end else ("rx", "tx"):
+            if end not in places:
+                raise ValueError(f"{end}= is needed: it moved when {self.site.name} was measured")
         single = all(place.ndim == 1 for place in places.values())
         if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
             asked = _float(np.atleast_2d(places[moving] - self.site.origin))
@@ -202,7 +220,7 @@ class Predictor:
                 raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
         ends = {moving: local[moving], static: self._static(local.get(static))}
         rotation = self._rotation(rx, count)
-        if static == "rx" and rotation.ndim == 2:
+        if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
             pose = Pose(_float(ends["rx"]), _float(rotation))
         else:
             positions = np.broadcast_to(ends["rx"], (count, 3))
@@ -218,12 +236,16 @@ class Predictor:
         return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
 
     def _static(self, given: np.ndarray | None) -> np.ndarray:
-        """Local position (3,) of the static end; a given one must be where it was measured."""
+        """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
         known, end = self.site.static_position, self.site.static_end
         if known is None:
-            if given is None:
-                raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
-            return given[0]
+            if given is not None:
+                return given[0] if len(given) == 1 else given
+            if self.site.stations is not None:
+                raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
+            if self.site.kind == "rssi":  # learned without its transmitter's place
+                return np.full(3, np.nan)
+            raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
         if given is not None and (np.linalg.norm(given - known, axis=-1) > SAME_PLACE_M).any():
             stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
             raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")

@@ -104,7 +104,7 @@ CSI = {
     "empty": (_set("csi", np.ones((0, 2, 3), complex)), "two rows or more"),
     "rows differ": (_set("rx_position", np.ones((11, 3))), r"rx_position: expected shape .*\(12, 3\).*found \(11, 3\)"),
     "transposed": (_set("rx_position", np.ones((3, 12))), r"found \(3, 12\); transposed"),
-    "two coordinates": (_set("rx_position", np.ones((12, 2))), r"rx_position: expected shape"),
+    "two coordinates": (_set("rx_position", np.ones((12, 2))), "rx_position: two coordinates.* rx_height"),
     "position nan": (_entry("rx_position", (5, 1), np.nan), "rx_position, row 5 = .*three finite coordinates"),
     "position 1e38": (_entry("rx_position", (5, 1), 1e38), "rx_position, row 5 = .*none beyond"),
     "position complex": (_set("tx_position", np.ones(3, complex)), "tx_position: expected real numbers"),

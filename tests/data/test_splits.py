@@ -195,3 +195,53 @@ def test_thinning_by_distance_leaves_the_test_rows_alone():
     assert np.linalg.norm(positions[left][:, None] - positions[kept][None], axis=-1).min(1).max() < 0.8
     with pytest.raises(DataError, match="spacing_m"):
         SplitSettings(spacing_m=0.0)
+
+
+def test_blocks_are_whole_squares_until_the_share_is_reached():
+    positions = np.random.default_rng(0).uniform(0, 3, (900, 3))
+    fold = make_split(positions, SplitSettings("blocks", side_m=0.5, share=0.2)).folds[0]
+    assert _disjoint(fold, 900) and 180 <= len(fold.test) < 180 + 60
+    square = np.floor(positions[:, :2] / 0.5) @ [1, 1000]
+    parts = [set(square[part]) for part in (fold.train, fold.val, fold.test)]
+    assert not parts[0] & parts[1] and not parts[0] & parts[2] and not parts[1] & parts[2]
+    assert len(fold.val) >= 0.1 * (len(fold.train) + len(fold.val))
+
+
+def test_blocks_without_a_side_are_a_tenth_of_the_site():
+    positions = np.random.default_rng(0).uniform(0, 1000, (900, 3))
+    fold = make_split(positions, SplitSettings("blocks")).folds[0]
+    assert len(np.unique(np.floor(positions[fold.test, :2] / 99.8), axis=0)) < 35
+    with pytest.raises(DataError, match="too few to hold some out"):
+        make_split(positions, SplitSettings("blocks", side_m=5000))
+
+
+@pytest.mark.parametrize("name", ["random", "grouped", "blocks", "corner"])
+def test_a_place_is_held_out_for_all_stations(name):
+    places = np.random.default_rng(0).uniform(0, 3, (200, 3))
+    place, station = np.repeat(np.arange(200), 4), np.tile(np.arange(4), 200)
+    found = make_split(places[place], SplitSettings(name), place=place, station=station)
+    alone = make_split(places, SplitSettings(name))
+    for fold, other in zip(found.folds, alone.folds, strict=True):
+        for part in ("train", "val", "test"):
+            np.testing.assert_array_equal(np.unique(place[getattr(fold, part)]), getattr(other, part))
+            assert len(getattr(fold, part)) == 4 * len(getattr(other, part))
+
+
+def test_stations_are_held_out_one_by_one_or_together():
+    station = np.repeat(np.arange(5), 20)
+    positions = np.random.default_rng(0).uniform(0, 3, (100, 3))
+    split = make_split(positions, SplitSettings("stations"), station=station)
+    assert [set(station[fold.test]) for fold in split.folds] == [{t} for t in range(5)]
+    for fold in split.folds:
+        assert _disjoint(fold, 100) and len(set(station[fold.val])) == 1
+        assert not set(station[fold.val]) & set(station[fold.train])
+    (fold,) = make_split(positions, SplitSettings("stations", leave_out=2), station=station).folds
+    assert len(set(station[fold.test])) == 2
+    with pytest.raises(DataError, match="have one station"):
+        make_split(positions, SplitSettings("stations"))
+    with pytest.raises(DataError, match="two at least must remain"):
+        make_split(positions, SplitSettings("stations", leave_out=4), station=station)
+
+
+def test_block_is_called_corner_now():
+    assert SplitSettings("block").name == "corner"
