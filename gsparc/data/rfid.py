@@ -26,7 +26,7 @@ from gsparc.ops import SphereGrid
 
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
-NUMBER = re.compile(r"\s*[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
+NUMBER = re.compile(r"\s*[+-]?((\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?|nan|inf)\s*", re.ASCII | re.IGNORECASE)
 LONGEST = 18  # digits of an index
 STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 

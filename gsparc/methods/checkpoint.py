@@ -110,7 +110,7 @@ def amend(path: str | Path, extra: Mapping[str, Any]) -> None:
     """
     path = Path(path)
     read(path)  # refuses what is no good checkpoint
-    content = torch.load(path, map_location="cpu", weights_only=True)
+    content = torch.load(_checked(path), map_location="cpu", weights_only=True)
     content["extra"] = {**content["extra"], **_plain(dict(extra), "extra")}
     _write(path, content)
 
