@@ -118,7 +118,7 @@ def assemble(
     site = Site(
         static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,
         origin=origin, box=np.stack([lower - origin, upper - origin]), sha256=content_hash(hashed),
-        target_scale=target_scale, static_position=still,
+        target_scale=target_scale, static_position=still, georeference=links.georeference,
         stations=None if stations is None else replace(stations, position=stations.position - origin),
         rx_rotation=np.array(rx_rotation[0], dtype=np.float64), **facts,
     )  # fmt: skip

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.data.degrees import in_metres
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw
 from gsparc.data.schema import End, Links
@@ -28,11 +29,18 @@ def expand(check: Checker, measured: str) -> Links | None:
         measured: name of the measurement.
     """
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
-    if not _heights(check):
+    origin = in_metres(check)
+    if check.problems or not _heights(check):
         return None
+    links = (
+        _with_table(check, measured) if check.given("station_position") else _without_table(check, measured)
+    )
+    return None if links is None else replace(links, georeference=origin)
+
+
+def _without_table(check: Checker, measured: str) -> Links | None:
+    """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
     arrays = check.raw.arrays
-    if "station_position" in arrays:
-        return _with_table(check, measured)
     for name in check.given(*STATION_FIELDS[:-1]):
         return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
     rows = len(arrays[measured]) if arrays[measured].ndim else 0

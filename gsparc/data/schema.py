@@ -50,6 +50,7 @@ class Links:
         censored: (S,) bool; None where nothing is.
         run: (S,) int64; None without runs.
         unknown_transmitter: powers of a transmitter whose place nobody gave.
+        georeference: of the world's origin, where places came in degrees.
     """
 
     static_end: End | None
@@ -59,6 +60,7 @@ class Links:
     censored: np.ndarray | None = None
     run: np.ndarray | None = None
     unknown_transmitter: bool = False
+    georeference: Georeference | None = None
 
     def named(self, rows: list[str]) -> list[str]:
         """Names (S,) of rows, with their stations."""

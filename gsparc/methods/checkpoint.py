@@ -257,6 +257,10 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
     if values.get("stations") is not None:
         stations = values["stations"]
         values["stations"] = Stations(**{**stations, "name": tuple(stations["name"])})
+    if values.get("georeference") is not None:
+        from gsparc.data.georeference import Georeference
+
+        values["georeference"] = Georeference(**values["georeference"])
     return Site(**values)
 
 

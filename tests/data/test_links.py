@@ -170,3 +170,41 @@ def test_what_is_wrong_is_one_line(case):
 def test_hdf5_and_npz_alike(tmp_path):
     np.savez(tmp_path / "town.npz", **town())
     assert load_own(tmp_path / "town.npz").site.stations.name == ("north", "east", "roof")
+
+
+def test_degrees_become_metres_and_back():
+    north = 40.76 + RNG.uniform(0, 0.01, PLACES)
+    east = -111.84 + RNG.uniform(0, 0.01, PLACES)
+    posts = {"station_latitude": np.array([40.76, 40.77, 40.765]), "station_longitude": np.full(3, -111.835)}
+    found = read(
+        town(tx_position=None, station_position=None, latitude=north, longitude=east, tx_height=1.5, **posts)
+    )
+    data = found.data
+    world = data.tx[::STATIONS, :2] + data.site.origin[:2]
+    back = data.site.georeference.to_degrees(world)
+    np.testing.assert_allclose(back[0], north, atol=1e-8)
+    np.testing.assert_allclose(back[1], east, atol=1e-8)
+    assert any("no station_height: taken as 0 m" in note for note in found.notes)
+
+
+BAD_DEGREES = {
+    "alone": ({"latitude": np.full(PLACES, 40.0)}, "given alone"),
+    "beyond": (
+        {"latitude": np.full(PLACES, 140.0), "longitude": np.full(PLACES, 4.0), "station_position": None},
+        "row 0: latitude 140",
+    ),
+    "metres beside": (
+        {"latitude": WALK[:, 0], "longitude": WALK[:, 1]}, "in metres beside places in degrees",
+    ),
+    "counts": (
+        {"latitude": WALK[:, 0], "longitude": WALK[1:, 1], "station_position": None}, "9 values for 10",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_DEGREES)
+def test_degrees_that_are_none_are_one_line(case):
+    arrays, words = BAD_DEGREES[case]
+    with pytest.raises(DataError, match=words) as refused:
+        read(town(tx_position=None, **arrays))
+    assert "\n" not in str(refused.value)
