@@ -74,8 +74,13 @@ def evaluate(
     facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
     facts |= {f"{eval_on}/{k}": v for k, v in scores.decided_by().items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
+    unheard = data.station if split.name == "stations" and data.site.kind == "rssi" else None
+    if unheard is not None:
+        facts[f"{eval_on}/rmse_db_after_constant"] = scores.after_constant(unheard)
     for name, other in others.items():
         own = {**other.scores.figures(), "skill": _skill(other.scores, others)}
+        if unheard is not None:
+            own["rmse_db_after_constant"] = other.scores.after_constant(unheard)
         own["train_s"] = float(np.mean(other.train_s))
         facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:

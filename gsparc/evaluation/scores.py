@@ -59,6 +59,19 @@ class Scores:
         found = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
         return {f"decided_by/{name}": value for name, value in found.items()}
 
+    def after_constant(self, station: np.ndarray) -> float | None:
+        """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
+
+        Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
+        """
+        error, of_row = self.samples["error_db"], station[self.row]
+        known = np.isfinite(error)
+        error, of_row = error[known], np.unique(of_row[known], return_inverse=True)[1].reshape(-1)
+        if not len(error):
+            return None
+        means = np.bincount(of_row, error) / np.bincount(of_row)
+        return float(np.sqrt(np.mean((error - means[of_row]) ** 2)))
+
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a file."""
         own = {"fold": self.fold, "row": self.row, "confidence": self.confidence, "variance": self.variance}

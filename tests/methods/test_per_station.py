@@ -12,10 +12,12 @@ import gsparc
 from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import SplitSettings, make_split
+from gsparc.evaluation.evaluate import evaluate
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.per_station import PerStation, for_links, of_station
 from gsparc.methods.registry import method_class
+from gsparc.methods.timing import ClockSettings
 
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5], [20, 20, 5]])
 LOSS = np.array([0.0, 10.0, 20.0, 30.0])  # stations are not calibrated
@@ -116,3 +118,14 @@ def test_real_city(tmp_path):
         for name in ("mean", "idw")
     }
     assert 9 < found["mean"]["rmse_db"] < 11 and 6 < found["idw"]["rmse_db"] < 8
+
+
+def test_a_constant_of_each_station_can_be_taken_away(town, tmp_path):
+    split = make_split(town.moving, SplitSettings("stations"), place=town.place, station=town.station)
+    found = evaluate(
+        fit_and_score(method_class("mean"), town, split, in_folders(FitContext(tmp_path)), eval_on=None).methods,
+        None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
+    ).facts  # fmt: skip
+    spread = np.std(10 * np.log10(town.target[:, 0]).reshape(-1, 4), axis=0)
+    assert found["test/rmse_db_after_constant"] == pytest.approx(np.sqrt(np.mean(spread**2)), rel=0.01)
+    assert found["test/rmse_db"] > 2 * found["test/rmse_db_after_constant"]
