@@ -1,4 +1,4 @@
-"""Tables of measurements: what is understood, what is said, and 40 spoilt ones with one line each."""
+"""Tables of measurements: what is understood, what is said, and 41 spoilt ones with one line each."""
 # ruff: noqa: E501 (a case is a row of a table)
 
 import importlib.util
