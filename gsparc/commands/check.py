@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
-from gsparc.data.describe import describe, read_any
+from gsparc.data.describe import describe, doubtful, read_any
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
 
 
-def check(path: str, console: Console) -> bool:
+def check(
+    path: str, console: Console, columns: Mapping[str, str] | None = None, stations_file: str | None = None
+) -> bool:
     """Write what was understood of `path`, or all its problems one per line; returns whether it is good."""
     try:
-        reading = read_any(path)
+        reading = read_any(path, columns, stations_file)
     except DataError as error:
         for problem in error.problems:
             _line(console, problem)
@@ -26,6 +28,8 @@ def check(path: str, console: Console) -> bool:
         _line(console, f"{topic:<12}{sentence}")
     for note in reading.notes:
         _line(console, f"{'note':<12}{note}")
+    for doubt in doubtful(reading.data):
+        _line(console, f"{'doubt':<12}{doubt}")
     try:
         split_for({"name": "random"}, reading.data).check()
     except DataError as error:
@@ -45,7 +49,15 @@ def _line(console: Console, text: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; exit status 0 when everything given is good, else 1."""
     parser = argparse.ArgumentParser(prog="gsparc check", description=__doc__)
-    parser.add_argument("path", nargs="+", help="npz or HDF5 file, or a folder like the RFID release")
+    parser.add_argument(
+        "path", nargs="+", help="npz or HDF5 file, a table (csv, parquet), or a folder like the RFID release"
+    )
+    parser.add_argument(
+        "--column", action="append", default=[], metavar="NAME=HEAD", help="of a table: which column is what"
+    )
+    parser.add_argument("--stations-file", help="of a table: a second one that lists the stations")
+    given = parser.parse_args(arguments)
+    columns = dict(text.partition("=")[::2] for text in given.column)
     console = Console()
-    good = [check(path, console) for path in parser.parse_args(arguments).path]
+    good = [check(path, console, columns, given.stations_file) for path in given.path]
     return 0 if all(good) else 1

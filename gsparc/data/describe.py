@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data import outliers
+from gsparc.data.doubts import as_links, doubts
 from gsparc.data.errors import DataError
 from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import read_raw
+from gsparc.data.raw import Raw, read_raw
 from gsparc.data.rfid import load_rfid
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.tables import is_table
 from gsparc.ops import SphereGrid
 
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
 ENDS = {"rx": "receiver", "tx": "transmitter"}
 
 
-def read_any(path: str | Path) -> Reading:
-    """Read a folder in the RFID release's layout, a NeWRF room, or a file of one's own.
+def read_any(
+    path: str | Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+) -> Reading:
+    """Read a folder in the RFID release's layout, a NeWRF room, a file of one's own, or a table.
+
+    Args:
+        path: folder or file.
+        columns, stations_file: of a table, see `Own`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
@@ -35,8 +43,54 @@ def read_any(path: str | Path) -> Reading:
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
-    raw = read_raw(path)
-    return read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    raw, notes = raw_of(path, columns, stations_file)
+    reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    return Reading(reading.data, (*notes, *reading.notes))
+
+
+def raw_of(
+    path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+) -> tuple[Raw, tuple[str, ...]]:
+    """The arrays of a file of the schema, or of a table, and how its columns were understood.
+
+    Raises:
+        DataError: not readable, or columns that nothing can be made of.
+    """
+    if not is_table(path):
+        told = any(value is not None for value in (columns or {}).values())
+        for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
+            raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
+        return read_raw(path), ()
+    from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
+
+    found = understand_table(path, columns or {}, stations_file)
+    return found.raw, found.notes
+
+
+def doubtful(data: Measurements) -> list[str]:
+    """Doubts about powers in the order of measuring: copies, wild rows, levels that jump, outages."""
+    if data.site.kind != "rssi" or data.site.static_end is None:
+        return []
+    stations = data.site.stations
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    place = np.arange(len(data)) if data.place is None else data.place
+    _, first, which = np.unique(place, return_index=True, return_inverse=True)
+    count = 1 if stations is None else len(stations)
+    with np.errstate(divide="ignore"):
+        level = 10 * np.log10(data.target[:, 0].astype(np.float64) * data.site.target_scale)
+    heard = np.ones(len(data), bool) if data.censored is None else ~data.censored
+    table, which = np.full((len(first), count), np.nan), which.reshape(-1)
+    table[which[heard], station[heard]] = level[heard]
+    rows = [data.row_names[i].partition(", station")[0] for i in first]
+    position, of_link, levels, called = as_links(data.moving[first], table, rows)
+    if data.censored is not None:  # what is missing there is known to be weak
+        kept = np.isfinite(levels)
+        position, of_link, levels = position[kept], of_link[kept], levels[kept]
+        called = [row for row, keep in zip(called, kept, strict=True) if keep]
+    known = None if data.site.static_position is None else data.site.static_position[None]
+    known = known if stations is None else stations.position
+    names = ["the station"] if stations is None else list(stations.name)
+    return doubts(position, of_link, levels, names, called, known)
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:

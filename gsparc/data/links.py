@@ -14,7 +14,7 @@ from gsparc.data.degrees import in_metres
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw
 from gsparc.data.schema import End, Links
-from gsparc.data.stations import OTHER, by_carrier, ends_of, station_of_row, station_table
+from gsparc.data.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
 
 POWERS = ("rssi", "rssi_db")
 PER_ROW = ("noise_variance", "rx_orientation", "rx_rotation", "run", "row_name", "received_power")
@@ -87,7 +87,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         assert which is not None
         positions = np.atleast_2d(check.real(f"{moving}_position", (3,), (rows, 3)))
         if not len(check.problems) and len(positions) == rows:
-            place = np.unique(positions, axis=0, return_inverse=True)[1].reshape(-1)
+            place = numbered(positions)
         links = Links(OTHER[moving], stations, which, place, run=run)
     else:
         check.raw = _unrolled(check.raw, measured, moving, count)

@@ -14,6 +14,14 @@ OTHER: dict[End, End] = {"rx": "tx", "tx": "rx"}
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
+def numbered(places: np.ndarray) -> np.ndarray:
+    """The number (n,) int64 of each of `places` (n, 3), counted in the order in which they first appear."""
+    _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[which.reshape(-1)]
+
+
 def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | None) -> Links:
     """Which end stands still, at one place or at few; None for both moving."""
     still: dict[End, bool] = {"rx": bool((rx == rx[:1]).all()), "tx": bool((tx == tx[:1]).all())}
@@ -31,8 +39,7 @@ def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | No
     check.notes.append(f"the {end} stands at {len(table)} places: taken as {len(table)} stations")
     stations = Stations(table, tuple(str(i) for i in range(len(table))))
     moving = rx if few == "tx" else tx
-    place = np.unique(moving, axis=0, return_inverse=True)[1].reshape(-1)
-    return Links(few, stations, which.reshape(-1).astype(np.int64), place.astype(np.int64), run=run)
+    return Links(few, stations, which.reshape(-1).astype(np.int64), numbered(moving), run=run)
 
 
 def station_table(check: Checker) -> Stations | None:

@@ -122,9 +122,9 @@ def test_real_city(tmp_path):
 
 def test_a_constant_of_each_station_can_be_taken_away(town, tmp_path):
     split = make_split(town.moving, SplitSettings("stations"), place=town.place, station=town.station)
+    fits = fit_and_score(method_class("mean"), town, split, in_folders(FitContext(tmp_path)), eval_on=None)
     found = evaluate(
-        fit_and_score(method_class("mean"), town, split, in_folders(FitContext(tmp_path)), eval_on=None).methods,
-        None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
+        fits.methods, None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
     ).facts  # fmt: skip
     spread = np.std(10 * np.log10(town.target[:, 0]).reshape(-1, 4), axis=0)
     assert found["test/rmse_db_after_constant"] == pytest.approx(np.sqrt(np.mean(spread**2)), rel=0.01)
