@@ -153,6 +153,9 @@ class Measurements:
         release_split: (train, test) int64 rows that the data themselves name, or None.
         provenance: where the data came from, as their makers wrote it down.
         uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or None.
+        censored: (S,) bool, True where nothing was heard: the target is a level that the power is below, and
+            its mask is False; None where everything was heard.
+        run: (S,) int64; rows of one run share an unknown complex factor of their own; None: there is none.
     """
 
     site: Site
@@ -167,6 +170,8 @@ class Measurements:
     release_split: tuple[np.ndarray, np.ndarray] | None = None
     provenance: dict[str, str] = field(default_factory=dict)
     uplink: np.ndarray | None = None
+    censored: np.ndarray | None = None
+    run: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.target)

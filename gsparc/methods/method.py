@@ -108,6 +108,7 @@ class Method(ABC):
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
+    uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
 
     @abstractmethod
