@@ -32,6 +32,6 @@ def cholesky(covariance: Tensor) -> Tensor:
         if not failed:
             return lower
     raise ValueError(
-        f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {RIDGES[-1]:.0%} of noise: "
-        "look for rows that are not finite (gsparc check FILE)"
+        f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {RIDGES[-1]:.0%} of "
+        "noise: look for rows that are not finite (gsparc check FILE)"
     )
