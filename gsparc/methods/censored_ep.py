@@ -13,7 +13,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cholesky, solve_triangular
 from scipy.special import log_ndtr
 
 from gsparc.methods.power_kernel import inverse_of
@@ -54,13 +54,9 @@ def truncated(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(z < FAR, series, ratio), np.clip(lost, LEAST, 1 - 1e-12)
 
 
-def propagate(mean: np.ndarray, covariance: np.ndarray, level: np.ndarray) -> Sites:
-    """Stand-ins for "below `level`" of a Gaussian vector.
-
-    Args:
-        mean: (m,), and covariance (m, m) with noise, positive definite.
-        level: (m,).
-    """
+def propagate(told: Told, level: np.ndarray) -> Sites:
+    """Stand-ins for "below `level`" (m,) of the unknown entries of a Gaussian vector."""
+    mean, covariance = told.mean, told.covariance
     total = covariance.diagonal()
     value, variance = _sites(mean, total, level)
     settled, before = False, mean
@@ -107,6 +103,14 @@ class Told:
     covariance: np.ndarray
     log_evidence: float
 
+    def uncertain(self, level: np.ndarray) -> np.ndarray:
+        """Entries (m,) bool that the known ones leave in doubt to lie below `level` (m,)."""
+        return level - self.mean < CERTAIN * np.sqrt(self.covariance.diagonal())
+
+    def of(self, kept: np.ndarray) -> Told:
+        """The entries `kept` alone."""
+        return Told(self.mean[kept], self.covariance[np.ix_(kept, kept)], self.log_evidence)
+
 
 def condition(gram: np.ndarray, values: np.ndarray, unknown: np.ndarray) -> Told:
     """Gaussian conditioning of a vector of mean zero.
@@ -136,7 +140,7 @@ def log_evidence(gram: np.ndarray, values: np.ndarray, unknown: np.ndarray) -> t
         unknown: (n,) bool.
     """
     told = condition(gram, values, unknown)
-    sites = propagate(told.mean, told.covariance, values[unknown])
+    sites = propagate(told, values[unknown])
     whole = gram.copy()
     rows = np.flatnonzero(unknown)
     whole[rows, rows] += sites.variance
@@ -145,16 +149,3 @@ def log_evidence(gram: np.ndarray, values: np.ndarray, unknown: np.ndarray) -> t
     inverse, _ = inverse_of(whole)
     weights = inverse @ pseudo
     return told.log_evidence + sites.log_evidence, 0.5 * (np.outer(weights, weights) - inverse)
-
-
-def informative(gram: np.ndarray, values: np.ndarray, unknown: np.ndarray) -> np.ndarray:
-    """Rows (n,) bool worth keeping: known, or not certain to lie below their level by the known ones."""
-    known = ~unknown
-    factor = cholesky(gram[np.ix_(known, known)], lower=True, check_finite=False), True
-    cross = gram[np.ix_(known, unknown)]
-    mean = cross.T @ cho_solve(factor, values[known], check_finite=False)
-    half = solve_triangular(factor[0], cross, lower=True, check_finite=False)
-    left = gram.diagonal()[unknown] - (half**2).sum(0)
-    kept = known.copy()
-    kept[unknown] = values[unknown] - mean < CERTAIN * np.sqrt(left)
-    return kept

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.methods.censored_ep import condition, informative, log_evidence, propagate
+from gsparc.methods.censored_ep import condition, log_evidence, propagate
 from gsparc.methods.distance_law import Law, Rows, law_of
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
 
@@ -291,24 +291,18 @@ def _conditioned(
     values = rows.decibels - trend.mean(places).numpy()
     gram = _gram(kernel, rows.places, trend)
     if rows.silent.any():
-        count = int(rows.silent.sum())
         deviation = math.sqrt(kernel.amplitude)
-        kept = informative(gram, values / deviation, rows.silent) if not rows.silent.all() else rows.silent
-        quiet = np.flatnonzero(kept & rows.silent)
-        if len(quiet) > MOST_SILENT:
-            notes.append(
-                f"{MOST_SILENT} of {len(quiet)} rows near their level are learned from, drawn evenly"
-            )
-            quiet = np.random.default_rng(seed).permutation(quiet)[:MOST_SILENT]
-        used = np.sort(np.concatenate([np.flatnonzero(~rows.silent), quiet]))
+        notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
+        told, level = condition(gram, values / deviation, rows.silent), values[rows.silent] / deviation
+        near = np.flatnonzero(told.uncertain(level))
+        if len(near) > MOST_SILENT:
+            notes.append(f"{MOST_SILENT} of {len(near)} rows near the level are used, drawn evenly")
+            near = np.sort(np.random.default_rng(seed).permutation(near)[:MOST_SILENT])
+        used = np.sort(np.concatenate([np.flatnonzero(~rows.silent), np.flatnonzero(rows.silent)[near]]))
         rows, values, extra, gram = rows.at(used), values[used], extra[used], gram[np.ix_(used, used)]
-        notes.insert(0, f"{count} rows where nothing was heard are below their level")
-        if rows.silent.any():
-            told = condition(gram, values / deviation, rows.silent)
-            sites = propagate(told.mean, told.covariance, values[rows.silent] / deviation)
-            extra[rows.silent] = sites.variance
-            values = values.copy()
-            values[rows.silent] = deviation * sites.value
+        if len(near):
+            sites = propagate(told.of(near), level[near])
+            extra[rows.silent], values[rows.silent] = sites.variance, deviation * sites.value
             if not sites.settled:
                 notes.append("what these rows say had not settled after all sweeps")
     factor = _factored(gram, extra)

@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods import censored_ep
 from gsparc.methods.censored import heard, left_out_note
-from gsparc.methods.censored_ep import condition, informative, log_evidence, propagate, truncated
+from gsparc.methods.censored_ep import condition, log_evidence, propagate, truncated
 from gsparc.methods.method import FitContext
 from gsparc.methods.power_process import draw
 from gsparc.methods.registry import build
@@ -138,7 +138,7 @@ def small_vector(count: int = 8):
 def test_evidence_and_means_are_those_of_sampling():
     gram, values, unknown = small_vector()
     told = condition(gram, values, unknown)
-    sites = propagate(told.mean, told.covariance, values[unknown])
+    sites = propagate(told, values[unknown])
     normal = multivariate_normal(told.mean, told.covariance, seed=1)
     assert sites.settled
     assert sites.log_evidence == pytest.approx(normal.logcdf(values[unknown]), abs=0.03)
@@ -160,16 +160,13 @@ def test_the_slope_of_the_evidence(monkeypatch):
 
 def test_rows_certain_to_be_silent_change_nothing():
     gram, values, unknown = small_vector()
-    values = values + 60.0 * (np.arange(8) == 6)
-    kept = informative(gram, values, unknown)
-    assert not kept[6] and kept[:5].all()
-    told, fewer = (
-        condition(g, v, u)
-        for g, v, u in ((gram, values, unknown), (gram[np.ix_(kept, kept)], values[kept], unknown[kept]))
-    )
-    every = propagate(told.mean, told.covariance, values[unknown])
-    rest = propagate(fewer.mean, fewer.covariance, values[kept & unknown])
-    assert np.allclose(every.value[kept[unknown]], rest.value, atol=1e-2)
+    level = values[unknown] + [0.0, 60.0, 0.0]
+    told = condition(gram, values, unknown)
+    kept = told.uncertain(level)
+    assert kept.tolist() == [True, False, True]
+    every, rest = propagate(told, level), propagate(told.of(kept), level[kept])
+    assert np.allclose(every.value[kept], rest.value, atol=1e-2)
+    assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
 
 
 def test_drawn_rows_keep_half_of_what_was_heard():
