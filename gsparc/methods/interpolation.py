@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.methods.censored import heard, left_out_note, silent
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.target_rows import from_real, training_targets
 from gsparc.ops import Pose
@@ -29,12 +30,17 @@ class Interpolator(Method):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none."""
-        rows = np.concatenate([fold.train, fold.val])
+        known = np.concatenate([fold.train, fold.val])
+        rows = known if self.uses_censored else heard(data, known)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         start = time.perf_counter()
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
-        notes = self._learn(data.moving[rows], training_targets(data, rows))
+        places, targets, unheard = data.moving[rows], training_targets(data, rows), silent(data, rows)
+        if unheard.any():
+            notes = self._learn_censored(places, targets, unheard)
+        else:
+            notes = (*self._learn(places, targets), *left_out_note(data, known))
         return FitReport(time.perf_counter() - start, notes)
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
@@ -73,6 +79,12 @@ class Interpolator(Method):
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
+
+    def _learn_censored(
+        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+    ) -> tuple[str, ...]:
+        """The same where nothing was heard in the rows `silent` (n,), whose targets are levels."""
+        raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
 
     @abstractmethod
     def _look_up(self, queries: np.ndarray) -> Prediction:

@@ -109,6 +109,7 @@ class Method(ABC):
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
+    uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
 
     @abstractmethod
