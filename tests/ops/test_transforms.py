@@ -8,7 +8,7 @@ from rasters import random_scene
 from torch.autograd import forward_ad
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops import Cutoff, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
 from gsparc.ops.channels import channels
 from gsparc.ops.networks import networks
 from gsparc.ops.operators import composite_op, view_of
@@ -101,6 +101,34 @@ def test_second_derivatives_by_either_road():
     (slope,) = torch.autograd.grad(power("cpu")(leaf), leaf, create_graph=True)
     with pytest.raises(RuntimeError, match=r"kernels have no second derivatives: take backend='reference'"):
         torch.autograd.grad(slope.sum(), leaf)
+
+
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+def test_the_hessian_in_means_was_off_by_five_percent(projection):
+    """The frame of `tangent` was orthonormal to first order only."""
+    model = field()
+    weight = tangents((image("cpu")(*model),))[0]
+
+    def power(backend):
+        cutoff = Cutoff(1e-12, 0.0)  # no edge that a difference could cross
+        return lambda means: (
+            rasterize(
+                means, *model[1:], POSE, GRID, projection=projection, cutoff=cutoff, backend=backend
+            ).image
+            * weight
+        ).sum()
+
+    def slope(means, backend="cpu", **kept):
+        leaf = means.clone().requires_grad_()
+        return leaf, torch.autograd.grad(power(backend)(leaf), leaf, **kept)[0].flatten()
+
+    step, directions = 1e-5, torch.eye(model[0].numel(), dtype=torch.float64).unflatten(-1, model[0].shape)
+    ends = ([slope(model[0] + sign * step * d)[1] for d in directions] for sign in (1, -1))
+    wanted = torch.stack([(ahead - behind) / (2 * step) for ahead, behind in zip(*ends, strict=True)])
+    leaf, kept = slope(model[0], "reference", create_graph=True)
+    rows = torch.stack([torch.autograd.grad(part, leaf, retain_graph=True)[0].flatten() for part in kept])
+    for found in (rows, hessian(power("cpu"))(model[0]).reshape(wanted.shape)):
+        assert (found - wanted).abs().max() < 1e-6 * wanted.abs().max()
 
 
 @BACKENDS
