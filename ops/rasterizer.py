@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -51,17 +53,21 @@ def make_plan(
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
-    validation.transforms(gaussians, pose)
+    pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
+    validation.transforms(gaussians, pose, pose_trained)
     with torch.no_grad():
         chosen = backends.choose(backend, means.device)
         optics = Optics(projection, low_pass, compensate, near, cutoff)
         still = Gaussians._make(None if tensor is None else tensor.detach() for tensor in gaussians)
-        return chosen.make_plan(validation.strongest(still), ids, validation.poses(pose, means), grid, optics)
+        poses = validation.poses(pose, means)
+        plan = chosen.make_plan(validation.strongest(still), ids, poses, grid, optics)
+    return replace(plan, pose_trained=True) if pose_trained else plan
 
 
 def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
     """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
     gaussians = validation.gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
+    validation.transforms(gaussians, plan.pose, plan.pose_trained)
     if plan.num_gaussians != len(gaussians.means):
         raise ValueError(
             f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan again"

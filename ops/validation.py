@@ -50,11 +50,10 @@ def gaussians(
     return given
 
 
-def transforms(gaussians: Gaussians, pose: Pose) -> None:
+def transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> None:
     """Refuse a pose whose gradient is asked for, which would be none, and Gaussians under `torch.vmap`."""
     ends = (pose.position, pose.rotation)
-    wanted = torch.is_grad_enabled() and any(part.requires_grad for part in ends)
-    if wanted or carries_tangent(*ends):
+    if (pose_trained and torch.is_grad_enabled()) or carries_tangent(*ends):
         raise ValueError("a pose has no gradients here: detach it, or move the Gaussians instead")
     if mapped(*gaussians, *ends):
         raise ValueError(

@@ -88,6 +88,21 @@ def test_gaussians_cannot_be_mapped(backend):
         vmap(lambda values: image(backend)(values, *model[1:]))(torch.stack([model[0], model[0]]))
 
 
+@BACKENDS
+def test_gaussians_mapped_over_a_plan_got_past_the_refusal(backend):
+    """Each was drawn by the order and the cut-offs of the first."""
+    model = field()
+    plan = make_plan(*model[:4], POSE, GRID, backend=backend)
+    several = torch.stack([model[0], -model[0]])
+    for made in (
+        lambda means: composite(plan, means, *model[1:]).image,
+        lambda means: mean_weights(plan, means, *model[1:4]).share,
+        lambda means: freeze(plan, means, *model[1:4], version=0).render(model[4], 0),
+    ):
+        with pytest.raises(ValueError, match=r"vmap over Gaussians or poses is not possible: give P poses"):
+            vmap(made)(several)
+
+
 def test_second_derivatives_by_either_road():
     model = field()
 
@@ -141,6 +156,21 @@ def test_a_pose_had_no_gradient_and_no_word(backend, part):
         rasterize(*model, pose, GRID, backend=backend)
     with torch.no_grad():
         rasterize(*model, pose, GRID, backend=backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize("part", ["position", "rotation"])
+def test_a_pose_planned_without_gradients_had_none_and_no_word(backend, part):
+    model = [part.clone().requires_grad_() for part in field()]
+    parts = {"position": POSE.position.clone(), "rotation": POSE.rotation.clone()}
+    with torch.no_grad():
+        plan = make_plan(
+            *model[:4], Pose(**{**parts, part: parts[part].requires_grad_()}), GRID, backend=backend
+        )
+        composite(plan, *model)
+    for made in (lambda: composite(plan, *model), lambda: mean_weights(plan, *model[:4])):
+        with pytest.raises(ValueError, match="a pose has no gradients here: detach it"):
+            made()
 
 
 def test_an_operator_by_itself_and_a_frozen_view_refuse():
