@@ -174,9 +174,12 @@ def freeze(
 
     Raises:
         ValueError: a plan of more than one pose.
+        RuntimeError: under `torch.func` and in forward mode; a view has no derivatives.
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    if beyond_kernels(*gaussians):
+        raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")
     order, buffers = backends.named(plan.backend).freeze(plan, gaussians)
     return FrozenPlan(plan.grid, plan.backend, version, order, buffers)

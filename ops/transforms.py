@@ -28,6 +28,15 @@ def mapped(*values: Any) -> bool:
     return False
 
 
+def unwrapped(value: Tensor, axis: int) -> tuple[Tensor, int]:
+    """The numbers behind a tensor, hidden axes included, and where its axis `axis` is among them."""
+    while _functorch.is_functorch_wrapped_tensor(value):
+        hidden = _functorch.maybe_get_bdim(value)
+        axis += 0 <= hidden <= axis
+        value = _functorch.get_unwrapped(value)
+    return value, axis
+
+
 def transforming() -> bool:
     """Whether a transform of `torch.func` is under way."""
     return torch._C._are_functorch_transforms_active()

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from gsparc.ops import built
 from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, SKEW, WIDEST
-from gsparc.ops.transforms import carries_tangent, mapped, transforming
+from gsparc.ops.transforms import carries_tangent, mapped, unwrapped
 
 
 class UnsoundGaussian(ValueError):
@@ -132,16 +134,25 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
         raise ValueError(
             f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
         )
-    looked_at = values.device.type == "cpu" and not transforming()  # a GPU is not waited for: NaN stays NaN
-    if looked_at and not bool(torch.isfinite(values).all()):
-        bad = (~torch.isfinite(values)).any(-1)
-        raise_for("features", int(bad.nonzero()[0, -1]))
+    check_features(values)
     poses = len(pose)
     if values.dim() == 2:
         return values.expand(poses, *values.shape)
     if poses not in (1, values.shape[0]):
         raise ValueError(f"{values.shape[0]} samples need one pose or as many, got {poses} poses")
     return values
+
+
+def check_features(values: Tensor, rows: Tensor | None = None) -> None:
+    """Check that features (..., N, C) on the CPU are finite (UnsoundGaussian; of `rows` (N,) where given)."""
+    if values.device.type != "cpu":  # a GPU is not waited for: NaN stays NaN
+        return
+    numbers, axis = unwrapped(values, values.dim() - 2)
+    if not math.isfinite(numbers.sum().item()):  # one pass; a sum may overflow where no number does
+        bad = (~torch.isfinite(numbers)).movedim(axis, 0).flatten(1).any(1)
+        if bool(bad.any()):
+            index = torch.argmax(bad.to(torch.int8))
+            raise_for("features", int(index if rows is None else rows[index]))
 
 
 def poses(pose: Pose, means: Tensor) -> Pose:

@@ -186,6 +186,31 @@ def test_an_operator_by_itself_and_a_frozen_view_refuse():
         assert forward_ad.unpack_dual(composite(plan, *model[:4], features).image).tangent.abs().max() > 0
 
 
+@BACKENDS
+def test_a_frozen_view_was_a_constant_to_transforms(backend):
+    """Gradients were zero or failed in torch's words, tangents were dropped in silence."""
+    model = field()
+    plan = make_plan(*model[:4], POSE, GRID, backend=backend)
+    view = freeze(plan, *model[:4], version=0)
+    asked = (
+        lambda made, value: vjp(made, value)[1](made(value)),
+        lambda made, value: jvp(made, (value,), (value,)),
+        lambda made, value: jacrev(made)(value),
+        lambda made, value: jacfwd(made)(value),
+    )
+    for derivative in asked:
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives and cannot be mapped"):
+            derivative(lambda features: view.render(features, 0), model[4])
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives: composite the plan"):
+            derivative(lambda opacities: freeze(plan, *model[:3], opacities, version=0).order, model[3])
+    with pytest.raises(RuntimeError, match="cannot be mapped"):
+        vmap(lambda features: view.render(features, 0))(torch.stack([model[4], model[4]]))
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(model[3], model[3])
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives"):
+            freeze(plan, *model[:3], dual, version=0)
+
+
 def test_networks_channels_and_similarity_have_forward_mode():
     draw = torch.Generator().manual_seed(0)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 from rasters import poses, random_scene
+from torch.func import jacfwd, jacrev, vmap
 
-from gsparc.ops import Pose, SphereGrid, UnsoundGaussian, rasterize
+from gsparc.ops import Pose, SphereGrid, UnsoundGaussian, freeze, make_plan, rasterize
 
 GRID = SphereGrid.hemisphere(9, 18)
 BACKENDS = pytest.mark.parametrize("backend", ["reference", "cpu"])
@@ -28,6 +29,41 @@ def test_features_that_are_not_finite(backend, value):
     with pytest.raises(UnsoundGaussian, match="Gaussian 4 has features that are not finite") as refused:
         drawn(backend, features=((1, 4, 0), value))
     assert refused.value.index == 4
+
+
+@BACKENDS
+def test_features_of_a_frozen_view_were_not_looked_at(backend):
+    scene = random_scene(n=40, samples=2)
+    model = (scene.means, scene.quats, scene.scales, scene.opacities)
+    view = freeze(make_plan(*model, poses(1), GRID, backend=backend), *model, version=0)
+    features = scene.features.clone()
+    features[1, view.order[3], 0] = float("nan")
+    found = f"Gaussian {int(view.order[3])} has features that are not finite"
+    for draw in (lambda: view.render(features, 0), lambda: view.compose(features[:, view.order])):
+        with pytest.raises(UnsoundGaussian, match=found):
+            draw()
+    view.render(torch.full_like(features, 1e308), 0)  # their sum is no number, each of them is
+    with pytest.raises(TypeError, match=r"features are torch.float32, this view was frozen in torch.float64"):
+        view.render(scene.features.float(), 0)
+    with pytest.raises(ValueError, match=r"of those seen, got \(2, 1, 2\)"):
+        view.compose(features[:, :1])  # the kernel read beyond them
+
+
+@BACKENDS
+def test_features_under_transforms_were_not_looked_at(backend):
+    scene = random_scene(n=6, samples=2)
+    features = scene.features.clone()
+    features[1, 4, 0] = float("inf")
+    pose = poses(1)
+
+    def drawn_of(values):
+        model = (scene.means, scene.quats, scene.scales, scene.opacities)
+        return rasterize(*model, values, pose, GRID, backend=backend).image
+
+    mapped_last = lambda values: vmap(drawn_of, in_dims=2)(values.movedim(0, 2))  # noqa: E731
+    for made in (vmap(drawn_of), mapped_last, jacfwd(drawn_of), jacrev(lambda v: vmap(drawn_of)(v).sum())):
+        with pytest.raises(UnsoundGaussian, match="Gaussian 4 has features that are not finite"):
+            made(features)
 
 
 @BACKENDS
