@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsparc.ops import backends, built, calls
 from gsparc.ops.operators import contiguous, empty_like, kernel, operator
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import beyond_kernels, full_precision
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
@@ -24,8 +24,8 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         ValueError, TypeError: shapes, devices or dtypes that do not fit.
     """
     _check(encoded, Layers(weight1, bias1, weight2, bias2))
-    plain = encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2)
-    if plain or encoded.dtype != weight1.dtype:
+    encoded = encoded.to(weight1.dtype)  # it comes in half precision from `torch.autocast`
+    if encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2):
         return products(encoded, weight1, bias1, weight2, bias2)
     kernels = built.kernels()
     fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None
@@ -38,6 +38,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     return products(encoded, weight1, bias1, weight2, bias2)
 
 
+@full_precision
 def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
     """The same (B, N, C) as matrix products; the reference."""
     count, width, hidden = weight1.shape

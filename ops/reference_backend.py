@@ -1,4 +1,7 @@
-"""The `reference` backend: plans and composites with dense tensors and autograd."""
+"""The `reference` backend: plans and composites with dense tensors and autograd.
+
+Half precision of `torch.autocast` is switched off here; a backward pass must itself be outside of it.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,10 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import Optics
+from gsparc.ops.transforms import full_precision
 
 
+@full_precision
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Depth order and radii; compositing evaluates the footprints again, differentiably."""
     validation.finite(gaussians, pose)
@@ -38,6 +43,7 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
     )
 
 
+@full_precision
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
@@ -51,6 +57,7 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
     return torch.cat(images).unflatten(-1, size), torch.stack(transmittances).unflatten(-1, size)
 
 
+@full_precision
 def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Sums over pixels of alpha T and of alpha, both (P, N)."""
     seen, total = [], []
@@ -69,6 +76,7 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 
+@full_precision
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
     no_shift = torch.zeros_like(plan.means2d)
@@ -76,6 +84,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return plan.buffers[0][0], (weights,)
 
 
+@full_precision
 def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
     """Image (K, H, W) of features (N, K) in the order of `freeze`."""
     return (features.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))

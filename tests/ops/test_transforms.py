@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from rasters import random_scene
+from rasters import poses, random_scene
 from torch.autograd import forward_ad
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
@@ -171,6 +171,24 @@ def test_a_pose_planned_without_gradients_had_none_and_no_word(backend, part):
     for made in (lambda: composite(plan, *model), lambda: mean_weights(plan, *model[:4])):
         with pytest.raises(ValueError, match="a pose has no gradients here: detach it"):
             made()
+
+
+@BACKENDS
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16], ids=str)
+def test_autocast_lowered_the_precision_in_silence(backend, precision):
+    """The reference and forward mode drew in half precision and refused sound rotations."""
+    model = [part.float() for part in field()]
+    pose = poses(1)
+    drawn = lambda means: rasterize(means, *model[1:], pose, GRID, backend=backend).image  # noqa: E731
+    layers = [torch.ones(size) / 3 for size in ((2, 3), (4, 3, 5), (4, 5), (4, 5, 2), (4, 2))]
+    outputs = lambda encoded: networks(encoded, *layers[1:])  # noqa: E731
+    for made, value in ((drawn, model[0]), (outputs, layers[0])):
+        wanted = jvp(made, (value,), (value,))
+        with torch.autocast("cpu", dtype=precision):
+            image, found = made(value), jvp(made, (value,), (value,))
+        assert torch.allclose(image, wanted[0], atol=1e-5)
+        for part, whole in zip(found, wanted, strict=True):
+            assert torch.allclose(part, whole, rtol=1e-5, atol=1e-5 * float(whole.abs().max()))
 
 
 def test_an_operator_by_itself_and_a_frozen_view_refuse():
