@@ -73,7 +73,7 @@ def _equirect_offsets(seen: Projected, grid: SphereGrid, shift: Tensor) -> tuple
     center = seen.center + shift
     column = torch.arange(grid.width, dtype=shift.dtype, device=shift.device) - center[:, :1]
     row = torch.arange(grid.height, dtype=shift.dtype, device=shift.device) - center[:, 1:]
-    turn = 2 * torch.pi / grid.azimuth_step
+    turn = grid.turn
     column = column - turn * torch.round(column.detach() / turn)
     size = (-1, grid.height, grid.width)
     p, q = column[:, None, :].expand(size).flatten(1), row[:, :, None].expand(size).flatten(1)

@@ -58,6 +58,25 @@ def test_forward_mode_was_zero_in_silence(made, backend):
 
 
 @BACKENDS
+@pytest.mark.parametrize("opacity", [1e-28, 1e-31, 1e-36])
+def test_the_share_of_the_faintest_had_a_tangent_and_no_gradient(backend, opacity):
+    """Below FAINTEST it has neither."""
+    means, quats, scales, opacities, _ = field()
+    faint, origin = torch.full_like(opacities, opacity), Pose.identity(torch.zeros(3, dtype=torch.float64))
+
+    def share(means):
+        optics = {"cutoff": Cutoff(0.01, 0.0, relative=True), "extinctions": opacities}
+        plan = make_plan(means, quats, scales, faint, origin, GRID, backend=backend, **optics)
+        return mean_weights(plan, means, quats, scales, faint, extinctions=opacities).share
+
+    tangent = jvp(share, (means,), (torch.ones_like(means),))[1].sum()
+    leaf = means.clone().requires_grad_()
+    share(leaf).sum().backward()
+    assert torch.allclose(tangent, leaf.grad.sum(), rtol=1e-9, atol=0)
+    assert bool(tangent != 0) == (opacity > 1e-30)
+
+
+@BACKENDS
 def test_transforms_agree_with_autograd(backend):
     model = field()
     slope = tangents((image(backend)(*model),))[0]
