@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import _native, calls, cuda_library, validation
-from gsparc.ops.geometry import Gaussians
+from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.operators import (
     Buffers,
     Poses,
@@ -119,7 +119,7 @@ def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, sett
         capacity = _with_headroom(_capacities[key])
     else:
         status, capacity = verdict.tolist()
-        validation.raise_for_status(status)
+        validation.raise_for_status(status, Pose(*poses))
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
     buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))

@@ -75,6 +75,17 @@ def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
     return gaussians
 
 
+def _trained(plan: Plan, *tensors: Tensor | None) -> bool:
+    """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
+    asked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    if asked and plan.means2d.is_inference():
+        raise RuntimeError(
+            "this plan was made in torch.inference_mode, so nothing can be trained over it: plan outside, "
+            "or under torch.no_grad"
+        )
+    return asked
+
+
 def composite(
     plan: Plan,
     means: Tensor,
@@ -92,12 +103,12 @@ def composite(
 
     Raises:
         ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
+        RuntimeError: gradients over a plan that was made in `torch.inference_mode`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     values = validation.features(features, means, plan.pose)
-    trained = any(tensor is not None and tensor.requires_grad for tensor in (*gaussians, features))
     plain = beyond_kernels(*gaussians, features)
-    trained = trained and torch.is_grad_enabled() and not plain
+    trained = _trained(plan, *gaussians, features) and not plain
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
     backend = reference_by_rows if plain else backends.named(plan.backend)
     image, transmittance = backend.composite(plan, gaussians, values, means2d)
@@ -149,9 +160,10 @@ def mean_weights(
     """Visible weight of each Gaussian for each pose, by a plan of the same Gaussians; differentiable.
 
     Raises:
-        ValueError, TypeError: as `composite`.
+        ValueError, TypeError, RuntimeError: as `composite`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    _trained(plan, *gaussians)
     backend = reference_by_rows if beyond_kernels(*gaussians) else backends.named(plan.backend)
     return Weights(*backend.mean_weights(plan, gaussians))
 

@@ -210,6 +210,18 @@ def test_autocast_lowered_the_precision_in_silence(backend, precision):
             assert torch.allclose(part, whole, rtol=1e-5, atol=1e-5 * float(whole.abs().max()))
 
 
+@BACKENDS
+def test_a_plan_of_inference_mode_was_trained_in_the_words_of_a_library(backend):
+    model = [part.clone().requires_grad_() for part in field()]
+    with torch.inference_mode():
+        plan = make_plan(*model[:4], POSE, GRID, backend=backend)
+    for made in (lambda: composite(plan, *model), lambda: mean_weights(plan, *model[:4])):
+        with pytest.raises(RuntimeError, match=r"this plan was made in torch.inference_mode"):
+            made()
+    with torch.no_grad():
+        assert composite(plan, *model).image.isfinite().all()
+
+
 def test_an_operator_by_itself_and_a_frozen_view_refuse():
     model = field()
     plan = make_plan(*model[:4], POSE, GRID)
