@@ -77,6 +77,25 @@ def test_the_share_of_the_faintest_had_a_tangent_and_no_gradient(backend, opacit
 
 
 @BACKENDS
+@pytest.mark.parametrize("derived", [False, True], ids=["backward", "forward"])
+def test_no_poses_made_an_empty_image_or_an_error_of_a_library(backend, derived):
+    model = [part.clone().requires_grad_() for part in field()]
+    none, features = poses(1)[:0], torch.zeros(0, 6, 2, dtype=torch.float64)
+
+    def drawn(means):
+        plan = make_plan(means, *model[1:4], none, GRID, backend=backend)
+        raster = composite(plan, means, *model[1:4], features)
+        assert plan.radii.shape == plan.visible.shape == (0, 6) and plan.means2d.shape == (0, 6, 2)
+        return raster.image, raster.transmittance, mean_weights(plan, means, *model[1:4]).share
+
+    outputs = jvp(drawn, (field()[0],), (field()[0],))[1] if derived else drawn(model[0])
+    assert [tuple(part.shape) for part in outputs] == [(0, 2, 9, 18), (0, 9, 18), (0, 6)]
+    if not derived:
+        sum(part.sum() for part in outputs).backward()
+        assert all(leaf.grad is not None and not leaf.grad.any() for leaf in model[:4])
+
+
+@BACKENDS
 def test_transforms_agree_with_autograd(backend):
     model = field()
     slope = tangents((image(backend)(*model),))[0]
