@@ -37,8 +37,14 @@ class Seen:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Shape (H, W), 1 at its centre, and where it is certain (H, W); the share of its peak that the low-pass
-    leaves; its largest variance [px^2]."""
+    """One Gaussian on the grid.
+
+    Attributes:
+        shape: (H, W), 1 at its centre.
+        certain: (H, W) bool, the pixel is neither at the horizon nor half a turn away.
+        share: of its peak, what the low-pass leaves.
+        variance: the largest [px^2].
+    """
 
     shape: np.ndarray
     certain: np.ndarray
