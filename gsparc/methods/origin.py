@@ -22,8 +22,10 @@ log = logging.getLogger(__name__)
 DECIDING = ("model", "dataset.batch_size", "init_from")
 RHYTHM = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
 """Settings that may change on the way, and are then named."""
-UNHASHED = ("kind", "static_end", "grid", "normalisation", "origin", "target_scale")
-UNHASHED += ("uplink_array", "uplink_hz", "antennas")
+UNHASHED = (
+    "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
+    "uplink_array", "uplink_hz", "antennas",
+)  # fmt: skip
 """Facts of a site that the content hash of its measurements leaves out."""
 
 # What is hashed, the group of settings that names it, in words.
