@@ -9,7 +9,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -115,13 +115,30 @@ class SplitSettings:
         ):
             if not good:
                 raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
-        rows = self.leave_out
-        if rows != "outliers" and (isinstance(rows, str) or any(type(r) is not int or r < 0 for r in rows)):
-            raise DataError(f"split.leave_out={rows}: expected outliers, or numbers of rows like [3, 17]")
+        _check_rows(self.leave_out)
         if self.folds < 2 or self.stretches_per_fold < 1:
             raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
         if len(self.corner) != 2 or set(self.corner) - set("+-"):
             raise DataError(f"split.corner={self.corner!r}: expected one of --, -+, +-, ++")
+
+
+@dataclass(frozen=True)
+class FileSettings:
+    """The folds of an index file: the config group `split` with the name `file`.
+
+    Attributes:
+        path: as a run writes it, split.json.
+        leave_out: see `SplitSettings`.
+    """
+
+    name: str = "file"
+    path: str = ""
+    leave_out: Sequence[int] | Literal["outliers"] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.path, str | Path) or str(self.path) in ("", "???"):
+            raise DataError("split.path is not set; say split.path=split.json for split=file")
+        _check_rows(self.leave_out)
 
 
 def make_split(
@@ -142,9 +159,7 @@ def make_split(
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
     """
     rows = len(positions)
-    absent = np.array(outliers if settings.leave_out == "outliers" else settings.leave_out, dtype=np.int64)
-    if len(absent) and absent.max() >= rows:
-        raise DataError(f"split.leave_out: row {absent.max()} of rows 0 to {rows - 1}")
+    absent = left_out(settings.leave_out, outliers, rows)
     if len(absent):
         return _of_the_rest(np.setdiff1d(np.arange(rows), absent), positions, settings, release_split)
     if settings.name == "grouped":
@@ -160,6 +175,27 @@ def make_split(
         pairs = [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
     folds = tuple(_finish(i, train, test, positions, settings) for i, (train, test) in enumerate(pairs))
     return Split(settings.name, folds, indices_hash(folds))
+
+
+def left_out(
+    leave_out: Sequence[int] | Literal["outliers"], outliers: np.ndarray | None, rows: int
+) -> np.ndarray:
+    """The rows (n,) int64 of `rows` that `leave_out` names, where `outliers` (n,) are those of that name.
+
+    Raises:
+        DataError: there is no such row.
+    """
+    named = outliers if isinstance(leave_out, str) else leave_out
+    absent = [int(row) for row in (() if named is None else named)]
+    if max(absent, default=-1) >= rows:
+        raise DataError(f"split.leave_out: row {max(absent)} of rows 0 to {rows - 1}")
+    return np.array(absent, dtype=np.int64)
+
+
+def without(split: Split, absent: np.ndarray) -> Split:
+    """The same folds without the rows `absent` (n,)."""
+    folds = tuple(Fold(*(np.setdiff1d(part, absent) for part in vars(f).values())) for f in split.folds)
+    return Split(split.name, folds, indices_hash(folds))
 
 
 def path_order(positions: np.ndarray) -> np.ndarray:
@@ -249,6 +285,17 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
         log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
     return Split(name, folds, stored_hash)
+
+
+def _check_rows(given: Any) -> None:
+    """Refuse what `leave_out` cannot be (DataError)."""
+    listed = given.tolist() if isinstance(given, np.ndarray) else given
+    if isinstance(listed, str) or not isinstance(listed, Sequence):
+        good = isinstance(listed, str) and listed == "outliers"
+    else:
+        good = all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
+    if not good:
+        raise DataError(f"split.leave_out={given}: expected outliers, or numbers of rows like [3, 17]")
 
 
 def _of_the_rest(
