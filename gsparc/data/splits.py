@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
 log = logging.getLogger(__name__)
@@ -270,8 +270,8 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
         name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
     except FileNotFoundError:
         raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise DataError(f"{path}: not a split file ({type(error).__name__}: {error})") from None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise DataError(f"{path}: not a split file ({type(error).__name__}: {reason(error)})") from None
     if stored_rows != rows:
         raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
     for i, fold in enumerate(folds):

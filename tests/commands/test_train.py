@@ -71,6 +71,14 @@ def test_methods_without_a_gradient_take_the_same_road(model, tmp_path):
     assert np.isfinite(facts["test/psnr_db"]) and objects.checkpoints[0].exists()
 
 
+def test_a_budget_that_a_method_does_not_take_is_said(tmp_path, caplog):
+    """`effects.array=true budget_s=5` took its time without a word."""
+    settings = [s for s in brief(spectra(tmp_path / "own.npz")) if not s.startswith("model.")]
+    facts, _ = train(compose(*settings, "model=mean", "budget_s=5"), tmp_path / "run")
+    assert "budget_s=5 is not used: the seconds of mean cannot be chosen" in caplog.text
+    assert facts["model/limited_by_clock"] is None
+
+
 def test_a_checkpoint_evaluates_to_the_same_figures(tmp_path):
     file = spectra(tmp_path / "own.npz")
     facts, objects = train(compose(*brief(file)), tmp_path / "run")

@@ -214,3 +214,12 @@ def test_thinning_by_distance_leaves_the_test_rows_alone():
     assert np.linalg.norm(positions[left][:, None] - positions[kept][None], axis=-1).min(1).max() < 0.8
     with pytest.raises(DataError, match="spacing_m"):
         SplitSettings(spacing_m=0.0)
+
+
+@pytest.mark.parametrize("text", ["[" * 50_000, '{"folds": [{"train": [' + "1" * 5000 + "]}]}"])
+def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path, text):
+    file = tmp_path / "split.json"
+    file.write_text(text)
+    with pytest.raises(DataError, match=r"split\.json: not a split file") as error:
+        read_split(file, 4)
+    assert len(str(error.value)) < 300 and "sys." not in str(error.value)
