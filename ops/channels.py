@@ -40,13 +40,16 @@ def channels(
             f"gains (B, N, 2), steering (N, A, 2) and delays (N,) are needed, "
             f"got {tuple(gains.shape)}, {tuple(steering.shape)}, {tuple(delays.shape)}"
         )
-    if gains.dtype != steering.dtype or delays.dtype != torch.float64:
+    known = gains.dtype in (torch.float32, torch.float64)
+    if not known or gains.dtype != steering.dtype or delays.dtype != torch.float64:
         raise TypeError(
-            f"gains and steering share a dtype and delays are float64, "
+            f"gains and steering are both float32 or both float64 and delays are float64, "
             f"got {gains.dtype}, {steering.dtype}, {delays.dtype}"
         )
+    if subcarriers < 0:
+        raise ValueError(f"{subcarriers} subcarriers are none: give 0 or more")
     tones = [first_hz, step_hz]
-    served = gains.dtype in (torch.float32, torch.float64) and not beyond_kernels(gains, steering, delays)
+    served = not beyond_kernels(gains, steering, delays)
     if served and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
         return channels_op(gains, steering, delays, tones, subcarriers)
     return summed(gains, steering, delays, tones, subcarriers)

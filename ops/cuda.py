@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import _native, calls, cuda_library, validation
-from gsparc.ops.geometry import Gaussians
+from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.operators import (
     Buffers,
     Poses,
@@ -106,7 +106,7 @@ def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, sett
         )
     buffers, means2d, radii, visible = out
     starts = count * tiles(settings) + 1
-    if n == 0:
+    if count * n == 0:
         zeros = [buffer.zero_() for buffer in buffers[:-1]]
         return Buffers._make([*zeros, buffers.entries.new_zeros(starts)]), means2d, radii, visible
     verdict = means.new_empty(2, dtype=torch.int64)
@@ -119,7 +119,7 @@ def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, sett
         capacity = _with_headroom(_capacities[key])
     else:
         status, capacity = verdict.tolist()
-        validation.raise_for_status(status)
+        validation.raise_for_status(status, Pose(*poses))
         _capacities[key] = max(capacity, _capacities.get(key, 0))
     check_memory(capacity, BYTES_PER_ENTRY)
     buffers = buffers._replace(entries=means.new_empty(starts + 2 * capacity, dtype=torch.int32))
@@ -135,10 +135,18 @@ def _by_gaussian(features: Tensor, poses: Poses) -> Tensor:
     return features.permute(1, 0, 2).reshape(1, n, samples * channels).contiguous()
 
 
+def _zero(gradients: Gaussians) -> None:
+    """Gradients where no kernel runs: of no Gaussians, or over no poses."""
+    for gradient in gradients:
+        if gradient is not None:
+            gradient.zero_()
+
+
 @kernel("composite", "cuda")
 def _composite(out: Any, means2d: Tensor, features: Tensor, **view: Any) -> None:
     rows = _by_gaussian(features, view["poses"])
-    run_on_plan("composite", rows, *out, sizes=rows.shape[2:], **view)
+    if len(view["poses"].positions) > 0:
+        run_on_plan("composite", rows, *out, sizes=rows.shape[2:], **view)
 
 
 @kernel("composite_backward", "cuda")
@@ -158,9 +166,11 @@ def _composite_backward(
     grads, _, grad_means2d = out
     grad_rows = torch.empty_like(rows)
     images = (image, transmittance, grad_image, grad_transmittance)
-    if n > 0:
+    if count * n > 0:
         tensors = (rows, *images, *grads, grad_rows, grad_means2d)
         run_on_plan("composite_backward", *tensors, sizes=rows.shape[2:], **view)
+    else:
+        _zero(grads)
     if count == 1:
         grad_rows = grad_rows.reshape(n, samples, channels).permute(1, 0, 2).contiguous()
     return grads, grad_rows, grad_means2d
@@ -178,8 +188,10 @@ def _weights(out: Any, **view: Any) -> Any:
 def _weights_backward(out: Any, grad_seen: Tensor, grad_total: Tensor, **view: Any) -> None:
     entries = capacity_of(view["buffers"], len(view["poses"].positions), view["settings"])
     check_memory(entries, out.means.element_size() * (_native.MOMENTS + 1))
-    if len(out.means) > 0:
+    if grad_seen.numel() > 0:
         run_on_plan("weights_backward", grad_seen, grad_total, *out, sizes=(1,), **view)
+    else:
+        _zero(out)
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.ops import backends
+from gsparc.ops import backends, validation
 from gsparc.ops.geometry import SphereGrid
-from gsparc.ops.transforms import carries_tangent
+from gsparc.ops.transforms import beyond_kernels
 
 
 class StalePlan(RuntimeError):
@@ -40,6 +40,8 @@ class FrozenPlan:
 
         Raises:
             StalePlan: if `version`, the field's counter now, is not the one this view was made from.
+            RuntimeError: under `torch.func` and in forward mode, where a constant would be no answer.
+            ValueError, TypeError: features of another number or dtype, or (on the CPU) not finite.
         """
         if version != self.version:
             raise StalePlan(
@@ -50,8 +52,18 @@ class FrozenPlan:
     @torch.no_grad()
     def compose(self, seen: Tensor) -> Tensor:
         """As `render`, of features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
-        if carries_tangent(seen):
-            raise RuntimeError("a frozen view has no derivatives: composite the plan it was made from")
+        if beyond_kernels(seen):
+            raise RuntimeError(
+                "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
+            )
+        if seen.dtype != self.buffers[-1].dtype:
+            raise TypeError(f"features are {seen.dtype}, this view was frozen in {self.buffers[-1].dtype}")
+        if seen.dim() not in (2, 3) or seen.shape[-2] != len(self.order):
+            count = len(self.order)
+            raise ValueError(
+                f"features must be ({count}, C) or (B, {count}, C) of those seen, got {tuple(seen.shape)}"
+            )
+        validation.check_features(seen, self.order)
         batch = seen if seen.dim() == 3 else seen.unsqueeze(0)
         samples, count, channels = batch.shape
         columns = batch.transpose(0, 1).reshape(count, samples * channels)

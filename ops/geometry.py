@@ -129,6 +129,11 @@ class SphereGrid:
         """Whether the columns close the circle, so that footprints wrap in azimuth."""
         return abs(self.width * self.azimuth_step - 2 * math.pi) < 1e-6
 
+    @property
+    def turn(self) -> float:
+        """Columns in a full circle: the width where they close it, if only nearly; as in csrc/pixels.h."""
+        return float(self.width) if self.periodic else 2 * math.pi / self.azimuth_step
+
     def elevations(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Row centres (H,) [rad]."""
         return self.first_elevation + self.elevation_step * torch.arange(self.height, dtype=dtype)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import _native, calls, validation
-from gsparc.ops.geometry import Gaussians
+from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.operators import (
     Buffers,
     Poses,
@@ -50,7 +50,8 @@ def _plan(out: Any, gaussians: Gaussians, ids: Tensor | None, poses: Poses, sett
     (buffers, *screen), means = out, gaussians.means
     tensors = (*contiguous((*gaussians, *poses, ids)), *buffers[:-1], *screen)
     sizes = (len(poses.positions), len(means))
-    validation.raise_for_status(calls.run("plan", means, *tensors, sizes=sizes, settings=settings))
+    status = calls.run("plan", means, *tensors, sizes=sizes, settings=settings)
+    validation.raise_for_status(status, Pose(*poses))
     entries = int(buffers.starts[-1])
     check_memory(entries, 4)
     buffers = buffers._replace(entries=means.new_empty(entries, dtype=torch.int32))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from gsparc.ops import backends, built, calls
 from gsparc.ops.operators import contiguous, empty_like, kernel, operator
-from gsparc.ops.transforms import beyond_kernels
+from gsparc.ops.transforms import beyond_kernels, full_precision
 
 
 def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
@@ -19,9 +19,13 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         encoded: (B, E), the same for all Gaussians.
         weight1, bias1: (N, E, H), (N, H).
         weight2, bias2: (N, H, C), (N, C).
+
+    Raises:
+        ValueError, TypeError: shapes, devices or dtypes that do not fit.
     """
-    plain = encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2)
-    if plain or encoded.dtype != weight1.dtype:
+    _check(encoded, Layers(weight1, bias1, weight2, bias2))
+    encoded = encoded.to(weight1.dtype)  # it comes in half precision from `torch.autocast`
+    if encoded.requires_grad or beyond_kernels(encoded, weight1, bias1, weight2, bias2):
         return products(encoded, weight1, bias1, weight2, bias2)
     kernels = built.kernels()
     fits = encoded.dtype in (torch.float32, torch.float64) and kernels is not None
@@ -34,6 +38,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
     return products(encoded, weight1, bias1, weight2, bias2)
 
 
+@full_precision
 def products(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, bias2: Tensor) -> Tensor:
     """The same (B, N, C) as matrix products; the reference."""
     count, width, hidden = weight1.shape
@@ -79,6 +84,26 @@ def _networks_backward(out: Layers, slope: Tensor, encoded: Tensor, layers: Laye
     else:
         for gradient in out:
             gradient.zero_()
+
+
+def _check(encoded: Tensor, layers: Layers) -> None:
+    """What a kernel reads by address alone (ValueError, TypeError)."""
+    first, bias1, second, bias2 = layers
+    fits = encoded.dim() == 2 and first.dim() == second.dim() == 3
+    if fits:
+        (count, inputs, hidden), outputs = first.shape, second.shape[2]
+        wanted = (inputs, (count, hidden), (count, hidden, outputs), (count, outputs))
+        fits = (encoded.shape[1], bias1.shape, second.shape, bias2.shape) == wanted
+    if not fits or not encoded.device == first.device == bias1.device == second.device == bias2.device:
+        got = ", ".join(f"{tuple(part.shape)} on {part.device}" for part in (encoded, *layers))
+        raise ValueError(
+            "encoded (B, E), weights (N, E, H) and (N, H, C) with biases (N, H) and (N, C) are needed "
+            f"on one device, got {got}"
+        )
+    alike = first.dtype == bias1.dtype == second.dtype == bias2.dtype
+    if not alike or (encoded.dtype != first.dtype and not torch.is_autocast_enabled(encoded.device.type)):
+        got = ", ".join(str(part.dtype) for part in (encoded, *layers))
+        raise TypeError(f"encoded, weights and biases share a dtype, got {got}; convert one of them")
 
 
 def _sizes(encoded: Tensor, layers: Layers) -> tuple[int, ...]:

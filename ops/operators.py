@@ -349,9 +349,7 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
 
 
 def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
-    """Image (K, H, W) of features (V, K) in the order of `freeze`, in its precision (TypeError)."""
-    if features.dtype != buffers[-1].dtype:
-        raise TypeError(f"features are {features.dtype}, this view was frozen in {buffers[-1].dtype}")
+    """Image (K, H, W) of features (V, K) in the order and precision of `freeze`."""
     features = features.contiguous()
     image = features.new_empty(features.shape[1], grid.height, grid.width)
     if image.numel():

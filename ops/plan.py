@@ -24,6 +24,7 @@ class Plan:
         radii: (P, N) [px], 0 where culled.
         visible: (P, N) bool.
         buffers: the backend's own tensors.
+        pose_trained: whether the poses it was given require gradients, of which there are none.
     """
 
     pose: Pose
@@ -34,6 +35,7 @@ class Plan:
     radii: Tensor
     visible: Tensor
     buffers: tuple[Tensor, ...]
+    pose_trained: bool = False
 
     @property
     def num_gaussians(self) -> int:

@@ -42,9 +42,11 @@ def _tangent_frame(
     direction: Tensor, east: Tensor, north: Tensor, cosine: Tensor, grid: SphereGrid
 ) -> tuple[Tensor, Tensor, Tensor]:
     # The footprint is the same in any frame of the plane: this one is carried along without turning, so
-    # that float32 loses nothing to the turn of east and north, which is infinite at the pole.
-    n, fixed = direction, (east.detach(), north.detach())
-    east, north = (e - n * (n * e).sum(-1, keepdim=True) for e in fixed)
+    # that float32 loses nothing to the turn of east and north, which is infinite at the pole. It is turned
+    # from where it stands to n, so that it stays orthonormal in every order of derivative.
+    n, still = direction, direction.detach()
+    halfway = (n + still) / (1 + (n * still).sum(-1, keepdim=True))
+    east, north = (e - halfway * (n * e).sum(-1, keepdim=True) for e in (east.detach(), north.detach()))
     return torch.full_like(cosine, 1 / grid.elevation_step), east, north
 
 
@@ -71,7 +73,7 @@ def _equirect_offsets(seen: Projected, grid: SphereGrid, shift: Tensor) -> tuple
     center = seen.center + shift
     column = torch.arange(grid.width, dtype=shift.dtype, device=shift.device) - center[:, :1]
     row = torch.arange(grid.height, dtype=shift.dtype, device=shift.device) - center[:, 1:]
-    turn = 2 * torch.pi / grid.azimuth_step
+    turn = grid.turn
     column = column - turn * torch.round(column.detach() / turn)
     size = (-1, grid.height, grid.width)
     p, q = column[:, None, :].expand(size).flatten(1), row[:, :, None].expand(size).flatten(1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -51,22 +53,37 @@ def make_plan(
         BackendUnavailable: if the backend was not built or does not serve this device.
     """
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
-    validation.transforms(gaussians, pose)
+    pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
+    validation.transforms(gaussians, pose, pose_trained)
     with torch.no_grad():
         chosen = backends.choose(backend, means.device)
         optics = Optics(projection, low_pass, compensate, near, cutoff)
         still = Gaussians._make(None if tensor is None else tensor.detach() for tensor in gaussians)
-        return chosen.make_plan(validation.strongest(still), ids, validation.poses(pose, means), grid, optics)
+        poses = validation.poses(pose, means)
+        plan = chosen.make_plan(validation.strongest(still), ids, poses, grid, optics)
+    return replace(plan, pose_trained=True) if pose_trained else plan
 
 
 def _planned(plan: Plan, *parameters: Tensor | None) -> Gaussians:
     """Validated Gaussians, as many as `plan` was made from (ValueError, TypeError)."""
     gaussians = validation.gaussians(*parameters, ids=None)  # type: ignore[arg-type, misc]
+    validation.transforms(gaussians, plan.pose, plan.pose_trained)
     if plan.num_gaussians != len(gaussians.means):
         raise ValueError(
             f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan again"
         )
     return gaussians
+
+
+def _trained(plan: Plan, *tensors: Tensor | None) -> bool:
+    """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
+    asked = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
+    if asked and plan.means2d.is_inference():
+        raise RuntimeError(
+            "this plan was made in torch.inference_mode, so nothing can be trained over it: plan outside, "
+            "or under torch.no_grad"
+        )
+    return asked
 
 
 def composite(
@@ -86,12 +103,12 @@ def composite(
 
     Raises:
         ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
+        RuntimeError: gradients over a plan that was made in `torch.inference_mode`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
     values = validation.features(features, means, plan.pose)
-    trained = any(tensor is not None and tensor.requires_grad for tensor in (*gaussians, features))
     plain = beyond_kernels(*gaussians, features)
-    trained = trained and torch.is_grad_enabled() and not plain
+    trained = _trained(plan, *gaussians, features) and not plain
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
     backend = reference_by_rows if plain else backends.named(plan.backend)
     image, transmittance = backend.composite(plan, gaussians, values, means2d)
@@ -143,9 +160,10 @@ def mean_weights(
     """Visible weight of each Gaussian for each pose, by a plan of the same Gaussians; differentiable.
 
     Raises:
-        ValueError, TypeError: as `composite`.
+        ValueError, TypeError, RuntimeError: as `composite`.
     """
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    _trained(plan, *gaussians)
     backend = reference_by_rows if beyond_kernels(*gaussians) else backends.named(plan.backend)
     return Weights(*backend.mean_weights(plan, gaussians))
 
@@ -168,9 +186,12 @@ def freeze(
 
     Raises:
         ValueError: a plan of more than one pose.
+        RuntimeError: under `torch.func` and in forward mode; a view has no derivatives.
     """
     if plan.num_poses != 1:
         raise ValueError(f"only the view of one pose can be frozen, this plan has {plan.num_poses}")
     gaussians = _planned(plan, means, quats, scales, opacities, extinctions)
+    if beyond_kernels(*gaussians):
+        raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")
     order, buffers = backends.named(plan.backend).freeze(plan, gaussians)
     return FrozenPlan(plan.grid, plan.backend, version, order, buffers)

@@ -76,15 +76,20 @@ def project(
     local = torch.where(present[:, None], local, torch.ones_like(local))
     distance = _norm(local)
     n = local / distance[:, None]
-    horizontal = _norm(n[:, :2])
-    on_axis = (horizontal == 0)[:, None]
+    on_axis = (n[:, :2] * n[:, :2]).sum(-1, keepdim=True) == 0
+    # By the longer side first: slopes of the root and of atan2 have squares of 1e-20, no float32 numbers.
+    longer = torch.where(on_axis, 1.0, n[:, :2].detach().abs().amax(-1, keepdim=True))
+    sides = n[:, :2] / longer
+    length = _norm(sides)[:, None]
+    horizontal = (longer * length)[:, 0]
     forward = torch.tensor([1.0, 0.0], dtype=means.dtype, device=means.device)
-    cos_sin = torch.where(on_axis, forward, n[:, :2] / torch.where(on_axis, 1.0, horizontal[:, None]))
+    cos_sin = torch.where(on_axis, forward, sides / torch.where(on_axis, 1.0, length))
     zero = torch.zeros_like(horizontal)
     east = torch.stack([-cos_sin[:, 1], cos_sin[:, 0], zero], -1)
     north = torch.stack([-n[:, 2] * cos_sin[:, 0], -n[:, 2] * cos_sin[:, 1], horizontal], -1)
     elevation = torch.atan2(n[:, 2], horizontal)
-    azimuth = torch.where(on_axis[:, 0], 0.0, torch.atan2(n[:, 1], torch.where(on_axis[:, 0], 1.0, n[:, 0])))
+    x, y = torch.where(on_axis, forward, sides).unbind(-1)
+    azimuth = torch.atan2(y, x)
 
     frame = PROJECTIONS[optics.projection].frame
     to_column, east, north = frame(n, east, north, horizontal, grid)

@@ -1,4 +1,7 @@
-"""The `reference` backend: plans and composites with dense tensors and autograd."""
+"""The `reference` backend: plans and composites with dense tensors and autograd.
+
+Half precision of `torch.autocast` is switched off here; a backward pass must itself be outside of it.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,10 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import Optics
+from gsparc.ops.transforms import full_precision
 
 
+@full_precision
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Depth order and radii; compositing evaluates the footprints again, differentiably."""
     validation.finite(gaussians, pose)
@@ -31,13 +36,14 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
         radii.append(torch.where(visible[-1], reference.radii(seen, strongest, optics), 0.0))
     return Plan(
         *(pose, grid, optics, "reference"),
-        means2d=torch.stack(centers),
-        radii=torch.stack(radii),
-        visible=torch.stack(visible),
-        buffers=(torch.stack(orders),),
+        means2d=_stacked(centers, means.new_empty(0, len(means), 2)),
+        radii=_stacked(radii, means.new_empty(0, len(means))),
+        visible=_stacked(visible, means.new_empty(0, len(means), dtype=torch.bool)),
+        buffers=(_stacked(orders, means.new_empty(0, len(means), dtype=torch.int64)),),
     )
 
 
+@full_precision
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
@@ -48,9 +54,13 @@ def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tenso
         images.append(torch.einsum("nu,bnc->bcu", weights, values[:, order]))
         transmittances.append(transmittance)
     size = (plan.grid.height, plan.grid.width)
-    return torch.cat(images).unflatten(-1, size), torch.stack(transmittances).unflatten(-1, size)
+    none = _nothing(*gaussians, features)
+    image = torch.cat(images) if images else none.expand(0, features.shape[2], size[0] * size[1])
+    transmittance = _stacked(transmittances, none.expand(0, size[0] * size[1]))
+    return image.unflatten(-1, size), transmittance.unflatten(-1, size)
 
 
+@full_precision
 def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Sums over pixels of alpha T and of alpha, both (P, N)."""
     seen, total = [], []
@@ -60,7 +70,8 @@ def weight_sums(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
         inverse = torch.argsort(plan.buffers[0][index])
         seen.append(weights.sum(1)[inverse])
         total.append(alpha.sum(1)[inverse])
-    return torch.stack(seen), torch.stack(total)
+    none = _nothing(*gaussians).expand(0, len(gaussians.means))
+    return _stacked(seen, none), _stacked(total, none)
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
@@ -69,6 +80,7 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 
+@full_precision
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
     """Depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
     no_shift = torch.zeros_like(plan.means2d)
@@ -76,9 +88,20 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return plan.buffers[0][0], (weights,)
 
 
+@full_precision
 def thaw(grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor) -> Tensor:
     """Image (K, H, W) of features (N, K) in the order of `freeze`."""
     return (features.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
+
+
+def _stacked(parts: list[Tensor], none: Tensor) -> Tensor:
+    """What there is for each pose (P, ...); `none` (0, ...) where there is no pose."""
+    return torch.stack(parts) if parts else none
+
+
+def _nothing(*tensors: Tensor | None) -> Tensor:
+    """0, a function of the tensors: their gradient is 0 rather than absent."""
+    return torch.stack([t[:0].sum() for t in tensors if t is not None]).sum()
 
 
 def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -14,6 +14,9 @@ from gsparc.ops.settings import FAINTEST
 class Raster:
     """A rendered batch of B samples seen from P poses (P = 1 when the pose is shared, else P = B).
 
+    Image and transmittance are differentiable. Radii, visible and means2d belong to the plan: constants,
+    whose derivative by a Gaussian is 0 in every mode.
+
     Attributes:
         image: (B, C, H, W), sum over Gaussians of transmittance before it, times alpha, times feature.
         transmittance: (P, H, W), what is left behind all Gaussians.
@@ -48,6 +51,6 @@ class Weights:
 def visible_share(seen: Tensor, total: Tensor) -> Tensor:
     """`Weights.share` of the sums over pixels of alpha T and of alpha."""
     bright = total > FAINTEST
-    with torch.no_grad():
-        faint = torch.where(total > 0, seen / torch.where(total > 0, total, 1.0), 0.0)
+    part, whole = seen.detach(), total.detach()  # `no_grad` would let tangents through
+    faint = torch.where(whole > 0, part / torch.where(whole > 0, whole, 1.0), 0.0)
     return torch.where(bright, seen / torch.where(bright, total, 1.0), faint)

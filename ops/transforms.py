@@ -1,13 +1,22 @@
-"""What torch's function transforms do to a tensor that reaches the rasterizer: tangents, vmap, nesting."""
+"""What torch does to a tensor that reaches the rasterizer: tangents, vmap, nesting, half precision."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
 from torch._C import _functorch
 from torch.autograd import forward_ad
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def full_precision(function: _Function) -> _Function:
+    """`function` in the precision of its tensors, as the kernels are, under `torch.autocast` too."""
+    exact = torch.autocast("cpu", enabled=False)(torch.autocast("cuda", enabled=False)(function))
+    return cast(_Function, exact)
 
 
 def carries_tangent(*values: Any) -> bool:
@@ -26,6 +35,15 @@ def mapped(*values: Any) -> bool:
                 return True
             value = _functorch.get_unwrapped(value)
     return False
+
+
+def unwrapped(value: Tensor, axis: int) -> tuple[Tensor, int]:
+    """The numbers behind a tensor, hidden axes included, and where its axis `axis` is among them."""
+    while _functorch.is_functorch_wrapped_tensor(value):
+        hidden = _functorch.maybe_get_bdim(value)
+        axis += 0 <= hidden <= axis
+        value = _functorch.get_unwrapped(value)
+    return value, axis
 
 
 def transforming() -> bool:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from gsparc.ops import built
 from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, SKEW, WIDEST
-from gsparc.ops.transforms import carries_tangent, mapped, transforming
+from gsparc.ops.transforms import carries_tangent, full_precision, mapped, unwrapped
 
 
 class UnsoundGaussian(ValueError):
@@ -50,11 +52,10 @@ def gaussians(
     return given
 
 
-def transforms(gaussians: Gaussians, pose: Pose) -> None:
+def transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> None:
     """Refuse a pose whose gradient is asked for, which would be none, and Gaussians under `torch.vmap`."""
     ends = (pose.position, pose.rotation)
-    wanted = torch.is_grad_enabled() and any(part.requires_grad for part in ends)
-    if wanted or carries_tangent(*ends):
+    if (pose_trained and torch.is_grad_enabled()) or carries_tangent(*ends):
         raise ValueError("a pose has no gradients here: detach it, or move the Gaussians instead")
     if mapped(*gaussians, *ends):
         raise ValueError(
@@ -64,11 +65,8 @@ def transforms(gaussians: Gaussians, pose: Pose) -> None:
 
 def finite(gaussians: Gaussians, pose: Pose) -> None:
     """Check that parameters and poses are finite and in range (ValueError names the first Gaussian)."""
-    turns = pose.rotation.mT @ pose.rotation - torch.eye(3).to(pose.rotation)
-    right_handed = torch.linalg.det(pose.rotation) > 0
-    near = (pose.position.abs() <= FARTHEST).all() & (turns.abs() <= SKEW).all() & right_handed.all()
-    if not bool(near):  # NaN is not either
-        raise_for_pose()
+    if not bool((_wrongness(pose) <= 1).all()):  # NaN is not either
+        raise_for_pose(pose)
     means, quats, scales, strongest, _ = gaussians
     valid = {
         "means": (means.abs() <= FARTHEST).all(-1),
@@ -81,6 +79,16 @@ def finite(gaussians: Gaussians, pose: Pose) -> None:
             raise_for(name, int(torch.argmin(ok.to(torch.int8))))
 
 
+@full_precision
+def _wrongness(pose: Pose) -> Tensor:
+    """How far P poses are from sound ones, (P,) in units of what `sound_pose` of csrc/pose.h allows."""
+    rotation, still = pose.rotation, torch.eye(3).to(pose.rotation)
+    far = pose.position.abs().amax(1) / FARTHEST
+    products = (rotation.mT @ rotation - still).abs().flatten(1).amax(1) / SKEW
+    across = torch.linalg.cross(rotation[:, 1], rotation[:, 2]) - rotation[:, 0]  # a mirror's is not 0
+    return torch.stack([far, products, across.abs().amax(1) / (2 * SKEW)]).amax(0)
+
+
 def strongest(gaussians: Gaussians) -> Gaussians:
     """Gaussians with max(opacity, extinction) as opacity; a negative one stays, to be found invalid."""
     opacities, extinctions = gaussians.opacities, gaussians.extinctions
@@ -91,10 +99,10 @@ def strongest(gaussians: Gaussians) -> Gaussians:
     return gaussians._replace(opacities=larger, extinctions=None)
 
 
-def raise_for_status(status: int) -> None:
+def raise_for_status(status: int, pose: Pose) -> None:
     """Raise for a plan's status: UNSOUND_POSE, EQUAL_IDS, 4 * Gaussian + parameter, or -1 if valid."""
     if status == built.kernels().UNSOUND_POSE:
-        raise_for_pose()
+        raise_for_pose(pose)
     if status == built.kernels().EQUAL_IDS:
         raise_for_ids()
     if status >= 0:
@@ -113,11 +121,12 @@ def raise_for(name: str, index: int) -> None:
     )
 
 
-def raise_for_pose() -> None:
-    """Raise for a pose that is none (ValueError)."""
+def raise_for_pose(pose: Pose) -> None:
+    """Raise for that of P poses which is least a pose (ValueError)."""
+    index = int(torch.argmax(_wrongness(pose).nan_to_num(nan=math.inf)))
     raise ValueError(
-        f"a pose is not finite, not within {FARTHEST:.0e} m, or its matrix is no rotation; "
-        "look at the positions and rotations of this batch"
+        f"pose {index} is not finite, not within {FARTHEST:.0e} m, or its matrix is no rotation; "
+        "look at its position and its rotation"
     )
 
 
@@ -133,10 +142,7 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
         raise ValueError(
             f"features must be ({means.shape[0]}, C) or (B, {means.shape[0]}, C), got {tuple(values.shape)}"
         )
-    looked_at = values.device.type == "cpu" and not transforming()  # a GPU is not waited for: NaN stays NaN
-    if looked_at and not bool(torch.isfinite(values).all()):
-        bad = (~torch.isfinite(values)).any(-1)
-        raise_for("features", int(bad.nonzero()[0, -1]))
+    check_features(values)
     poses = len(pose)
     if values.dim() == 2:
         return values.expand(poses, *values.shape)
@@ -145,8 +151,23 @@ def features(values: Tensor, means: Tensor, pose: Pose) -> Tensor:
     return values
 
 
+def check_features(values: Tensor, rows: Tensor | None = None) -> None:
+    """Check that features (..., N, C) on the CPU are finite (UnsoundGaussian; of `rows` (N,) where given)."""
+    if values.device.type != "cpu":  # a GPU is not waited for: NaN stays NaN
+        return
+    numbers, axis = unwrapped(values, values.dim() - 2)
+    if not math.isfinite(numbers.sum().item()):  # one pass; a sum may overflow where no number does
+        bad = (~torch.isfinite(numbers)).movedim(axis, 0).flatten(1).any(1)
+        if bool(bad.any()):
+            index = torch.argmax(bad.to(torch.int8))
+            raise_for("features", int(index if rows is None else rows[index]))
+
+
 def poses(pose: Pose, means: Tensor) -> Pose:
-    """Poses (P,) in the Gaussians' dtype and on their device, always batched; the plan checks values."""
+    """Poses (P,) in the Gaussians' dtype, on their device and batched (TypeError); the plan checks values."""
+    for name, part in vars(pose).items():
+        if part.dtype not in (torch.float32, torch.float64):
+            raise TypeError(f"a pose needs float32 or float64, got a {name} in {part.dtype}; convert it")
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
     return Pose(position, rotation)

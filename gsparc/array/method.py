@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import time
 from typing import Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from gsparc.methods.method import FitContext, FitReport, Method, Prediction, Pre
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
 from gsparc.methods.target_rows import to_real, training_targets
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
 from gsparc.physics.bartlett import SpectrumRenderer
@@ -80,21 +80,21 @@ class ArrayField(PredictsVariance):
         rows = np.sort(np.concatenate([fold.train, fold.val])) if self.refit else fold.train
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
-        begin = time.perf_counter()
+        watch = TimeBudget()
         if len(rows) > self.rows:
             rows = np.sort(np.random.default_rng([self.seed, 5]).permutation(rows)[: self.rows])
             log.info("%s: training on %d of the spectra", self.name, len(rows))
-        found, recovery_s = recovered(data, rows, platform_cache() if self.cache else None, self.seed)
-        elapsed = time.perf_counter() - begin
+        found, recovery = recovered(data, rows, platform_cache() if self.cache else None, self.seed)
+        elapsed, recovery_s = watch.spent, recovery.wall
         report(found, data, rows, context.run_dir / "array_recovery.csv")
-        begin = time.perf_counter()
+        watch = TimeBudget()
         self._learn(data, rows, found.vectors)
-        seconds = recovery_s + time.perf_counter() - begin
+        seconds = recovery_s + watch.spent
         notes = [
             f"{self.name}: phase retrieval {recovery_s:.1f} s (this run {elapsed:.1f} s), training "
             f"{seconds - recovery_s:.1f} s, {int(found.suspect.sum())} suspect spectra"
         ]
-        return FitReport(seconds, tuple(notes))
+        return FitReport(seconds, tuple(notes), "processor" if found.hurried.any() else None)
 
     def _learn(self, data: Measurements, rows: np.ndarray, vectors: np.ndarray) -> None:
         site = data.site

@@ -7,7 +7,6 @@ to a global phase and, for arrays symmetric about a point, its twin `conj(h)` in
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +15,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.schema import Site
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.physics.array_response import lags
 
 log = logging.getLogger(__name__)
@@ -40,6 +40,7 @@ class Recovered:
         residual: (n,) root mean square over pixels of `|A^H h|^2 - image^2`, the part inside the lags.
         floor: (n,) the same for the part that no array vector can explain.
         expected: (n,) the same as quantisation alone would make it.
+        hurried: (n,) bool: seconds ended the search, so that another machine's result may differ.
     """
 
     vectors: np.ndarray
@@ -47,6 +48,7 @@ class Recovered:
     residual: np.ndarray
     floor: np.ndarray
     expected: np.ndarray
+    hurried: np.ndarray
 
     @property
     def suspect(self) -> np.ndarray:
@@ -65,9 +67,10 @@ def recover(
         positions: (n, 3) [m] of the transmitter; neighbours start each other's search.
         seed: of the random starts.
         budget_s: every row is solved once from its neighbours or from random starts; no row is restarted
-            after this many seconds (spectra of another array never converge) [s].
+            after this many seconds of the processor, because runs of either clock share the result (spectra
+            of another array never converge) [s].
     """
-    begin = time.perf_counter()
+    budget, hurried = TimeBudget(budget_s, "processor"), np.zeros(len(images), dtype=bool)
     problem = _Problem.of(site, images)
     generator = torch.Generator().manual_seed(seed)
     n = len(images)
@@ -84,8 +87,10 @@ def recover(
         unsolved = order[cost[order] > enough[order]]
         if turn == 0:
             unsolved = unsolved[: -(-n // SEEDED)]
-        late = time.perf_counter() - begin > budget_s
-        if not len(unsolved) or (late and turn > 1):
+        if not len(unsolved):
+            break
+        if turn > 1 and budget.over():
+            hurried[unsolved.numpy()] = True
             break
         for rows in unsolved.split(max(1, 1536 // starts)):
             keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
@@ -102,7 +107,7 @@ def recover(
         log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
     for rows in every.split(512):
         keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), FINAL_ITERATIONS))
-    return problem.result(state, cost)
+    return problem.result(state, cost, hurried)
 
 
 def _solved_neighbours(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
@@ -179,11 +184,12 @@ class _Problem:
         error = error - 2 * o * self.z1[rows] - o.square() * self.z0
         return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
 
-    def result(self, state: Tensor, cost: Tensor) -> Recovered:
+    def result(self, state: Tensor, cost: Tensor, hurried: np.ndarray) -> Recovered:
         m = len(self.forms) // 2
         vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
-        return Recovered(vectors, offset, *(v.numpy() for v in (cost.sqrt(), self.floor, self.expected)))
+        residual, floor, expected = (v.numpy() for v in (cost.sqrt(), self.floor, self.expected))
+        return Recovered(vectors, offset, residual, floor, expected, hurried)
 
 
 def _search(

@@ -6,8 +6,7 @@ The minimum-norm emission of each vector is regressed on kernel features of the 
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from gsparc.field.frozen import seen_by_array
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.methods.target_rows import to_real, training_targets
+from gsparc.methods.time_budget import Spent, TimeBudget
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
 
@@ -39,14 +39,16 @@ class Vectors:
         rows: (n,) of the dataset.
         vectors: (n, M) complex128.
         prior: features of the emission.
-        elapsed_s, training_s: time of phase retrieval in this run, and when it was computed [s].
+        elapsed, training: time of phase retrieval in this run, and when it was computed.
+        hurried: whether seconds ended it.
     """
 
     rows: np.ndarray
     vectors: np.ndarray
     prior: Prior
-    elapsed_s: float
-    training_s: float
+    elapsed: Spent
+    training: Spent
+    hurried: bool
 
 
 class ThroughArray:
@@ -57,16 +59,18 @@ class ThroughArray:
         assert task.receiver is not None
         found = aligned_vectors(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         solve = partial(start, data=task.data, found=found, receiver=task.receiver)
-        return Start(found.prior, None, solve, found.training_s, found.elapsed_s)
+        return Start(
+            found.prior, None, solve, astuple(found.training), astuple(found.elapsed), found.hurried
+        )  # fmt: skip
 
 
 def aligned_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Vectors:
     """Retrieve the vectors of the given rows (cached where known) and align phases and twins."""
     site = data.site
     assert site.array is not None and site.grid is not None and site.wavelength is not None
-    begin = time.perf_counter()
-    found, training_s = recovered(data, rows, platform_cache(), seed)
-    elapsed = time.perf_counter() - begin
+    watch = TimeBudget()
+    found, training = recovered(data, rows, platform_cache(), seed)
+    elapsed = watch.counted
     report(found, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(site.array, site.grid, site.wavelength).numpy()
     images = to_real(training_targets(data, rows), "spectrum")
@@ -76,7 +80,7 @@ def aligned_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: in
     if len(rows) > anchors:
         places = places[np.sort(np.random.default_rng(seed).choice(len(rows), anchors, replace=False))]
     prior = Prior(torch.from_numpy(places.astype(np.float32)), kernel.length, max(kernel.noise, MIN_NOISE))
-    return Vectors(rows, process.vectors, prior, elapsed, training_s)
+    return Vectors(rows, process.vectors, prior, elapsed, training, bool(found.hurried.any()))
 
 
 @torch.no_grad()

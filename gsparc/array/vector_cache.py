@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import logging
-import time
 from dataclasses import fields
 from pathlib import Path
 
@@ -15,18 +14,19 @@ from gsparc.array.phase_retrieval import Recovered, recover
 from gsparc.data.files import whole_file
 from gsparc.data.schema import Measurements, Site
 from gsparc.methods.target_rows import training_targets
+from gsparc.methods.time_budget import Spent, TimeBudget
 
 log = logging.getLogger(__name__)
 
 AT_ONCE = 1024  # rows solved between two writes
-VERSION = 2  # raise it when phase retrieval changes its results
+VERSION = 3  # raise it when phase retrieval changes its results
 NAMED = 8  # suspect images named in a log line
 
 
 def recovered(
     data: Measurements, rows: np.ndarray, cache: Path | None, seed: int = 0
-) -> tuple[Recovered, float]:
-    """Array vectors of the given rows, cached where known, and the seconds they took when computed [s].
+) -> tuple[Recovered, Spent]:
+    """Array vectors of the given rows, cached where known, and the seconds they took when computed.
 
     Only these rows are read: vectors of a test set are never computed for a training run. The cache is
     written after every `AT_ONCE` rows, so that an interrupted run continues there.
@@ -39,20 +39,20 @@ def recovered(
     """
     path = None if cache is None else Path(cache) / f"array-v{VERSION}" / f"{_key(data.site)}.npz"
     known = _read(path, len(data))
-    have = np.zeros(len(data), dtype=bool) if known is None else known["seconds"] >= 0
+    have = np.zeros(len(data), dtype=bool) if known is None else known["wall"] >= 0
     missing = rows[~have[rows]]
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
-        begin = time.perf_counter()
+        watch = TimeBudget()
         found = recover(data.site, training_targets(data, part), data.tx[part], seed)
-        spent = time.perf_counter() - begin
+        spent = vars(watch.counted)
         known = known or _empty(len(data), found)
         for name, values in known.items():
-            values[part] = spent / len(part) if name == "seconds" else getattr(found, name)
+            values[part] = spent[name] / len(part) if name in spent else getattr(found, name)
         if path is not None:
             _write(path, known)
     assert known is not None
     result = Recovered(**{f.name: known[f.name][rows] for f in fields(Recovered)})
-    return result, float(known["seconds"][rows].sum())
+    return result, Spent(*(float(known[f.name][rows].sum()) for f in fields(Spent)))
 
 
 def report(result: Recovered, data: Measurements, rows: np.ndarray, path: Path) -> None:
@@ -90,7 +90,7 @@ def _empty(count: int, like: Recovered) -> dict[str, np.ndarray]:
     arrays = {f.name: getattr(like, f.name) for f in fields(Recovered)}
     return {
         **{k: np.zeros((count, *v.shape[1:]), dtype=v.dtype) for k, v in arrays.items()},
-        "seconds": np.full(count, -1.0),
+        **{f.name: np.full(count, -1.0) for f in fields(Spent)},
     }
 
 
@@ -99,7 +99,7 @@ def _read(path: Path | None, count: int) -> dict[str, np.ndarray] | None:
         return None
     try:
         with np.load(path, allow_pickle=False) as file:
-            known = {name: file[name] for name in (*(f.name for f in fields(Recovered)), "seconds")}
+            known = {f.name: file[f.name] for f in (*fields(Recovered), *fields(Spent))}
     except Exception as error:  # whatever a damaged archive raises: it is only a cache
         log.warning("cached array vectors are not readable and are computed anew: %s (%s)", path, error)
         return None

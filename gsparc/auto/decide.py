@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import Explains, FitContext, Method
+from gsparc.methods.time_budget import Clock, weaker
 
 Switch = bool | Literal["auto", "splat"]
 SPLAT: Literal["splat"] = "splat"
@@ -51,12 +52,14 @@ class Decision:
         on: whether it is computed.
         reason: one clause, with the measurement that decided.
         seconds: what deciding cost [s].
+        limited_by: the clock whose seconds ended a trial.
     """
 
     effect: str
     on: bool
     reason: str
     seconds: float = 0.0
+    limited_by: Clock | None = None
 
     def __str__(self) -> str:
         cost = f" ({self.seconds:.1f} s to find out)" if self.seconds >= 0.1 else ""
@@ -170,7 +173,9 @@ def nmse_of(method: Method, data: Measurements, rows: np.ndarray) -> float:
     return float(miss / batch.target.abs().square().sum())
 
 
-def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
+def probe_phase(
+    trial: Method, rival: Method, data: Measurements, fold: Fold, seed: int, clock: Clock = "wall"
+) -> Decision:
     """Let a small coherent search and the Gaussian process predict a held-out fifth of the training rows.
 
     Args:
@@ -178,8 +183,9 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
         rival: an unfitted interpolator.
         data, fold: only training rows are looked at.
         seed: of the draw.
+        clock: of the trial's seconds.
     """
-    started = time.perf_counter()
+    started, limited = time.perf_counter(), None
     dense = spacing_in_wavelengths(data, fold.train)
     inner = fifths(fold.train, seed)[0]
     if not (data.target[inner.train].any() and data.target[inner.test].any()):
@@ -187,14 +193,14 @@ def probe_phase(trial: Method, rival: Method, data: Measurements, fold: Fold, se
         return Decision("phase", False, silent, time.perf_counter() - started)
     errors = []
     for method in (trial, rival):
-        method.fit(data, inner, FitContext())
+        limited = weaker(limited, method.fit(data, inner, FitContext(budget_clock=clock)).limited_by)
         errors.append(nmse_of(method, data, inner.test))
     reason = (
         f"neighbours are {dense:.2f} wavelengths apart"
         f"{' (dense enough to interpolate)' if dense < DENSE else ''}; on a held-out fifth of the training "
         f"data a short search leaves NMSE {errors[0]:.3f}, the Gaussian process {errors[1]:.3f}"
     )
-    return Decision("phase", errors[0] < errors[1], reason, time.perf_counter() - started)
+    return Decision("phase", errors[0] < errors[1], reason, time.perf_counter() - started, limited)
 
 
 def probe_array(candidate: Method, data: Measurements, fold: Fold, seed: int) -> Decision:
@@ -218,7 +224,7 @@ def contest_array(trial: Method, rival: Method, data: Measurements, fold: Fold, 
         data, fold: only training rows are looked at.
         seed: of the draw.
     """
-    started, rows = time.perf_counter(), fold.train
+    started, rows, limited = time.perf_counter(), fold.train, None
     apart = spacing_in_wavelengths(data, rows)
     if apart < LOOSE or len(rows) < 10:
         return Decision("array", True, "neighbours are near enough to tell of one another")
@@ -230,10 +236,10 @@ def contest_array(trial: Method, rival: Method, data: Measurements, fold: Fold, 
     batch, errors = data.batch(inner.test), []
     for method in (trial, rival):
         with tempfile.TemporaryDirectory() as aside:  # what a trial writes is no part of the run
-            method.fit(data, inner, FitContext(Path(aside)))
+            limited = weaker(limited, method.fit(data, inner, FitContext(Path(aside))).limited_by)
         errors.append(float((method.predict(batch.tx, batch.rx).mean - batch.target).square().mean()))
     reason = (
         f"neighbours are {apart:.2f} wavelengths apart; on a held-out fifth of the training spectra the "
         f"array's squared error is {errors[0]:.4f}, the Gaussian process's {errors[1]:.4f}"
     )
-    return Decision("array", errors[0] < errors[1], reason, time.perf_counter() - started)
+    return Decision("array", errors[0] < errors[1], reason, time.perf_counter() - started, limited)

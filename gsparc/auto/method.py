@@ -28,6 +28,7 @@ from gsparc.methods.method import (
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import method_class
+from gsparc.methods.time_budget import Clock, weaker
 from gsparc.ops import Pose
 from gsparc.training.splatting import LearnedField
 
@@ -77,6 +78,11 @@ class Gsparc(LearnedField):
         self.decisions: tuple[Decision, ...] = ()
 
     @property
+    def takes_budget(self) -> bool:  # type: ignore[override]
+        """Whether what was chosen does."""
+        return self._chosen is None or self._models[self._chosen].takes_budget
+
+    @property
     def effects(self) -> str:  # type: ignore[override]
         """The effects that are computed, for `summary.json`."""
         response, companion, directions = self.settings.response, self._companion, ""
@@ -90,12 +96,16 @@ class Gsparc(LearnedField):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Decide, then train what was decided on; the probe's time is part of the bill."""
-        self.site = data.site
-        self.decisions = self._decide(data, fold, context.seed)
+        self.site, budget = data.site, context.time_budget()
+        self.decisions = self._decide(data, fold, context)
         for decision in self.decisions:
             log.info("%s", decision)
         others = (d.effect for d in self.decisions if d.on and getattr(self.switches, d.effect) != SPLAT)
         self._chosen = self._named(next(others, None), data.site)
+        if context.budget_s is not None:
+            if budget.seconds - budget.spent < LEAST_BUDGET_S:
+                log.warning("budget_s=%g: deciding took %.1f s of them", context.budget_s, budget.spent)
+            context = replace(context, budget_s=max(budget.seconds - budget.spent, LEAST_BUDGET_S))
         if self._chosen is None:
             report = super().fit(data, fold, context)
         else:
@@ -106,7 +116,9 @@ class Gsparc(LearnedField):
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
             self._weigh_directional()
-        return replace(report, seconds=report.seconds + sum(d.seconds for d in self.decisions))
+        limited = weaker(report.limited_by, *(d.limited_by for d in self.decisions))
+        seconds = report.seconds + sum(d.seconds for d in self.decisions)
+        return replace(report, seconds=seconds, limited_by=limited)
 
     @staticmethod
     def _named(effect: str | None, site: Site) -> str | None:
@@ -121,9 +133,6 @@ class Gsparc(LearnedField):
                 f"ckpt_path: effects.{self._chosen} trains in one piece (recovered vectors are cached); "
                 "start again without ckpt_path"
             )
-        if context.budget_s is not None:
-            left = context.budget_s - sum(d.seconds for d in self.decisions)
-            context = replace(context, budget_s=max(left, LEAST_BUDGET_S))
         return chosen.fit(data, fold, context)
 
     def _weigh_directional(self) -> None:
@@ -139,7 +148,8 @@ class Gsparc(LearnedField):
         elif weight > UNUSED:
             self._companion = DirectionalEnsemble(self._directional, weight, self._companion)
 
-    def _decide(self, data: Measurements, fold: Fold, seed: int) -> tuple[Decision, ...]:
+    def _decide(self, data: Measurements, fold: Fold, context: FitContext) -> tuple[Decision, ...]:
+        seed, clock = context.seed, context.budget_clock
         hidden = self.settings.emission.hidden
         splatting = f"emission.hidden={hidden}" if hidden else None
         antennas = data.target.shape[1] if data.site.kind == "csi" else 1
@@ -150,9 +160,9 @@ class Gsparc(LearnedField):
         if directions.on:
             directions = self._fit_directional(data, fold)
         if directions.on and sources:
-            phase = self._search_beside(data, fold, seed)
+            phase = self._search_beside(data, fold, seed, clock)
         elif phase.on and self.switches.phase == "auto":
-            phase = decide.probe_phase(self._probe, method_class("gp")(), data, fold, seed)
+            phase = decide.probe_phase(self._probe, method_class("gp")(), data, fold, seed, clock)
         if array.on and self.switches.array == "auto":
             candidate = self._models[self._named("array", data.site) or ""]
             array = decide.probe_array(candidate, data, fold, seed)
@@ -164,18 +174,19 @@ class Gsparc(LearnedField):
         """The array's vectors explain the spectra; whether they predict held-out spectra."""
         trial = copy.deepcopy(self._models["array"])
         contest = decide.contest_array(trial, method_class("gp")(), data, fold, seed)
-        return replace(array if contest.on else contest, seconds=array.seconds + contest.seconds)
+        seconds = array.seconds + contest.seconds
+        return replace(array if contest.on else contest, seconds=seconds, limited_by=contest.limited_by)
 
-    def _search_beside(self, data: Measurements, fold: Fold, seed: int) -> Decision:
+    def _search_beside(self, data: Measurements, fold: Fold, seed: int, clock: Clock) -> Decision:
         """Whether a search is worth its time beside measured directions."""
         started = time.perf_counter()
-        error, self._ratio = combine.held_out_ratio(self._probe, data, fold.train, seed)
+        error, self._ratio, limited = combine.held_out_ratio(self._probe, data, fold.train, seed, clock)
         reason = (
             f"short searches leave NMSE {error:.3f} of held-out channels, "
             f"{self._ratio:.1f} times their leave-one-out error"
         )
         on = error < HOPELESS or self.switches.phase is True
-        return Decision("phase", on, reason, time.perf_counter() - started)
+        return Decision("phase", on, reason, time.perf_counter() - started, limited)
 
     def _fit_directional(self, data: Measurements, fold: Fold) -> Decision:
         """Sources of measured directions, used where they predict left-out channels at all."""

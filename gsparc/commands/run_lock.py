@@ -20,7 +20,7 @@ _held: list[FileLock] = []  # by the command that is running
 
 
 class InUse(BaseException):
-    """Another run writes into the folder; no `Exception`, which Hydra makes a warning of in a callback."""
+    """The folder is not ours to write to; no `Exception`, which Hydra makes a warning of in a callback."""
 
 
 class RunLock(Callback):
@@ -32,7 +32,7 @@ class RunLock(Callback):
 
     def on_multirun_start(self, config: DictConfig, **unused: Any) -> None:
         """Hold the multirun's folder, and with it those of its jobs."""
-        hold(_folder(config, "hydra.sweep.dir"))
+        hold(_folder(config, "hydra.sweep.dir"), jobs=True)
 
 
 def _folder(config: DictConfig, key: str) -> Path:
@@ -40,13 +40,33 @@ def _folder(config: DictConfig, key: str) -> Path:
     return Path(str(OmegaConf.select(config, key)))
 
 
-def hold(folder: Path) -> None:
+def hold(folder: Path, jobs: bool = False) -> None:
     """Lock a folder until `release`; the system does so too when the process ends, however it ends.
 
+    Args:
+        folder: made where there is none.
+        jobs: whether folders in it will be written to as well.
+
     Raises:
-        InUse: another process has locked it; says which, since when, with which command.
+        InUse: another process has locked it, a folder it lies in, or, with `jobs`, one in it: says which,
+            since when, with which command. Or it cannot be locked.
     """
-    folder.mkdir(parents=True, exist_ok=True)
+    since = datetime.now().isoformat(sep=" ", timespec="seconds")
+    who = f"process {os.getpid()} on {socket.gethostname()} since {since}: {' '.join(sys.argv)}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        _held.append(_locked(folder))
+        (folder / HOLDER).write_text(who, encoding="utf-8")  # before looking: of two, one sees the other
+        near = [parent / HOLDER for parent in folder.resolve().parents]
+        for other in near + (sorted(folder.rglob(HOLDER)) if jobs else []):
+            if other.exists() and other.parent != folder:
+                _locked(other.parent).release()
+    except (OSError, NotImplementedError) as error:
+        raise InUse(f"{folder}: cannot be locked ({error}); give another hydra.run.dir=...") from None
+
+
+def _locked(folder: Path) -> FileLock:
+    """Its lock, held."""
     lock = FileLock(folder / LOCK)
     try:
         lock.acquire(timeout=0)
@@ -57,15 +77,13 @@ def hold(folder: Path) -> None:
         raise InUse(
             f"{folder}: another run writes here{holder}; wait for its end, or give hydra.run.dir=..."
         ) from None
-    since = datetime.now().isoformat(sep=" ", timespec="seconds")
-    who = f"process {os.getpid()} on {socket.gethostname()} since {since}: {' '.join(sys.argv)}"
-    (folder / HOLDER).write_text(who, encoding="utf-8")
-    _held.append(lock)
+    return lock
 
 
 def release() -> None:
     """Unlock what this process holds."""
     while _held:
         lock = _held.pop()
-        Path(lock.lock_file).with_name(HOLDER).unlink(missing_ok=True)
+        with suppress(OSError):
+            Path(lock.lock_file).with_name(HOLDER).unlink(missing_ok=True)
         lock.release()  # the file stays: removing it would let a third run pass the second

@@ -84,7 +84,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        _tell(method, report)
+        _tell(method, report, config.budget_s)
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)
 
@@ -103,8 +103,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             methods, fitted.train_s, data, split,
             eval_on=config.eval_on, baselines=list(config.baselines), cache=platform_cache(),
         )  # fmt: skip
-        limited = config.get("budget_clock", "wall") if fitted.time_limited else None
-        facts = {**found.facts, **provenance(), "seed": int(config.seed), "model/limited_by_clock": limited}
+        run = {"seed": int(config.seed), "model/limited_by_clock": fitted.limited_by}
+        facts = {**found.facts, **provenance(), **run}
         for logger in loggers:
             logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
     title = f"{data.site.name}: test rows of {methods[0].name}"
@@ -166,8 +166,10 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     return own if own.exists() else None
 
 
-def _tell(method: Method, report: FitReport) -> None:
-    """What the fit found, and whether options of the Trainer were asked for and not used."""
+def _tell(method: Method, report: FitReport, budget_s: float | None) -> None:
+    """What the fit found, and whether a budget or options of the Trainer were asked for and not used."""
+    if budget_s is not None and not method.takes_budget:
+        log.warning("budget_s=%g is not used: the seconds of %s cannot be chosen", budget_s, method.name)
     if not (isinstance(method, TrainsByGradient) and method.trainer_options()):
         said = HydraConfig.get().overrides.task if HydraConfig.initialized() else []
         unused = [o for o in said if re.match(r"[+~]*(trainer[.=]|init_from=)", o)]

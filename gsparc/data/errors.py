@@ -14,6 +14,14 @@ def shortened(text: str) -> str:
     return text if len(text) <= MOST else f"{text[: MOST // 2]} ... {text[-MOST // 3 :]}"
 
 
+def reason(error: BaseException) -> str:
+    """What another library says is wrong, on one line, without what only a programmer could do about it."""
+    if isinstance(error, RecursionError):
+        return "brackets within brackets, too many"
+    text = " ".join(str(error).split()).partition("; use sys.set_int_max_str_digits")[0]
+    return text or type(error).__name__
+
+
 class DataError(ValueError):
     """Input that was refused at load; nothing half-loaded exists when it is raised.
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, reason
 
 
 def platform_cache() -> Path:
@@ -34,10 +34,8 @@ def read_yaml(path: Path, missing: str, expected: str) -> Mapping[str, Any]:
         content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
     except FileNotFoundError:
         raise DataError(f"{path}: missing; expected {missing}") from None
-    except RecursionError:
-        raise DataError(f"{path}: not readable as YAML (brackets within brackets, too many)") from None
-    except (yaml.YAMLError, UnicodeDecodeError, OSError, ValueError) as error:
-        raise DataError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from None
+    except (yaml.YAMLError, UnicodeDecodeError, OSError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: not readable as YAML ({reason(error)})") from None
     if not isinstance(content, Mapping):
         raise DataError(f"{path}: expected {expected}")
     return content

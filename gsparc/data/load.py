@@ -19,7 +19,15 @@ from gsparc.data.errors import DataError
 from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
 from gsparc.data.outliers import outliers
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split, SplitSettings, make_split, read_split
+from gsparc.data.splits import (
+    FileSettings,
+    Split,
+    SplitSettings,
+    left_out,
+    make_split,
+    read_split,
+    without,
+)
 
 # A dataset is a file or a folder: who says the one may mean the other.
 PATHS = {"file": "root", "root": "file"}
@@ -79,10 +87,13 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     Raises:
         DataError: unknown name or key, impossible shares, or a file made for other data.
     """
-    if config.get("name") == "file":
-        return read_split(config["path"], len(data), data.site.sha256)
-    settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
     wrong = np.concatenate([np.zeros(0, np.int64), *outliers(data).values()])
+    if config.get("name") == "file":
+        file = FileSettings(**known_keys(config, FileSettings, "split", "setting of split=file"))
+        split = read_split(file.path, len(data), data.site.sha256)
+        absent = left_out(file.leave_out, wrong, len(data))
+        return without(split, absent) if len(absent) else split
+    settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
     return make_split(data.moving, settings, data.release_split, wrong, data.place, data.station)
 
 

@@ -169,8 +169,12 @@ def _attributes(check: Checker, stem: str) -> dict[str, Any]:
     if normalisation not in NORMALISATIONS:
         check.refuse("normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}")
     error, stand_in = given.get("convergence_error"), given.get("stand_in")
-    if error is not None and not (isinstance(error, int | float) and np.isfinite(error) and error >= 0):
+    number = isinstance(error, int | float) and not isinstance(error, bool)
+    if error is not None and not (number and np.isfinite(error) and error >= 0):
         error = check.refuse("convergence_error", f"{error!r}; expected a finite number, at least 0")
+    for name in ("name", "stand_in"):
+        if not isinstance(given.get(name), str | None):
+            check.refuse(name, f"a {type(given[name]).__name__}; expected text")
     return {
         "name": str(given.get("name") or stem),
         "normalisation": normalisation,
@@ -193,8 +197,10 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
         return None, kind
     if kind == "csi" and array.size:
         array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
-    if kind == "rssi" or array.dtype.kind == "f":
-        array = array.astype(np.float64)
+    if (
+        kind == "rssi" or array.dtype.kind in "fc"
+    ):  # magnitudes of complex64 overflow, units of 1e-42 are lost
+        array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64)
     if kind == "rssi":
         array = array[:, None]
     if len(array) < 2 or array.size == 0:
@@ -227,7 +233,8 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
     measured = True if mask is None else mask
     unmarked = "not finite; expected numbers (mark what was not measured in mask)"
-    check.refuse_rows(name, ~np.isfinite(values) & measured, unmarked)
+    with np.errstate(over="ignore"):
+        check.refuse_rows(name, ~np.isfinite(np.abs(values)) & measured, unmarked)
     if name == "csi":
         return
     with np.errstate(invalid="ignore"):
@@ -309,11 +316,9 @@ def _scaled(
         scale = rounded_rms(np.sqrt(values), mask) ** 2
     if scale <= 0:
         return values, 0.0
-    if (
-        name == "csi"
-    ):  # in double precision: in complex64 units of 1e-42 have a digit or two, and no reciprocal
-        return (values.astype(np.complex128) / scale).astype(np.complex64), scale
-    return (values / scale).astype(np.float32), scale
+    lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
+    with np.errstate(over="ignore"):  # what is then infinite is refused by row
+        return (values * lift / (scale * lift)).astype(np.complex64 if name == "csi" else np.float32), scale
 
 
 __all__ = ["DataError", "Reading", "from_arrays", "interpret", "load_own", "write_own"]

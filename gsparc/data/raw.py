@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.hdf5_probe import read_error
 
@@ -76,7 +76,7 @@ def write_raw(path: str | Path, raw: Raw) -> None:
             write(partial, raw)
     except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
         found = re.search(r"error message = '([^']+)'", str(error))
-        why = found[1] if found else getattr(error, "strerror", None) or _one_line(error)
+        why = found[1] if found else getattr(error, "strerror", None) or reason(error)
         raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
@@ -140,7 +140,7 @@ def _read_npz(path: Path) -> Raw:
                     raise KeyError("in the archive twice")
                 arrays[name] = file[name]
     except DAMAGED as error:
-        fault = f"damaged or not an npz file ({_one_line(error)})"
+        fault = f"damaged or not an npz file ({reason(error)})"
         if "allow_pickle" in str(error):
             fault = "holds Python objects; expected plain arrays of numbers"
         raise DataError(f"{path}, {name}: {fault}") from None
@@ -150,19 +150,21 @@ def _read_npz(path: Path) -> Raw:
         return Raw(arrays)
     try:
         attributes = json.loads(str(text))
+        if not isinstance(attributes, dict):
+            raise TypeError(f"found a {type(attributes).__name__}")
         units = attributes.pop("units", {})
         if not isinstance(units, dict):
             raise TypeError("units is not a table")
-    except (ValueError, TypeError, AttributeError) as error:
-        raise DataError(f"{path}, attributes: expected a JSON table as text ({_one_line(error)})") from None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise DataError(f"{path}, attributes: expected a JSON table as text ({reason(error)})") from None
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
 def _read_hdf5(path: Path) -> Raw:
     arrays, units, name = {}, {}, "the file"
-    reason = read_error(path)
-    if reason is not None:
-        raise DataError(f"{path}: damaged ({reason}); write it again, text best with a fixed length")
+    fault = read_error(path)
+    if fault is not None:
+        raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     try:
         with h5py.File(path, "r") as file:
             for key, item in file.items():
@@ -174,7 +176,7 @@ def _read_hdf5(path: Path) -> Raw:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
     except DAMAGED as error:
-        raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({_one_line(error)})") from None
+        raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({reason(error)})") from None
     arrays = {k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}
     written = attributes.pop(DIGEST, None)
     raw = Raw(arrays, attributes, units)
@@ -190,10 +192,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
 
 
 def renamed(raw: Raw, names: Mapping[str, str]) -> Raw:

@@ -9,12 +9,12 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError
+from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 
 log = logging.getLogger(__name__)
@@ -124,15 +124,31 @@ class SplitSettings:
         ):
             if not good:
                 raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
-        rows = self.leave_out
-        if self.name == "stations" and type(rows) is int and rows >= 0:
-            return
-        if rows != "outliers" and (isinstance(rows, str) or any(type(r) is not int or r < 0 for r in rows)):
-            raise DataError(f"split.leave_out={rows}: expected outliers, or numbers of rows like [3, 17]")
+        if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
+            _check_rows(self.leave_out)
         if self.folds < 2 or self.stretches_per_fold < 1:
             raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
         if len(self.corner) != 2 or set(self.corner) - set("+-"):
             raise DataError(f"split.corner={self.corner!r}: expected one of --, -+, +-, ++")
+
+
+@dataclass(frozen=True)
+class FileSettings:
+    """The folds of an index file: the config group `split` with the name `file`.
+
+    Attributes:
+        path: as a run writes it, split.json.
+        leave_out: see `SplitSettings`.
+    """
+
+    name: str = "file"
+    path: str = ""
+    leave_out: Sequence[int] | Literal["outliers"] = ()
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.path, str | Path) or str(self.path) in ("", "???"):
+            raise DataError("split.path is not set; say split.path=split.json for split=file")
+        _check_rows(self.leave_out)
 
 
 def make_split(
@@ -157,13 +173,7 @@ def make_split(
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
     """
     rows, left = len(positions), settings.leave_out
-    absent = np.zeros(0, np.int64)
-    if left == "outliers":
-        absent = np.asarray(outliers, dtype=np.int64)
-    elif not isinstance(left, int):
-        absent = np.array(left, dtype=np.int64)
-    if len(absent) and absent.max() >= rows:
-        raise DataError(f"split.leave_out: row {absent.max()} of rows 0 to {rows - 1}")
+    absent = np.zeros(0, np.int64) if isinstance(left, int) else left_out(left, outliers, rows)
     if len(absent):
         rest = np.setdiff1d(np.arange(rows), absent)
         return _of_the_rest(rest, positions, settings, release_split, place, station)
@@ -201,6 +211,27 @@ def _pairs(
     order = np.random.default_rng(settings.seed).permutation(rows)
     train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
     return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
+
+
+def left_out(
+    leave_out: Sequence[int] | Literal["outliers"], outliers: np.ndarray | None, rows: int
+) -> np.ndarray:
+    """The rows (n,) int64 of `rows` that `leave_out` names, where `outliers` (n,) are those of that name.
+
+    Raises:
+        DataError: there is no such row.
+    """
+    named = outliers if isinstance(leave_out, str) else leave_out
+    absent = [int(row) for row in (() if named is None else named)]
+    if max(absent, default=-1) >= rows:
+        raise DataError(f"split.leave_out: row {max(absent)} of rows 0 to {rows - 1}")
+    return np.array(absent, dtype=np.int64)
+
+
+def without(split: Split, absent: np.ndarray) -> Split:
+    """The same folds without the rows `absent` (n,)."""
+    folds = tuple(Fold(*(np.setdiff1d(part, absent) for part in vars(f).values())) for f in split.folds)
+    return Split(split.name, folds, indices_hash(folds))
 
 
 def path_order(positions: np.ndarray) -> np.ndarray:
@@ -275,8 +306,8 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
         name, stored_rows, stored_hash = str(content["name"]), int(content["rows"]), str(content["sha256"])
     except FileNotFoundError:
         raise DataError(f"{path}: no such split file; a run writes one as split.json") from None
-    except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
-        raise DataError(f"{path}: not a split file ({type(error).__name__}: {error})") from None
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        raise DataError(f"{path}: not a split file ({type(error).__name__}: {reason(error)})") from None
     if stored_rows != rows:
         raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
     for i, fold in enumerate(folds):
@@ -290,6 +321,17 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     if dataset_sha256 and content.get("dataset_sha256") not in ("", None, dataset_sha256):
         log.warning("%s was made for other data (their content hashes differ); rows may not correspond", path)
     return Split(name, folds, stored_hash)
+
+
+def _check_rows(given: Any) -> None:
+    """Refuse what `leave_out` cannot be (DataError)."""
+    listed = given.tolist() if isinstance(given, np.ndarray) else given
+    if isinstance(listed, str) or not isinstance(listed, Sequence):
+        good = isinstance(listed, str) and listed == "outliers"
+    else:
+        good = all(isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed)
+    if not good:
+        raise DataError(f"split.leave_out={given}: expected outliers, or numbers of rows like [3, 17]")
 
 
 def _of_the_rest(

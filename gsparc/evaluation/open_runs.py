@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.splits import Split
+from gsparc.data.splits import Split, indices_hash
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.methods import checkpoint
 from gsparc.methods.method import Method
 from gsparc.methods.predictor import SAME_PLACE_M
 
 log = logging.getLogger(__name__)
+
+SAME_ROW_M = 1e-3  # rows of two files this near are of the same place
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,8 @@ class Opened:
         data: in the models' local coordinates and units.
         split: the folds the methods were trained on, or others that were asked for.
         foreign: what differs from what the methods were trained on, one clause; None: nothing.
-        learned: test rows of which it is known that the methods have learned from them.
+        learned: test rows that the methods have learned from, of other data those at places that they have
+            learned from; None: not known.
     """
 
     methods: list[Method]
@@ -39,7 +43,7 @@ class Opened:
     data: Measurements
     split: Split
     foreign: str | None = None
-    learned: int = 0
+    learned: int | None = 0
 
     def facts(self) -> dict[str, Any]:
         """`dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
@@ -68,7 +72,7 @@ def open_files(
     data = aligned(module.measurements, stored[0].site)
     whole = split_for(_settings("split", stored[0], split), data)
     chosen = _folds(whole, stored)
-    foreign, learned = _foreign(stored, data, whole, chosen)
+    foreign, learned = _foreign(stored, data, chosen)
     if foreign is not None:
         log.warning("%s was trained on %s", stored[0].path, foreign)
     return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned)
@@ -104,22 +108,65 @@ def _folds(split: Split, stored: Sequence[checkpoint.Stored]) -> Split:
     return Split(split.name, tuple(split.folds[number] for number in numbers), split.sha256)
 
 
+def trained_on(stored: Sequence[checkpoint.Stored], split: Split) -> bool | None:
+    """Whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
+
+    A finished model has the hash of its whole split, an interrupted training that of its own rows.
+    """
+    said = []
+    for one, fold in zip(stored, split.folds, strict=True):
+        whole, rows = one.extra.get("split_sha256"), one.extra.get("origin", {}).get("rows")
+        if whole is None and rows is None:
+            return None
+        said.append(rows == indices_hash((fold,)) if whole is None else whole == split.sha256)
+    return all(said)
+
+
 def _foreign(
-    stored: Sequence[checkpoint.Stored], data: Measurements, whole: Split, chosen: Split
-) -> tuple[str | None, int]:
+    stored: Sequence[checkpoint.Stored], data: Measurements, chosen: Split
+) -> tuple[str | None, int | None]:
     """What was trained on instead, and how many of these test rows the models have learned from."""
-    if data.site.sha256 != stored[0].site.sha256:
-        return f"other data than {data.site.name} (content hashes differ)", 0
-    if stored[0].extra.get("split_sha256") in (None, whole.sha256):
+    same = data.site.sha256 == stored[0].site.sha256
+    known = trained_on(stored, chosen)
+    if same and known:
         return None, 0
+    what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
+    own = data if same else _training_data(stored[0])
+    before = None if own is None else _training_folds(stored, own)
+    if own is None or before is None:
+        what = "rows that it does not name" if same and known is None else what
+        return f"{what}; these test rows may have been TRAINED on", None
+    if same and indices_hash(before.folds) == indices_hash(chosen.folds):
+        return None, 0
+    learned, count = 0, sum(len(fold.test) for fold in chosen.folds)
+    for old, fold in zip(before.folds, chosen.folds, strict=True):
+        rows = np.concatenate([old.train, old.val])
+        if same:
+            learned += int(np.isin(fold.test, rows).sum())
+        else:
+            gaps, _ = cKDTree(own.moving[rows]).query(data.moving[fold.test])
+            learned += int((gaps < SAME_ROW_M).sum())
+    if same:
+        return f"{what} ({before.name}): {learned} of these {count} test rows were TRAINED on", learned
+    return f"{what}: {learned} of these {count} test rows are at places that were TRAINED on", learned
+
+
+def _training_data(stored: checkpoint.Stored) -> Measurements | None:
+    """What a checkpoint was trained on; None where it is gone or has changed."""
     try:
-        before = _folds(split_for(_settings("split", stored[0], None), data), stored)
-    except ValueError:  # a split file that is gone
-        return "another split; its test rows may have been TRAINED on", 0
-    pairs = list(zip(before.folds, chosen.folds, strict=True))
-    seen = [np.isin(fold.test, np.concatenate([old.train, old.val])) for old, fold in pairs]
-    learned, count = int(np.concatenate(seen).sum()), sum(map(len, seen))
-    return f"another split ({before.name}): {learned} of these {count} test rows were TRAINED on", learned
+        own = datamodule(_settings("dataset", stored, None), trusted=False).measurements
+        return aligned(own, stored.site) if own.site.sha256 == stored.site.sha256 else None
+    except (ValueError, OSError):
+        return None
+
+
+def _training_folds(stored: Sequence[checkpoint.Stored], own: Measurements) -> Split | None:
+    """The folds of the stored settings; None where they are gone or not those that were trained on."""
+    try:
+        before = _folds(split_for(_settings("split", stored[0], None), own), stored)
+    except ValueError:
+        return None
+    return None if trained_on(stored, before) is False else before
 
 
 def aligned(data: Measurements, site: Site) -> Measurements:

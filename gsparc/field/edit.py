@@ -54,7 +54,7 @@ def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Opti
     groups = {} if optimizer is None else {id(g["params"][0]): g for g in optimizer.param_groups}
     for name, old in rows.items():
         added = edit.replace.get(name, old.detach()[edit.parents])
-        new = nn.Parameter(torch.cat([old.detach()[edit.keep], added.to(old.dtype)]))
+        new = nn.Parameter(torch.cat([old.detach()[edit.keep], added.to(old.dtype)]), old.requires_grad)
         _set(root, name, new)
         group = groups.get(id(old))
         if optimizer is None or group is None:
@@ -75,7 +75,7 @@ def apply(edit: Edit, root: nn.Module, gaussians: GaussianField, optimizer: Opti
 def resize(root: nn.Module, gaussians: GaussianField, count: int) -> None:
     """Give every per-Gaussian tensor `count` rows of zeros, so that a state dict of that size fits."""
     for name, old in row_parameters(root, len(gaussians)).items():
-        _set(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:])))
+        _set(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:]), old.requires_grad))
     gaussians.ids = gaussians.ids.new_zeros(count)
 
 

@@ -64,14 +64,17 @@ class Start:
         prior: features of the encodings, or None.
         sources: (N, 3) places of the Gaussians [m], or None to place them by `init`.
         solve: sets the parameters of a fresh model.
-        billed_s, waited_s: seconds of reusable work: as it was first measured, and this time.
+        billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
+            the processor [s].
+        hurried: whether seconds ended that work.
     """
 
     prior: Prior | None
     sources: Tensor | None = None
     solve: Callable[[GaussianModel], None] = unchanged
-    billed_s: float = 0.0
-    waited_s: float = 0.0
+    billed_s: tuple[float, float] = (0.0, 0.0)
+    waited_s: tuple[float, float] = (0.0, 0.0)
+    hurried: bool = False
 
 
 class Initialiser(Protocol):

@@ -271,19 +271,20 @@ def _as_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def non_finite(value: Any, where: str) -> str | None:
-    """The place of the first number that is NaN or infinite; None: all are finite."""
+def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
+    """Where the first number is that is NaN or, unless it may be `infinite`, infinite; None: all are good."""
     if isinstance(value, Tensor):
-        wrong = ~torch.isfinite(value)
+        wrong = torch.isnan(value) if infinite else ~torch.isfinite(value)
         return f"{where}{wrong.nonzero()[0].tolist()}" if wrong.any() else None
     if isinstance(value, float):
-        return None if math.isfinite(value) else where
+        return where if math.isnan(value) or (math.isinf(value) and not infinite) else None
     parts: Iterable[tuple[str, Any]] = ()
     if isinstance(value, Mapping):
         parts = ((f"{where}.{key}", one) for key, one in value.items())
     elif isinstance(value, (list, tuple)):
         parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
-    return next((found for name, one in parts if (found := non_finite(one, name)) is not None), None)
+    each = (non_finite(one, name, infinite=infinite) for name, one in parts)
+    return next((found for found in each if found is not None), None)
 
 
 def _plain(value: Any, where: str) -> Any:

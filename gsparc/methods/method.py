@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.methods.time_budget import Clock, TimeBudget
+from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
@@ -43,12 +44,12 @@ class FitReport:
     Attributes:
         seconds: training time without validation, testing or pictures [s].
         notes: what a reader must know (early stop, dropped components), one line each.
-        time_limited: whether seconds ended it, so that another machine's result may differ.
+        limited_by: the clock whose seconds decided something, so that another machine's result may differ.
     """
 
     seconds: float
     notes: tuple[str, ...] = ()
-    time_limited: bool = False
+    limited_by: Clock | None = None
 
 
 @dataclass(frozen=True)
@@ -96,9 +97,10 @@ class FitContext:
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
             )
 
-    def time_budget(self, seconds: float, spent_s: float = 0.0) -> TimeBudget:
-        """So many seconds of this context's clock, of which some were spent before [s]."""
-        return TimeBudget(seconds, self.budget_clock, spent_s)
+    def time_budget(self, seconds: float | None = None, before: Spent = NOTHING) -> TimeBudget:
+        """So many seconds of this context's clock (None: `budget_s`, or no end), some spent before."""
+        seconds = self.budget_s if seconds is None else seconds
+        return TimeBudget(math.inf if seconds is None else seconds, self.budget_clock, before)
 
 
 class Method(ABC):
@@ -111,6 +113,7 @@ class Method(ABC):
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
     uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
+    takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
 
     @abstractmethod
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:

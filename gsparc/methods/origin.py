@@ -7,32 +7,49 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import yaml
 
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, indices_hash
+from gsparc.data.assemble import content_hash
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.splits import Fold, SplitSettings, indices_hash
 from gsparc.methods.checkpoint import Stored
 from gsparc.methods.method import FitContext
 
 log = logging.getLogger(__name__)
 
-DECIDING = ("model", "dataset.batch_size")  # settings that a run must share with what it goes on from
+# Settings that a run must share with what it goes on from.
+DECIDING = ("model", "dataset.batch_size", "init_from")
 RHYTHM = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
 """Settings that may change on the way, and are then named."""
+UNHASHED = (
+    "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
+    "uplink_array", "uplink_hz", "antennas",
+)  # fmt: skip
+"""Facts of a site that the content hash of its measurements leaves out."""
+
+# What is hashed, the group of settings that names it, in words.
+_HASHED = (
+    ("data", "dataset", "data"),
+    ("beside", "dataset", "directions or uplink"),
+    ("rows", "split", "rows"),
+)
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Hashes of what is learned from, the seed, and the whole configuration as text.
+    """What is learned from, the seed, and the whole configuration as text.
 
     Attributes:
-        data: content hash of the measurements.
+        site: of the measurements.
+        beside: hash of their directions and uplink, which their content hash leaves out.
         rows: hash of the fold's indices.
         seed: of the run.
         config: YAML text; "" from Python without one.
     """
 
-    data: str
+    site: Site
+    beside: str
     rows: str
     seed: int
     config: str = ""
@@ -40,11 +57,16 @@ class Origin:
     @classmethod
     def of(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
         """Of a fit that begins."""
-        return cls(data.site.sha256, indices_hash((fold,)), context.seed, context.config_yaml)
+        directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
+        beside = content_hash({**directions, "uplink": data.uplink})
+        return cls(data.site, beside, indices_hash((fold,)), context.seed, context.config_yaml)
 
     def marks(self) -> dict[str, Any]:
         """For the `extra` of a checkpoint, which holds the configuration itself."""
-        return {"origin": {"data": self.data, "rows": self.rows, "seed": self.seed}}
+        return {"origin": {**self._hashes(), "seed": self.seed}}
+
+    def _hashes(self) -> dict[str, str]:
+        return {"data": self.site.sha256, "beside": self.beside, "rows": self.rows}
 
     def refuse_other(self, stored: Stored) -> None:
         """Whether training may go on from `stored`; settings of its rhythm that changed are logged.
@@ -52,12 +74,18 @@ class Origin:
         Raises:
             ValueError: it is of other data, rows, seed or settings, which are named.
         """
-        kept = stored.extra.get("origin", {"data": stored.site.sha256})  # earlier versions kept less
         before, now = stored.configuration, yaml.safe_load(self.config) or {}
-        found = []
-        for name, group, what in (("data", "dataset", "data"), ("rows", "split", "rows")):
-            if kept.get(name, getattr(self, name)) != getattr(self, name):
+        own, found = self._hashes(), []
+        kept = stored.extra.get("origin")
+        if kept is None:  # earlier versions kept less
+            kept = {"data": stored.site.sha256, "seed": before.get("seed", self.seed)}
+            found += _differences(_with_split(before), _with_split(now), ("split",))
+        for name, group, what in _HASHED:
+            if kept.get(name, own[name]) != own[name]:
                 found.append(", ".join(_differences(before, now, (group,))) or f"other {what}")
+        if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
+            facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
+            found += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
         if kept.get("seed", self.seed) != self.seed:
             found.append(f"seed={kept['seed']} (here {self.seed})")
         found += _differences(before, now, DECIDING)
@@ -79,6 +107,14 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
     under = [k for k in under if keys is RHYTHM or k not in RHYTHM]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
+
+
+def _with_split(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A configuration with every setting of its split; settings that came later have their defaults."""
+    split = config.get("split")
+    return (
+        {"split": {**vars(SplitSettings()), "leave_out": [], **split}} if isinstance(split, Mapping) else {}
+    )
 
 
 def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -77,7 +77,7 @@ def search_many(
         )  # fmt: skip
         member = Member(phased, left_out)
         errors.append(left_out)
-        cache.put(f"{stage} {number}", member)
+        cache.put(f"{stage} {number}", member, budget.limited_by)
         return member
 
     # Parallel searches scale better than threaded factorisations of a few hundred rows.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import math
-import time
 from collections import Counter
 from dataclasses import replace
 from hashlib import sha256
@@ -20,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
-from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.time_budget import TimeBudget, weaker
 from gsparc.multipath.diffraction import (
     Edges,
     diffracted,
@@ -48,6 +47,7 @@ MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
 MAX_EDGE_ERROR = 0.8  # leave-one-out error with edges over that without, above which edges are dropped
 EDGE_BUDGET = 0.2  # least share of the budget for the search with edges
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
+ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
 
 
@@ -71,6 +71,7 @@ class ImageSourceGP(FramedMethod):
 
     name = "image_source_gp"
     resumable = True  # finished searches are kept in `last.ckpt`
+    takes_budget = True
 
     def __init__(
         self,
@@ -102,9 +103,10 @@ class ImageSourceGP(FramedMethod):
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
-        started = time.monotonic()
         refuse(data.site, self.name, data.target.shape[1])
         known = np.concatenate([fold.train, fold.val])
+        cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
+        budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
@@ -113,14 +115,11 @@ class ImageSourceGP(FramedMethod):
         held = self.frame.inside(everything)
         notes = []
         if self.offsets != "none":
-            data = self._without_offsets(data, known)
+            data = self._without_offsets(data, known, budget)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
-        cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
-        started -= cache.spent_s
-        budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent_s)
         row_sets = self._row_sets(data, known, self.searches)
         found = self._search(row_sets, self.settings, budget, self.clutter, cache)
         if self.look_for_edges:
@@ -143,7 +142,8 @@ class ImageSourceGP(FramedMethod):
         if len(clutter):
             these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
             notes.append(f"{self.name}: clutter: {these}")
-        return FitReport(time.monotonic() - started, tuple(notes), budget.limited)
+        limited = weaker(budget.limited_by, cache.limited_by)
+        return FitReport(budget.counted.wall, tuple(notes), limited)
 
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
@@ -196,13 +196,15 @@ class ImageSourceGP(FramedMethod):
         assert self.site is not None and self.site.static_position is not None
         return torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
 
-    def _without_offsets(self, data: Measurements, known: np.ndarray) -> Measurements:
+    def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
         aligned = self._remove_offsets(data, known, self._transmitter()[None], torch.ones(1, self.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
-            now, rows = TimeBudget(MIN_BUDGET_S), self._row_sets(aligned, known, 1)
+            now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
+            rows = self._row_sets(aligned, known, 1)
             phased = self._search(rows, few, now, False, SearchCache())[0].phased
+            budget.limited |= now.limited
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
                 gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ import torch
 
 from gsparc.data.files import whole_file
 from gsparc.methods.checkpoint import SEARCHES
+from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget, weaker
 from gsparc.multipath.phased_gp import PhasedScene
 
 log = logging.getLogger(__name__)
@@ -43,7 +43,8 @@ class SearchCache:
         depends_on: what searches depend on, by name; a file with other values is refused.
 
     Attributes:
-        spent_s: training time of the interrupted run up to its last finished search [s].
+        spent: training time of the interrupted run up to its last finished search.
+        limited_by: the clock whose seconds ended one of the searches.
 
     Raises:
         ValueError: `resume` holds no searches, or those of other data or settings.
@@ -57,15 +58,17 @@ class SearchCache:
         self._depends_on = dict(depends_on or {})
         self._kept: dict[str, dict[str, Any]] = {}
         self._lock = threading.Lock()
-        self.spent_s = 0.0
+        self.spent = NOTHING
+        self.limited_by: Clock | None = None
         if resume is not None:
             self._open(resume)
-        self._started = time.monotonic() - self.spent_s
+        self._watch = TimeBudget(before=self.spent)
 
     def _open(self, file: Path) -> None:
         try:
             stored = torch.load(file, weights_only=True)
-            before, kept, spent = dict(stored["depends_on"]), dict(stored[SEARCHES]), float(stored["spent_s"])
+            before, kept, wall = dict(stored["depends_on"]), dict(stored[SEARCHES]), float(stored["spent_s"])
+            spent = Spent(wall, float(stored.get("processor_s", wall)))  # older files know one clock
         except Exception as error:  # any error of a damaged or foreign file
             raise ValueError(
                 f"ckpt_path={file}: holds no finished searches ({type(error).__name__}); start without it"
@@ -73,8 +76,8 @@ class SearchCache:
         other = [name for name, value in self._depends_on.items() if before.get(name) != value]
         if other:
             raise ValueError(f"ckpt_path={file}: is of other {', '.join(other)}; start without it")
-        self._kept, self.spent_s = kept, spent
-        log.info("reusing %d cached searches (%.0f s of training time)", len(kept), spent)
+        self._kept, self.spent, self.limited_by = kept, spent, stored.get("limited_by")
+        log.info("reusing %d cached searches (%.0f s of training time)", len(kept), wall)
 
     def find(self, name: str) -> Member | None:
         """The finished search of this name, or None."""
@@ -82,12 +85,14 @@ class SearchCache:
             kept = self._kept.get(name)
         return None if kept is None else Member(PhasedScene.from_state(kept["scene"]), kept["left_out"])
 
-    def put(self, name: str, member: Member) -> None:
-        """Store a finished search; the file is written atomically."""
+    def put(self, name: str, member: Member, limited_by: Clock | None) -> None:
+        """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
+            self.limited_by = weaker(self.limited_by, limited_by)
             self._kept[name] = {"scene": member.phased.state(), "left_out": member.left_out}
             if self._path is None:
                 return
-            spent = time.monotonic() - self._started
+            spent = self._watch.counted
+            facts = {"spent_s": spent.wall, "processor_s": spent.processor, "limited_by": self.limited_by}
             with whole_file(self._path) as partial, partial.open("wb") as file:
-                torch.save({"depends_on": self._depends_on, "spent_s": spent, SEARCHES: self._kept}, file)
+                torch.save({"depends_on": self._depends_on, **facts, SEARCHES: self._kept}, file)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -19,6 +18,7 @@ from gsparc.data.datamodule import order
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.time_budget import TimeBudget
 from gsparc.ops import Pose
 from gsparc.peers.network import Network, Scene
 
@@ -34,15 +34,16 @@ class TrainedPeer(Method):
 
     Args:
         budget_s: seconds of training in processor time per thread, so that a busy machine gives the same
-            training (on a quiet one they are the clock's); the learning-rate schedule stretches to them.
-            None takes 60.
-        max_steps: ends training earlier; null for no limit (with it a run repeats exactly).
+            training (on a quiet one they are the clock's). None takes 60.
+        max_steps: steps of the learning-rate schedule, which end training where the seconds do not: such a
+            run repeats exactly. None stretches the schedule to the seconds.
         batch_size: samples per step.
         rate: Adam's learning rate where `rates` names no other.
         seed: of initial weights and order of the samples.
         name: as it appears in tables.
     """
 
+    takes_budget: ClassVar[bool] = True  # type: ignore[misc]
     kinds: ClassVar[tuple[Kind, ...]]
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
@@ -77,7 +78,8 @@ class TrainedPeer(Method):
             ValueError: a kind of data the method does not serve, or no training rows.
             RuntimeError: the loss became NaN or infinite.
         """
-        started, began = time.perf_counter(), time.process_time()
+        assert self.budget_s is not None
+        budget = TimeBudget(self.budget_s, "processor")
         rows = np.sort(np.concatenate([fold.train, fold.val]))
         if data.site.kind not in self.kinds:
             raise ValueError(
@@ -88,18 +90,18 @@ class TrainedPeer(Method):
         L.seed_everything(self.seed, verbose=False)
         self.site, self.found = data.site, self.precompute(data, rows)
         self.network = self.build(_scene(data, rows), self.found)
-        self._train(data, rows, began)
+        self._train(data, rows, budget)
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"
-        return FitReport(time.perf_counter() - started, (note,), time_limited=self.steps != self.max_steps)
+        return FitReport(budget.counted.wall, (note,), budget.clock if self.steps != self.max_steps else None)
 
-    def _train(self, data: Measurements, rows: np.ndarray, began: float) -> None:
+    def _train(self, data: Measurements, rows: np.ndarray, budget: TimeBudget) -> None:
         network = self.fitted()
         optimizer = torch.optim.Adam(self._groups(network), eps=1e-15)
         base = [group["lr"] for group in optimizer.param_groups]
         draw = torch.Generator().manual_seed(self.seed)
         for step in count():
-            progress = self._progress(step, (time.process_time() - began) / torch.get_num_threads())
+            progress = self._progress(step, budget)
             if progress >= 1:
                 break
             for group, rate in zip(optimizer.param_groups, base, strict=True):
@@ -115,13 +117,10 @@ class TrainedPeer(Method):
             optimizer.step()
             self.steps = step + 1
 
-    def _progress(self, step: int, elapsed_s: float) -> float:
+    def _progress(self, step: int, budget: TimeBudget) -> float:
         """Share of the training that is over; step 0 is always taken."""
-        assert self.budget_s is not None
-        spent = elapsed_s / self.budget_s if step else 0.0
-        if self.max_steps is None:
-            return spent
-        return max(step / self.max_steps, spent)
+        spent = budget.spent / budget.seconds if step else 0.0
+        return spent if self.max_steps is None or spent >= 1 else step / self.max_steps
 
     def _groups(self, network: nn.Module) -> Iterator[dict[str, Any]]:
         for name, parameter in network.named_parameters():

@@ -25,7 +25,10 @@ def interrupted(path: Path) -> checkpoint.Stored:
         raise ValueError(
             f"{path} holds a finished model, not a training state: resume from last.ckpt instead"
         )
-    wrong = checkpoint.non_finite(stored.extra["trainer"].get("optimizer_states"), "optimizer_states")
+    trainer = {**stored.extra["trainer"], "earlier_s": stored.extra.get("earlier_s")}
+    callbacks = trainer.pop("callbacks", None)  # whose best score begins at infinity
+    wrong = checkpoint.non_finite(trainer, "trainer")
+    wrong = wrong or checkpoint.non_finite(callbacks, "trainer.callbacks", infinite=True)
     if wrong is not None:
         raise checkpoint.CheckpointError(f"{path}: {wrong} is NaN or infinite; resume from an earlier file")
     return stored

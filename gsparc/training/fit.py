@@ -23,9 +23,9 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext
-from gsparc.methods.time_budget import clock_of
+from gsparc.methods.time_budget import Spent, TimeBudget
 from gsparc.training.lightning_module import GaussianModule
-from gsparc.training.time_budget import Budget, Stretched
+from gsparc.training.time_budget import SPENT, Budget, Stretched
 
 SECONDS = "time/learning_s"
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
@@ -125,9 +125,12 @@ class StopBetweenSteps(L.Callback):
 
 
 def run_stage(
-    module: GaussianModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO
-) -> float:
+    module: GaussianModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
+    budget: TimeBudget,
+) -> float:  # fmt: skip
     """Train `module` on `fold.train`, watching `fold.val`; returns the seconds spent learning [s].
+
+    The budget is paused before and after, and counts them too.
 
     Raises:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
@@ -140,8 +143,8 @@ def run_stage(
     stop = StopBetweenSteps(folder / "last.ckpt")
     callbacks, pace = list(context.callbacks()), module.pace
     if pace is not None:
-        stretched = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
-        callbacks = [Budget(pace, clock_of(context.budget_clock)), *stretched]
+        callbacks = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
+    callbacks = [Budget(pace, budget), *callbacks]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
@@ -183,6 +186,7 @@ def run_stage(
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     finally:
         batches.trainer = None  # which holds the optimizer's state
+    budget.charge(Spent(*trainer.callback_metrics[SPENT].tolist()) - budget.counted)
     return float(trainer.callback_metrics[SECONDS])
 
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -29,6 +28,7 @@ from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.origin import Origin
+from gsparc.methods.time_budget import Clock, Spent, TimeBudget, weaker
 from gsparc.ops import Pose
 from gsparc.training import reduce
 from gsparc.training.auto_settings import Choices, resolve, settled
@@ -60,6 +60,8 @@ class LearnedField(Method):
     """
 
     resumable = True  # every step's state is in `last.ckpt`
+    takes_budget = True
+    _limited_by: Clock | None = None
 
     def __init__(
         self,
@@ -87,7 +89,7 @@ class LearnedField(Method):
         self._ends: dict[str, Tensor] = {}
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
-        self._billed_s = 0.0  # for reusable work, by the stages so far
+        self._billed = Spent()  # for reusable work, by the stages so far
         self._frozen: FrozenView | FrozenArray | None = None
 
     # -- learning ----------------------------------------------------------------------------------
@@ -110,9 +112,12 @@ class LearnedField(Method):
             origin.refuse_other(resumed)
         marks = {} if resumed is None else resumed.extra
         stage, seconds = str(marks.get("stage", "train")), float(marks.get("earlier_s", 0.0))
-        self._billed_s = 0.0
+        budget = context.time_budget(before=Spent(*marks.get("spent", (seconds, seconds))))
+        budget.pause()
+        now = None if context.budget_s is None else context.budget_clock
+        self._billed, self._limited_by = Spent(), weaker(now, marks.get("limited_by"))
         if stage == "train":
-            seconds += self._stage("train", origin, data, fold, context, seconds)
+            seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
@@ -120,18 +125,23 @@ class LearnedField(Method):
             every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
             again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
-            seconds += self._stage("refit", origin, data, every, again, seconds, self.fitted().confidence)
+            confidence = self.fitted().confidence
+            seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
         self._frozen = None
-        return FitReport(seconds, time_limited=context.budget_s is not None)
+        return FitReport(seconds, limited_by=self._limited_by)
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
-        earlier_s: float, confidence: Confidence | None = None,
+        budget: TimeBudget, earlier_s: float, confidence: Confidence | None = None,
     ) -> float:  # fmt: skip
-        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s]."""
+        """Train a fresh model on `fold.train`, with a given confidence or a new one; seconds spent [s].
+
+        The budget is paused before and after.
+        """
         folder, resume = context.run_dir, context.resume
         L.seed_everything(context.seed, verbose=False)
-        started, spent = time.perf_counter(), 0.0
+        started = budget.counted
+        budget.go()
         assert self.choices is not None
         if context.init_from is not None and resume is None and stage == "train":
             self._start_from(data.site, context.init_from)
@@ -147,23 +157,34 @@ class LearnedField(Method):
             self.model = self._new_model(data.site, start.sources)
             start.solve(self.model)
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
-            spent = start.billed_s - start.waited_s - self._billed_s
-            self._billed_s = start.billed_s
+            budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
+            self._billed = Spent(*start.billed_s)
+            self._limited_by = weaker(self._limited_by, "processor" if start.hurried else None)
         else:
             self.restore(data.site, checkpoint.read(resume).state)
         if confidence is not None:
             self.fitted().confidence = confidence.requires_grad_(False)
-        prepared = time.perf_counter() - started + spent
+        budget.pause()
+        prepared = (budget.counted - started).wall
         steps, pace = total_steps(context), None
         if context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
             end = context.budget_s * (0.5 if first else 1.0)
-            pace = Pace(steps, end - earlier_s - prepared)
+            pace = Pace(steps, end - budget.spent)
+            if pace.budget_s <= 0:
+                log.warning(
+                    "budget_s=%.3g: %.1f of %.3g s went before the first step of stage %s (preparation, "
+                    "earlier stages), which has one step; give more",
+                    context.budget_s, budget.spent, end, stage,
+                )  # fmt: skip
         module = self.module(steps, folder, pace)
         module.prepared_seconds = earlier_s + prepared
-        marks = {"stage": stage, "earlier_s": earlier_s + prepared, **origin.marks()}
+        marks = {
+            "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
+            "limited_by": self._limited_by, **origin.marks(),
+        }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
-        return prepared + run_stage(module, data, fold, context, files)
+        return prepared + run_stage(module, data, fold, context, files, budget)
 
     def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
         """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""

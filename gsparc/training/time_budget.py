@@ -6,11 +6,15 @@ its schedule the training is.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
+from dataclasses import astuple
 from typing import Any
 
 import lightning.pytorch as L
+import torch
+
+from gsparc.methods.time_budget import Spent, TimeBudget
+
+SPENT = "time/spent_s"  # metric of both clocks
 
 
 class Pace:
@@ -43,55 +47,59 @@ class Pace:
 
 
 class Budget(L.Callback):
-    """Ends training when its seconds are spent; validation is not billed.
+    """Counts the seconds of training, and ends it with its pace; validation is not billed.
 
     Args:
-        pace: told after every step.
-        now: the clock that is billed [s].
+        pace: told after every step; None where steps decide.
+        budget: paused, with all that was spent before the first step.
     """
 
-    def __init__(self, pace: Pace, now: Callable[[], float] | None = None) -> None:
-        self.pace, self.now = pace, now or time.perf_counter
-        self.seconds = 0.0
-        self._since: float | None = None
+    def __init__(self, pace: Pace | None, budget: TimeBudget) -> None:
+        self.pace, self.budget, self._begin = pace, budget, budget.counted
 
-    def _go(self) -> None:
-        self._since = self.now()
+    @property
+    def _learned(self) -> Spent:
+        return self.budget.counted - self._begin
 
-    def _halt(self) -> None:
-        if self._since is not None:
-            self.seconds += self.now() - self._since
-        self._since = None
+    def _look(self, trainer: L.Trainer) -> None:
+        if self.pace is not None:
+            self.pace.spend(self._learned.by(self.budget.clock))
+            trainer.should_stop = trainer.should_stop or self.pace.over
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
         """Start the watch."""
-        self.pace.spend(self.seconds)
-        self._go()
+        self._look(trainer)
+        self.budget.go()
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Say how far it is; end when it is over."""
-        self._halt()
-        self.pace.spend(self.seconds)
-        trainer.should_stop = trainer.should_stop or self.pace.over
-        self._go()
+        self._look(trainer)
 
     def on_validation_start(self, trainer: L.Trainer, module: Any) -> None:
         """Stop the watch."""
-        self._halt()
+        self.budget.pause()
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Go on."""
         if trainer.state.fn == "fit":
-            self._go()
+            self.budget.go()
+
+    def on_train_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Stop the watch."""
+        self.budget.pause()
+
+    def on_fit_end(self, trainer: L.Trainer, module: Any) -> None:
+        """Bring home what was spent; only metrics leave the process where there are several devices."""
+        trainer.callback_metrics[SPENT] = torch.tensor(astuple(self.budget.counted), dtype=torch.float64)
 
     def state_dict(self) -> dict[str, Any]:
         """Seconds spent, so that a resumed run has only the rest."""
-        running = 0.0 if self._since is None else self.now() - self._since
-        return {"seconds": self.seconds + running}
+        return {"seconds": self._learned.wall, "processor_s": self._learned.processor}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from there."""
-        self.seconds = float(state["seconds"])
+        """Go on from there; older files know one clock."""
+        wall = float(state["seconds"])
+        self.budget.charge(Spent(wall, float(state.get("processor_s", wall))))
 
 
 class Stretched(L.Callback):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,10 +11,13 @@ import torch
 from known_arrays import array_site, measure, room_vectors, spectra, walk
 
 from gsparc.array import vector_cache
+from gsparc.array.method import ArrayField
 from gsparc.array.phase_retrieval import recover
 from gsparc.array.vector_gp import align, mirror_elements, twin
 from gsparc.data.load import load
 from gsparc.data.rfid import planar_array
+from gsparc.data.splits import Fold
+from gsparc.methods.method import FitContext
 from gsparc.ops import SphereGrid
 
 
@@ -60,6 +64,21 @@ def test_an_image_that_the_array_cannot_measure_is_suspect(known_campaign):
     assert np.flatnonzero(found.suspect).tolist() == [5]
 
 
+def test_rows_that_seconds_gave_up_are_known_also_from_the_cache(known_campaign, tmp_path, monkeypatch):
+    """Seconds of the wall gave up rows, the cache kept them, and no report told."""
+    data, _ = known_campaign
+    images = data.target.copy()
+    images[5] = np.random.default_rng(0).integers(0, 256, images[5].shape)
+    spoilt = replace(data, target=images)
+    monkeypatch.setattr(vector_cache, "recover", partial(recover, budget_s=0.0))
+    for cache in (tmp_path, tmp_path):
+        found, _ = vector_cache.recovered(spoilt, np.arange(8), cache)
+        assert np.flatnonzero(found.hurried).tolist() == [5]
+    fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
+    for measured, clock in ((spoilt, "processor"), (data, None)):
+        assert ArrayField(cache=False).fit(measured, fold, FitContext(tmp_path)).limited_by == clock
+
+
 def test_a_zero_spectrum_gives_a_zero_vector(known_campaign):
     data, _ = known_campaign
     images = np.concatenate([data.target[:4], np.zeros_like(data.target[:1])])
@@ -93,7 +112,8 @@ def test_only_requested_rows_are_recovered_and_cached(known_campaign, tmp_path, 
     monkeypatch.setattr(vector_cache, "recover", lambda *a: asked.append(len(a[1])) or inner(*a))
     first, seconds = vector_cache.recovered(data, np.arange(10), tmp_path)
     again, later = vector_cache.recovered(data, np.arange(5, 15), tmp_path)
-    assert asked == [10, 5] and seconds > 0 and later > seconds / 2
+    assert asked == [10, 5] and seconds.wall > 0 and later.wall > seconds.wall / 2
+    assert seconds.processor > 0 and seconds.processor / 2 < later.processor
     np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
     other = replace(data, site=replace(data.site, sha256="another"))
     vector_cache.recovered(other, np.arange(3), tmp_path)

@@ -183,7 +183,7 @@ def test_directions_are_not_used_where_they_are_not_wanted(settings):
     data, fold, _ = directed(40)
     method = _best(*settings, "phase_probe.budget_s=1")
     method.site = data.site
-    decided = {d.effect: d for d in method._decide(data, fold, 0)}
+    decided = {d.effect: d for d in method._decide(data, fold, FitContext())}
     assert not decided["directions"].on
 
 
@@ -199,8 +199,8 @@ def test_searches_of_few_rows_promise_too_much():
     data, fold, _ = directed(150)
     few = fold.train[:10]
     probe = _best()._probe
-    error, optimism = held_out_ratio(probe, data, few, 0)
-    better, honest = held_out_ratio(probe, data, fold.train, 0)
+    error, optimism, _ = held_out_ratio(probe, data, few, 0)
+    better, honest, _ = held_out_ratio(probe, data, fold.train, 0)
     assert optimism > 2 and optimism > honest and error > 3 * better
 
 

@@ -7,26 +7,36 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from boxes import room_of_spectra
+from campaigns import compose
+from clocks import wound
 from known_arrays import array_site, measure, room_vectors
-from rooms import directed
+from rooms import directed, shoebox
 
 from gsparc.array.method import ArrayField
 from gsparc.array.moving.method import MovingArrayField
+from gsparc.auto.combine import held_out_ratio
 from gsparc.auto.decide import (
+    Decision,
     contest_array,
     decide_array,
     decide_directions,
     decide_phase,
     fifths,
     probe_array,
+    probe_phase,
     spacing_in_wavelengths,
 )
+from gsparc.auto.method import Gsparc
 from gsparc.data.rfid import load_rfid, planar_array
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.method import FitContext, FitReport
+from gsparc.methods.registry import build
+from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.ops import SphereGrid
 from gsparc.simulate.rfid_sim import ensure_rfid_sim
+from gsparc.training.splatting import LearnedField
 
 
 @pytest.fixture(scope="module")
@@ -115,6 +125,33 @@ def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images(tmp_pat
     assert not list(tmp_path.iterdir())  # a trial left array_recovery.csv where the user stood
     near = replace(data, tx=apart / 20)
     assert contest_array(trial, GaussianProcess(), near, fold, seed=0).seconds == 0.0  # not held
+
+
+def test_a_probe_has_seconds_of_the_runs_clock_and_says_when_they_ended_it():
+    """It had ten of the wall whatever the run's were of, and its report was dropped."""
+    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1)
+    quick = {"searches": 2, "search_rows": 60, "margin": 2.0, "clutter": False, "edges": False}
+    for seconds, limited in ((1e-3, "processor"), (1e4, None)):
+        probe = ImageSourceGP(**quick, budget_s=seconds)
+        assert probe_phase(probe, GaussianProcess(), data, fold, 0, "processor").limited_by == limited
+        assert held_out_ratio(probe, data, fold.train, 0, "processor")[2] == limited
+
+
+def test_deciding_is_billed_by_the_clock_of_the_budget(tmp_path, monkeypatch):
+    clocks, given = wound(monkeypatch), []
+
+    def decide(self, data, fold, context):
+        clocks.monotonic.wind(1000.0)
+        clocks.process_time.wind(2.0)
+        return (Decision("phase", False, "slow", 1000.0, "wall"),)
+
+    monkeypatch.setattr(Gsparc, "_decide", decide)
+    monkeypatch.setattr(LearnedField, "fit", lambda *a: given.append(a[3].budget_s) or FitReport(3.0))
+    _, data, fold = shoebox(20, size=(3.0, 2.5, 2.2), max_order=0)
+    context = FitContext(tmp_path, budget_s=10.0, budget_clock="processor")
+    report = build(compose().model).fit(data, fold, context)
+    assert given == [pytest.approx(8.0, abs=0.01)]
+    assert report.seconds == 1003 and report.limited_by == "wall"
 
 
 def test_spacing_is_in_wavelengths(spectra) -> None:

@@ -9,7 +9,7 @@ import pytest
 from doors import assert_refused, knock
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.run_lock import HOLDER, InUse, hold, release
+from gsparc.commands.run_lock import HOLDER, LOCK, InUse, hold, release
 
 HOLDS = "import sys, time; from gsparc.commands.run_lock import hold; from pathlib import Path; "
 HOLDS += "hold(Path(sys.argv[1])); print('held', flush=True); time.sleep(60)"
@@ -49,3 +49,33 @@ def test_a_released_folder_is_free(tmp_path):
     with pytest.raises(InUse, match=r"another run writes here \(process \d+ on "):
         hold(tmp_path)
     release()
+
+
+def test_folders_of_a_multiruns_jobs_are_held_with_it(other, tmp_path):
+    """A run into one of them passed, and a multirun wrote into the folder of a run that held it."""
+    given = ["ckpt=none.ckpt", f"hydra.run.dir={tmp_path / '0_seed-0'}"]
+    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), f"{tmp_path}: another run writes here")
+    given = ["-m", "ckpt=none.ckpt", "eval_on=val", f"hydra.sweep.dir={tmp_path.parent}"]
+    given += [f"hydra.sweep.subdir={tmp_path.name}"]
+    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), f"{tmp_path}: another run writes here")
+    assert not (tmp_path / ".hydra").exists()
+
+
+@pytest.mark.parametrize("taken", [LOCK, HOLDER, "."])
+def test_a_folder_that_cannot_be_locked_is_not_written_to(taken, tmp_path, recwarn):
+    """Hydra made a warning of it, and the run went on without a lock."""
+    folder = tmp_path / "run"
+    if taken == ".":
+        folder.write_text("a file")
+    else:
+        (folder / taken).mkdir(parents=True)
+    given = ["ckpt=none.ckpt", f"hydra.run.dir={folder}"]
+    assert_refused(
+        knock(COMMANDS["evaluate"].run, "evaluate", given), r"run: cannot be locked \(.*give another"
+    )
+    assert not [w for w in recwarn if "RunLock" in str(w.message)]
+    assert not (folder / ".hydra").exists()
+    if taken == HOLDER:
+        (folder / taken).rmdir()
+        hold(folder)  # the lock was not left behind
+        release()

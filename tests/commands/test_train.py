@@ -9,17 +9,24 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from campaigns import brief, channels, compose, powers, spectra
 from omegaconf import open_dict
 
 import gsparc
 from gsparc.commands import evaluate
 from gsparc.commands.train import Objects, train
+from gsparc.data.load import load as load_data
+from gsparc.data.splits import Fold
 from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
+from gsparc.methods.origin import Origin
 from gsparc.training.splatting import LearnedField
 
 ROOT = Path(__file__).parents[2]
@@ -62,6 +69,14 @@ def test_methods_without_a_gradient_take_the_same_road(model, tmp_path):
     facts, objects = train(compose(*settings, f"model={model}"), tmp_path / "run")
     assert facts["model/name"] == model and facts["time/train_s"] >= 0
     assert np.isfinite(facts["test/psnr_db"]) and objects.checkpoints[0].exists()
+
+
+def test_a_budget_that_a_method_does_not_take_is_said(tmp_path, caplog):
+    """`effects.array=true budget_s=5` took its time without a word."""
+    settings = [s for s in brief(spectra(tmp_path / "own.npz")) if not s.startswith("model.")]
+    facts, _ = train(compose(*settings, "model=mean", "budget_s=5"), tmp_path / "run")
+    assert "budget_s=5 is not used: the seconds of mean cannot be chosen" in caplog.text
+    assert facts["model/limited_by_clock"] is None
 
 
 def test_a_checkpoint_evaluates_to_the_same_figures(tmp_path):
@@ -198,6 +213,101 @@ def test_a_run_goes_on_with_the_same_data_or_not_at_all(interrupted, tmp_path):
     other = spectra(tmp_path / "other.npz", origin=1.0)
     with pytest.raises(ValueError, match=r"was trained with dataset\.file=.*own\.npz \(here .*other\.npz\)"):
         train(compose(*brief(other, "model.refit=false", f"ckpt_path={last}")), tmp_path / "run")
+
+
+def altered(last: Path, to: Path, change: Callable[[dict], object]) -> Path:
+    """The checkpoint with its content changed."""
+    content = torch.load(last, weights_only=True)
+    change(content)
+    torch.save(content, to)
+    return to
+
+
+def test_a_run_goes_on_with_the_same_grid_or_not_at_all(interrupted, tmp_path):
+    """The content hash does not know it."""
+    file, last = interrupted
+    with np.load(file) as stored:
+        np.savez(tmp_path / "own.npz", **stored, grid_deg=[0.0, 0.0, 3.0, 10.0])
+    settings = brief(tmp_path / "own.npz", "model.refit=false", f"ckpt_path={last}")
+    with pytest.raises(ValueError, match=r"last\.ckpt: was trained with other grid: go on with the same"):
+        train(compose(*settings), tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    "what, change",
+    [
+        ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
+        ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
+        ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
+        ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
+        ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
+    ],
+)
+def test_facts_beside_the_content_hash_are_of_an_origin(interrupted, what, change):
+    file, last = interrupted
+    data = load_data({"name": "own", "file": str(file)})
+    fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
+    before, now = (Origin.of(d, fold, FitContext()) for d in (data, change(data)))
+    stored = replace(checkpoint.read(last), config="", extra=before.marks())
+    before.refuse_other(stored)
+    with pytest.raises(ValueError, match=f"was trained with {what}: go on"):
+        now.refuse_other(stored)
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [("split.seed=9", r"split\.seed=0 \(here 9\)"), ("seed=4", r"seed=0 \(here 4\)"), (None, None)],
+)
+def test_old_checkpoints_go_on_with_the_split_of_their_configuration(interrupted, tmp_path, change, said):
+    """Without `origin` another split or seed passed; settings that came later have their defaults."""
+    file, last = interrupted
+
+    def age(content: dict) -> None:
+        del content["extra"]["origin"]
+        content["config"] = content["config"].replace("  leave_out: []\n", "")
+
+    old = altered(last, tmp_path / "old.ckpt", age)
+    assert "leave_out" not in checkpoint.read(old).config
+    settings = brief(file, "model.refit=false", f"ckpt_path={old}", *([change] if change else []))
+    if said is None:
+        assert np.isfinite(train(compose(*settings), tmp_path / "run")[0]["test/psnr_db"])
+        return
+    with pytest.raises(ValueError, match=rf"old\.ckpt: was trained with {said}"):
+        train(compose(*settings), tmp_path / "run")
+
+
+def test_weights_to_start_from_beside_a_run_to_go_on_from_are_refused(interrupted, tmp_path):
+    """`init_from=` was ignored; a run that began with it goes on with it, in its coordinates."""
+    file, last = interrupted
+    first = train(compose(*brief(file, "model.refit=false")), tmp_path / "first")[1].checkpoints[0]
+    start = f"init_from={first}"
+    with pytest.raises(ValueError, match=r"was trained with init_from=None \(here .*model\.ckpt\)"):
+        train(compose(*brief(file, "model.refit=false", start, f"ckpt_path={last}")), tmp_path / "run")
+    often = "callbacks.checkpoint.every_n_train_steps=10"
+    train(compose(*brief(file, "model.refit=false", start, often)), tmp_path / "second")
+    on = f"ckpt_path={tmp_path / 'second' / 'last.ckpt'}"
+    assert train(compose(*brief(file, "model.refit=false", start, on)), tmp_path / "third")
+    with pytest.raises(ValueError, match=r"was trained with init_from=.*model\.ckpt \(here None\)"):
+        train(compose(*brief(file, "model.refit=false", on)), tmp_path / "fourth")
+
+
+SPOILT = {
+    "optimizer_states": lambda t: t["optimizer_states"][0]["param_groups"][1].update(lr=np.nan),
+    "lr_schedulers": lambda t: t["lr_schedulers"][0]["base_lrs"].__setitem__(2, np.nan),
+    "callbacks.CostLedger": lambda t: t["callbacks"]["CostLedger"].update(seconds=np.nan),
+}
+
+
+@pytest.mark.parametrize("where", SPOILT)
+def test_a_training_state_that_is_not_finite_is_refused_before_training(interrupted, tmp_path, where):
+    """One rate of NaN trained on unnoticed; seconds of NaN failed when training was over."""
+    file, last = interrupted
+    spoilt = altered(
+        last, tmp_path / "spoilt.ckpt", lambda content: SPOILT[where](content["extra"]["trainer"])
+    )
+    with pytest.raises(ValueError, match=rf"trainer\.{re.escape(where)}.* is NaN or infinite; resume from"):
+        train(compose(*brief(file, "model.refit=false", f"ckpt_path={spoilt}")), tmp_path / "run")
+    assert not (tmp_path / "run" / "learning_curve.csv").exists()
 
 
 def test_settings_of_the_rhythm_may_change_and_are_named(interrupted, tmp_path, caplog):

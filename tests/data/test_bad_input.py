@@ -357,3 +357,47 @@ def test_many_bad_rows_stay_readable():
 def test_a_path_of_another_dataset_is_not_ignored(name, key):
     with pytest.raises(DataError, match=rf"dataset\.{key} is not a setting of dataset={name}"):
         load({"name": name, key: "somewhere"})
+
+
+@pytest.mark.parametrize(
+    "text,says",
+    [
+        ("[" * 50_000, "brackets within brackets, too many"),
+        ('{"name": ' + "[" * 50_000, "brackets within brackets, too many"),
+        ('{"a": ' + "1" * 5000 + "}", r"Exceeds the limit .* value has 5000 digits\)$"),
+        ("[1]", "expected a JSON table as text .found a list"),
+        ('{"units": [1]}', "units is not a table"),
+        ('{"name": [1]}', "name: a list; expected text"),
+        ('{"stand_in": 5}', "stand_in: a int; expected text"),
+        ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),
+    ],
+)
+def test_attributes_that_are_none(tmp_path, csi_arrays, text, says):
+    """Brackets ended `gsparc check` in a traceback; lists and truth values passed."""
+    np.savez(tmp_path / "own.npz", attributes=np.array(text), **csi_arrays)
+    with pytest.raises(DataError) as error:
+        load_own(tmp_path / "own.npz")
+    _one_clear_line(error, says)
+    assert "own.npz, " in str(error.value) and "set_int_max_str_digits" not in str(error.value)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    "dtype,unit", [(np.complex128, 1e-310), (np.complex128, 1e300), (np.complex64, 1e38)]
+)
+def test_channels_in_units_at_the_edge_of_numbers(csi_arrays, dtype, unit):
+    """Units of 1e-310 were refused as beyond float32, row by row."""
+    tiny = from_arrays({**csi_arrays, "csi": (csi_arrays["csi"] * unit).astype(dtype)})
+    np.testing.assert_allclose(tiny.target, from_arrays(csi_arrays).target, rtol=1e-5)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [1e39, 1.7e308])
+def test_a_channel_beyond_float32_is_refused_without_a_warning_before(csi_arrays, value):
+    channels = csi_arrays["csi"].astype(np.complex64)
+    channels[3, 0, 0] = 3e38 + 3e38j  # as a sum of squares it was infinite, with a warning
+    assert np.isfinite(from_arrays({**csi_arrays, "csi": channels}).target).all()
+    channels = csi_arrays["csi"].astype(np.complex128)
+    channels[3, 0, 0] = value * (1 + 1j)
+    with pytest.raises(DataError, match=r"csi, row 3: (beyond float32|not finite)"):
+        from_arrays({**csi_arrays, "csi": channels})

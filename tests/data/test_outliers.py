@@ -86,11 +86,23 @@ def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
     )
 
 
-@pytest.mark.parametrize("rows", ["outlier", [-1], [1.5], [999]])
+@pytest.mark.parametrize(
+    "rows",
+    ["outlier", "", [-1], [1.5], [999], 3, None, True, [True], [[3]], {"3": 4}, [10**20], np.array(3)],
+)
 def test_rows_that_cannot_be_left_out_are_refused(rows, tmp_path):
+    """A single number, null and a number beyond 64 bits ended in words of Python and NumPy."""
     clean, _ = spoilt("rssi", tmp_path, 0)
     with pytest.raises(ValueError, match=r"split\.leave_out"):
         split_for({"name": "random", "leave_out": rows}, clean)
+
+
+@pytest.mark.parametrize("rows", [np.array([3, 4]), [np.int64(3), np.uint8(4)], (3, 4)])
+def test_rows_to_leave_out_may_be_numbers_of_numpy(rows, tmp_path):
+    """An array, or numbers out of one, were refused."""
+    clean, _ = spoilt("rssi", tmp_path, 0)
+    expected = split_for({"name": "random", "leave_out": [3, 4]}, clean)
+    assert split_for({"name": "random", "leave_out": rows}, clean).sha256 == expected.sha256
 
 
 def test_real_dynamics_are_no_outliers():

@@ -179,6 +179,25 @@ def test_split_for_reads_the_config_group(rfid_folder, tmp_path):
         split_for({"name": "random", "sed": 0}, data)
 
 
+def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path):
+    """`+split.leave_out` and `+split.train_count` beside split=file were ignored."""
+    data, path = load_rfid(rfid_folder), str(tmp_path / "s.json")
+    split = split_for({"name": "random"}, data)
+    write_split(path, split, len(data), data.site.sha256)
+    gone = [int(split.folds[0].train[0]), int(split.folds[0].test[0])]
+    kept = split_for({"name": "file", "path": path, "leave_out": gone}, data)
+    for before, after in zip(split.folds, kept.folds, strict=True):
+        for part in ("train", "val", "test"):
+            np.testing.assert_array_equal(getattr(after, part), np.setdiff1d(getattr(before, part), gone))
+    assert kept.sha256 != split.sha256
+    with pytest.raises(DataError, match=r"split\.train_count: no such setting of split=file; there are"):
+        split_for({"name": "file", "path": path, "train_count": 5}, data)
+    with pytest.raises(DataError, match=r"split\.path is not set"):
+        split_for({"name": "file"}, data)
+    with pytest.raises(DataError, match=r"split\.leave_out: row 999 of rows 0 to"):
+        split_for({"name": "file", "path": path, "leave_out": [999]}, data)
+
+
 def test_grouped_on_the_real_path_keeps_most_training_rows(real_rfid):
     split = split_for({"name": "grouped"}, load_rfid(real_rfid))
     assert all(len(f.train) + len(f.val) > 100 for f in split.folds)
@@ -245,3 +264,12 @@ def test_stations_are_held_out_one_by_one_or_together():
 
 def test_block_is_called_corner_now():
     assert SplitSettings("block").name == "corner"
+
+
+@pytest.mark.parametrize("text", ["[" * 50_000, '{"folds": [{"train": [' + "1" * 5000 + "]}]}"])
+def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path, text):
+    file = tmp_path / "split.json"
+    file.write_text(text)
+    with pytest.raises(DataError, match=r"split\.json: not a split file") as error:
+        read_split(file, 4)
+    assert len(str(error.value)) < 300 and "sys." not in str(error.value)

@@ -82,3 +82,13 @@ def test_resize_makes_room_for_a_state_dict():
     resize(smaller, smaller.gaussians, 9)
     smaller.load_state_dict(larger.state_dict())
     assert torch.equal(smaller.gaussians.means, larger.gaussians.means) and len(smaller.gaussians) == 9
+
+
+def test_what_is_not_learned_is_not_learned_after_an_edit_either():
+    """The delays of a single tone began to ask for gradients, without a group of the optimizer."""
+    root = Root()
+    root.head.weight.requires_grad_(False)
+    edit.apply(Edit(torch.ones(6, dtype=torch.bool), torch.tensor([1])), root, root.gaussians)
+    assert len(root.head.weight) == 7 and not root.head.weight.requires_grad
+    resize(root, root.gaussians, 3)
+    assert not root.head.weight.requires_grad and root.gaussians.means.requires_grad

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 TICK_S = 1e-4  # that every look at the clock takes, so that nothing takes no time at all
 
 
 class WoundClock:
-    """In the place of `time.perf_counter`."""
+    """In the place of a clock of `time`."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -18,3 +20,11 @@ class WoundClock:
     def wind(self, seconds: float) -> None:
         """Let time pass [s]."""
         self.now += seconds
+
+
+def wound(monkeypatch) -> SimpleNamespace:
+    """The `monotonic` and `process_time` that every time budget looks at."""
+    clocks = SimpleNamespace(monotonic=WoundClock(), process_time=WoundClock())
+    monkeypatch.setattr("gsparc.methods.time_budget.time", clocks)
+    monkeypatch.setattr("gsparc.methods.time_budget.torch.get_num_threads", lambda: 1)
+    return clocks

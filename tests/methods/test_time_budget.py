@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
 import time
 
 import pytest
 import torch
+from clocks import wound
 from rooms import shoebox
 
 from gsparc.methods.method import FitContext
-from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.time_budget import Spent, TimeBudget, weaker
 from gsparc.multipath.image_source_gp import ImageSourceGP
 
 
@@ -25,8 +27,35 @@ def test_processor_time_does_not_count_what_others_do():
 
 
 def test_what_was_spent_before_counts():
-    budget = TimeBudget(100.0, spent_s=70.0)
+    budget = TimeBudget(100.0, before=Spent(wall=70.0))
     assert 70 <= budget.spent < 71 and budget.over(0.6) and not budget.over(0.8)
+
+
+def test_pauses_are_not_counted_and_charges_are(monkeypatch):
+    clocks = wound(monkeypatch)
+    budget = TimeBudget(10.0, "processor")
+    clocks.process_time.wind(2.0)
+    clocks.monotonic.wind(50.0)
+    budget.pause()
+    clocks.process_time.wind(100.0)
+    assert budget.spent == pytest.approx(2.0, abs=0.01) and budget.counted.wall == pytest.approx(50, abs=0.01)
+    budget.charge(Spent(wall=1.0, processor=7.0))
+    budget.go()
+    assert not budget.over() and budget.limited_by is None
+    clocks.process_time.wind(1.1)
+    assert budget.over() and budget.limited_by == "processor"
+
+
+def test_of_two_clocks_the_wall_is_the_weaker():
+    assert weaker("processor", None, "wall") == "wall" and weaker(None, "processor") == "processor"
+    assert weaker() is None is weaker(None, None)
+
+
+def test_a_budget_survives_pickling():
+    """Processes of several devices are given theirs."""
+    paused = TimeBudget(10.0, "processor", Spent(1.0, 3.0))
+    paused.pause()
+    assert pickle.loads(pickle.dumps(paused)).spent == paused.spent >= 3
 
 
 def test_another_clock_is_refused(tmp_path):
@@ -40,5 +69,23 @@ def test_a_search_that_the_clock_ended_says_so(tmp_path, seconds, limited):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     method = ImageSourceGP(searches=2, clutter=False)
     report = method.fit(data, fold, FitContext(tmp_path, budget_s=seconds))
-    assert report.time_limited is limited
+    assert report.limited_by == ("wall" if limited else None)
     assert any("ended by the time budget" in note for note in report.notes) is limited
+
+
+def test_searches_for_offsets_are_counted_by_the_same_clock_and_may_be_ended_by_it(tmp_path, monkeypatch):
+    """They had 120 seconds of the wall each, and nothing told when these ended one."""
+    budgets, search = [], ImageSourceGP._search
+
+    def ended(self, rows, settings, budget, *rest):
+        found = search(self, rows, settings, budget, *rest)
+        budget.limited |= not budgets
+        budgets.append(budget)
+        return found
+
+    monkeypatch.setattr(ImageSourceGP, "_search", ended)
+    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
+    method = ImageSourceGP(searches=1, search_rows=60, clutter=False, edges=False, offsets="phase_timing")
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e3, budget_clock="processor"))
+    assert [(b.clock, b.seconds) for b in budgets] == [("processor", s) for s in (250.0, 250.0, 1e3)]
+    assert budgets[2].spent > budgets[0].spent > budgets[1].spent and report.limited_by == "processor"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from clocks import wound
 from rooms import shoebox
 
 from gsparc.methods.method import FitContext
@@ -13,9 +14,9 @@ from gsparc.multipath.image_source_gp import ImageSourceGP
 QUICK = {"searches": 2, "search_rows": 100, "margin": 2.0, "clutter": False, "edges": False}
 
 
-def _fit(data, fold, folder, resume=None, **more):
+def _fit(data, fold, folder, resume=None, clock="wall", **more):
     method = ImageSourceGP(**{**QUICK, **more})
-    return method, method.fit(data, fold, FitContext(folder, resume=resume))
+    return method, method.fit(data, fold, FitContext(folder, resume=resume, budget_clock=clock))
 
 
 @pytest.fixture()
@@ -52,9 +53,32 @@ def test_finished_searches_are_reused(tmp_path, counted):
         assert begun == [1]
         batch = data.batch(fold.test)
         assert torch.equal(whole.predict(batch.tx, batch.rx).mean, again.predict(batch.tx, batch.rx).mean)
-        assert report.seconds > torch.load(tmp_path / "cut" / "last.ckpt", weights_only=True)["spent_s"]
+        before = torch.load(tmp_path / "cut" / "last.ckpt", weights_only=True)
+        assert report.seconds > before["spent_s"] and report.limited_by is None
     finally:
         torch.set_num_threads(threads)
+
+
+def test_seconds_of_the_wall_are_not_taken_off_a_budget_of_the_processor(tmp_path, monkeypatch):
+    """A run that went on had less left, or nothing, where the machine had been busy."""
+    clocks = wound(monkeypatch)
+    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
+    clocks.monotonic.wind(0.5)
+    run = ensemble.Search.run
+    monkeypatch.setattr(ensemble.Search, "run", lambda self: clocks.monotonic.wind(1000.0) or run(self))
+    _fit(data, fold, tmp_path, searches=1, clock="processor", budget_s=20.0)
+    stored = torch.load(tmp_path / "last.ckpt", weights_only=True)
+    assert stored["spent_s"] > 999 and stored["processor_s"] < 1
+    report = _fit(data, fold, tmp_path / "b", tmp_path / "last.ckpt", "processor", budget_s=20.0)[1]
+    assert report.limited_by is None and report.seconds > 1999  # the second search, too
+
+
+def test_what_a_hurried_search_found_is_the_machines_also_when_it_is_reused(tmp_path, monkeypatch):
+    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
+    run = ensemble.Search.run
+    monkeypatch.setattr(ensemble.Search, "run", lambda self: (self.late(), run(self))[1])
+    _fit(data, fold, tmp_path, searches=1, budget_s=1e-3)
+    assert _fit(data, fold, tmp_path / "b", tmp_path / "last.ckpt", searches=1)[1].limited_by == "wall"
 
 
 def test_searches_of_another_run_are_refused(tmp_path):

@@ -82,3 +82,11 @@ def test_float32_delays_are_refused():
         channels(gains, steering, delays.float(), *TONES, 4)
     with pytest.raises(ValueError, match="are needed"):
         channels(gains, steering, delays[:2], *TONES, 4)
+
+
+def test_half_precision_and_negative_counts_failed_in_the_words_of_a_library():
+    gains, steering, delays = sources(1, 3, 2)
+    with pytest.raises(TypeError, match="both float32 or both float64"):
+        channels(gains.half(), steering.half(), delays, *TONES, 4)
+    with pytest.raises(ValueError, match="-1 subcarriers are none"):
+        channels(gains, steering, delays, *TONES, -1)

@@ -1,8 +1,10 @@
 """The kernels against the float64 reference, forward and backward, on random fields."""
 
+import math
+
 import pytest
 import torch
-from rasters import GRIDS, assert_close, poses, random_scene, render
+from rasters import GRIDS, assert_close, one, origin, poses, random_scene, render
 
 from gsparc.ops import Cutoff, SphereGrid, _native, make_plan, mean_weights, rasterize
 
@@ -66,6 +68,29 @@ def test_weights_equal_reference(dtype, projection, hides):
         values = [seen.mean.detach(), seen.share.detach(), *(leaf.grad for leaf in leaves)]
         results[backend] = dict(enumerate(values + ([hidden.grad] if hides else [])))
     assert_close(results["cpu"], results["reference"], TOLERANCE[dtype])
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("away", [1e-19, 1e-20, 1e-22, 1e-30])
+def test_a_hair_off_the_axis_the_gradient_was_no_number(backend, away):
+    """Reference, float32, `equirect`: the slopes of the root and of atan2 have the square of `away`."""
+    scene = one([away, 0.0, 1.0])
+    want = render(scene, origin(), GRIDS["sphere"], "reference", projection="equirect")
+    got = render(scene.to(torch.float32), origin(), GRIDS["sphere"], backend, projection="equirect")
+    assert all(torch.isfinite(value).all() for value in got.values())
+    if away > 1e-21:  # below, the kernel's square of it has few bits left, and then none
+        assert_close(got, want, 1e-3)
+
+
+@pytest.mark.parametrize("gap", [0.0, 1e-7, -1e-7, 1e-3])
+@pytest.mark.parametrize("first", [0.0, -7.5])
+def test_a_grid_that_nearly_closes_wrapped_by_two_periods(gap, first):
+    """The kernels' period was the width, the reference's 2 pi / step."""
+    scene, width = random_scene(seed=5, size=2.0), 16
+    grid = SphereGrid(9, width, 0.0, first, 0.1, (1 - gap) * 2 * math.pi / width)
+    assert grid.periodic == (abs(gap) < 1e-6) and grid.turn == pytest.approx(2 * math.pi / grid.azimuth_step)
+    want = render(scene, poses(3), grid, "reference", projection="equirect")
+    assert_close(render(scene, poses(3), grid, projection="equirect"), want, 1e-9)
 
 
 def test_weights_are_the_image_of_indicators():

@@ -84,3 +84,33 @@ def test_strides_are_understood():
     wide = torch.empty(5, 8, 4, dtype=torch.float64).mT
     wide.copy_(weight1)
     assert torch.equal(networks(encoded, wide, *rest), networks(encoded, weight1, *rest))
+
+
+@pytest.mark.parametrize(
+    ("part", "shape"),
+    [
+        (0, (2, 2)),
+        (0, (2, 200)),
+        (2, (0,)),
+        (2, (4, 2)),
+        (3, (2, 5, 2)),
+        (3, (4, 3, 2)),
+        (4, (4, 1)),
+        (1, (4, 15)),
+    ],
+    ids=str,
+)
+def test_shapes_that_the_kernel_read_out_of_bounds(part, shape):
+    """An empty bias was a segmentation fault, a bias (N, 1) other numbers than the products'."""
+    tensors = weights((2, 4, 3, 5, 2))
+    tensors[part] = torch.ones(shape, dtype=torch.float64)
+    with pytest.raises(ValueError, match=r"weights \(N, E, H\) and \(N, H, C\) with biases .* are needed"):
+        networks(*tensors)
+
+
+@pytest.mark.parametrize("part", range(5))
+def test_dtypes_that_the_kernel_misread(part):
+    tensors = weights((2, 4, 3, 5, 2))
+    tensors[part] = tensors[part].float()
+    with pytest.raises(TypeError, match="encoded, weights and biases share a dtype"):
+        networks(*tensors)

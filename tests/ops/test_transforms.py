@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
-from rasters import random_scene
+from rasters import poses, random_scene
 from torch.autograd import forward_ad
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops import Cutoff, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
 from gsparc.ops.channels import channels
 from gsparc.ops.networks import networks
 from gsparc.ops.operators import composite_op, view_of
@@ -58,6 +58,44 @@ def test_forward_mode_was_zero_in_silence(made, backend):
 
 
 @BACKENDS
+@pytest.mark.parametrize("opacity", [1e-28, 1e-31, 1e-36])
+def test_the_share_of_the_faintest_had_a_tangent_and_no_gradient(backend, opacity):
+    """Below FAINTEST it has neither."""
+    means, quats, scales, opacities, _ = field()
+    faint, origin = torch.full_like(opacities, opacity), Pose.identity(torch.zeros(3, dtype=torch.float64))
+
+    def share(means):
+        optics = {"cutoff": Cutoff(0.01, 0.0, relative=True), "extinctions": opacities}
+        plan = make_plan(means, quats, scales, faint, origin, GRID, backend=backend, **optics)
+        return mean_weights(plan, means, quats, scales, faint, extinctions=opacities).share
+
+    tangent = jvp(share, (means,), (torch.ones_like(means),))[1].sum()
+    leaf = means.clone().requires_grad_()
+    share(leaf).sum().backward()
+    assert torch.allclose(tangent, leaf.grad.sum(), rtol=1e-9, atol=0)
+    assert bool(tangent != 0) == (opacity > 1e-30)
+
+
+@BACKENDS
+@pytest.mark.parametrize("derived", [False, True], ids=["backward", "forward"])
+def test_no_poses_made_an_empty_image_or_an_error_of_a_library(backend, derived):
+    model = [part.clone().requires_grad_() for part in field()]
+    none, features = poses(1)[:0], torch.zeros(0, 6, 2, dtype=torch.float64)
+
+    def drawn(means):
+        plan = make_plan(means, *model[1:4], none, GRID, backend=backend)
+        raster = composite(plan, means, *model[1:4], features)
+        assert plan.radii.shape == plan.visible.shape == (0, 6) and plan.means2d.shape == (0, 6, 2)
+        return raster.image, raster.transmittance, mean_weights(plan, means, *model[1:4]).share
+
+    outputs = jvp(drawn, (field()[0],), (field()[0],))[1] if derived else drawn(model[0])
+    assert [tuple(part.shape) for part in outputs] == [(0, 2, 9, 18), (0, 9, 18), (0, 6)]
+    if not derived:
+        sum(part.sum() for part in outputs).backward()
+        assert all(leaf.grad is not None and not leaf.grad.any() for leaf in model[:4])
+
+
+@BACKENDS
 def test_transforms_agree_with_autograd(backend):
     model = field()
     slope = tangents((image(backend)(*model),))[0]
@@ -88,6 +126,21 @@ def test_gaussians_cannot_be_mapped(backend):
         vmap(lambda values: image(backend)(values, *model[1:]))(torch.stack([model[0], model[0]]))
 
 
+@BACKENDS
+def test_gaussians_mapped_over_a_plan_got_past_the_refusal(backend):
+    """Each was drawn by the order and the cut-offs of the first."""
+    model = field()
+    plan = make_plan(*model[:4], POSE, GRID, backend=backend)
+    several = torch.stack([model[0], -model[0]])
+    for made in (
+        lambda means: composite(plan, means, *model[1:]).image,
+        lambda means: mean_weights(plan, means, *model[1:4]).share,
+        lambda means: freeze(plan, means, *model[1:4], version=0).render(model[4], 0),
+    ):
+        with pytest.raises(ValueError, match=r"vmap over Gaussians or poses is not possible: give P poses"):
+            vmap(made)(several)
+
+
 def test_second_derivatives_by_either_road():
     model = field()
 
@@ -103,6 +156,34 @@ def test_second_derivatives_by_either_road():
         torch.autograd.grad(slope.sum(), leaf)
 
 
+@pytest.mark.parametrize("projection", ["tangent", "equirect"])
+def test_the_hessian_in_means_was_off_by_five_percent(projection):
+    """The frame of `tangent` was orthonormal to first order only."""
+    model = field()
+    weight = tangents((image("cpu")(*model),))[0]
+
+    def power(backend):
+        cutoff = Cutoff(1e-12, 0.0)  # no edge that a difference could cross
+        return lambda means: (
+            rasterize(
+                means, *model[1:], POSE, GRID, projection=projection, cutoff=cutoff, backend=backend
+            ).image
+            * weight
+        ).sum()
+
+    def slope(means, backend="cpu", **kept):
+        leaf = means.clone().requires_grad_()
+        return leaf, torch.autograd.grad(power(backend)(leaf), leaf, **kept)[0].flatten()
+
+    step, directions = 1e-5, torch.eye(model[0].numel(), dtype=torch.float64).unflatten(-1, model[0].shape)
+    ends = ([slope(model[0] + sign * step * d)[1] for d in directions] for sign in (1, -1))
+    wanted = torch.stack([(ahead - behind) / (2 * step) for ahead, behind in zip(*ends, strict=True)])
+    leaf, kept = slope(model[0], "reference", create_graph=True)
+    rows = torch.stack([torch.autograd.grad(part, leaf, retain_graph=True)[0].flatten() for part in kept])
+    for found in (rows, hessian(power("cpu"))(model[0]).reshape(wanted.shape)):
+        assert (found - wanted).abs().max() < 1e-6 * wanted.abs().max()
+
+
 @BACKENDS
 @pytest.mark.parametrize("part", ["position", "rotation"])
 def test_a_pose_had_no_gradient_and_no_word(backend, part):
@@ -113,6 +194,51 @@ def test_a_pose_had_no_gradient_and_no_word(backend, part):
         rasterize(*model, pose, GRID, backend=backend)
     with torch.no_grad():
         rasterize(*model, pose, GRID, backend=backend)
+
+
+@BACKENDS
+@pytest.mark.parametrize("part", ["position", "rotation"])
+def test_a_pose_planned_without_gradients_had_none_and_no_word(backend, part):
+    model = [part.clone().requires_grad_() for part in field()]
+    parts = {"position": POSE.position.clone(), "rotation": POSE.rotation.clone()}
+    with torch.no_grad():
+        plan = make_plan(
+            *model[:4], Pose(**{**parts, part: parts[part].requires_grad_()}), GRID, backend=backend
+        )
+        composite(plan, *model)
+    for made in (lambda: composite(plan, *model), lambda: mean_weights(plan, *model[:4])):
+        with pytest.raises(ValueError, match="a pose has no gradients here: detach it"):
+            made()
+
+
+@BACKENDS
+@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16], ids=str)
+def test_autocast_lowered_the_precision_in_silence(backend, precision):
+    """The reference and forward mode drew in half precision and refused sound rotations."""
+    model = [part.float() for part in field()]
+    pose = poses(1)
+    drawn = lambda means: rasterize(means, *model[1:], pose, GRID, backend=backend).image  # noqa: E731
+    layers = [torch.ones(size) / 3 for size in ((2, 3), (4, 3, 5), (4, 5), (4, 5, 2), (4, 2))]
+    outputs = lambda encoded: networks(encoded, *layers[1:])  # noqa: E731
+    for made, value in ((drawn, model[0]), (outputs, layers[0])):
+        wanted = jvp(made, (value,), (value,))
+        with torch.autocast("cpu", dtype=precision):
+            image, found = made(value), jvp(made, (value,), (value,))
+        assert torch.allclose(image, wanted[0], atol=1e-5)
+        for part, whole in zip(found, wanted, strict=True):
+            assert torch.allclose(part, whole, rtol=1e-5, atol=1e-5 * float(whole.abs().max()))
+
+
+@BACKENDS
+def test_a_plan_of_inference_mode_was_trained_in_the_words_of_a_library(backend):
+    model = [part.clone().requires_grad_() for part in field()]
+    with torch.inference_mode():
+        plan = make_plan(*model[:4], POSE, GRID, backend=backend)
+    for made in (lambda: composite(plan, *model), lambda: mean_weights(plan, *model[:4])):
+        with pytest.raises(RuntimeError, match=r"this plan was made in torch.inference_mode"):
+            made()
+    with torch.no_grad():
+        assert composite(plan, *model).image.isfinite().all()
 
 
 def test_an_operator_by_itself_and_a_frozen_view_refuse():
@@ -126,6 +252,31 @@ def test_an_operator_by_itself_and_a_frozen_view_refuse():
         with pytest.raises(RuntimeError, match="a frozen view has no derivatives"):
             view.render(features, 0)
         assert forward_ad.unpack_dual(composite(plan, *model[:4], features).image).tangent.abs().max() > 0
+
+
+@BACKENDS
+def test_a_frozen_view_was_a_constant_to_transforms(backend):
+    """Gradients were zero or failed in torch's words, tangents were dropped in silence."""
+    model = field()
+    plan = make_plan(*model[:4], POSE, GRID, backend=backend)
+    view = freeze(plan, *model[:4], version=0)
+    asked = (
+        lambda made, value: vjp(made, value)[1](made(value)),
+        lambda made, value: jvp(made, (value,), (value,)),
+        lambda made, value: jacrev(made)(value),
+        lambda made, value: jacfwd(made)(value),
+    )
+    for derivative in asked:
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives and cannot be mapped"):
+            derivative(lambda features: view.render(features, 0), model[4])
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives: composite the plan"):
+            derivative(lambda opacities: freeze(plan, *model[:3], opacities, version=0).order, model[3])
+    with pytest.raises(RuntimeError, match="cannot be mapped"):
+        vmap(lambda features: view.render(features, 0))(torch.stack([model[4], model[4]]))
+    with forward_ad.dual_level():
+        dual = forward_ad.make_dual(model[3], model[3])
+        with pytest.raises(RuntimeError, match="a frozen view has no derivatives"):
+            freeze(plan, *model[:3], dual, version=0)
 
 
 def test_networks_channels_and_similarity_have_forward_mode():

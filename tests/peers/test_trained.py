@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from clocks import wound
 from scenes import lobes, room
 
 from gsparc.methods import checkpoint
@@ -75,12 +76,27 @@ def test_the_budget_ends_training_and_the_schedule_reaches_its_end(tmp_path, mon
     data, fold = lobes(tmp_path)
     seen, ticks = [], count()
     monkeypatch.setattr("gsparc.peers.trained.rate_factor", lambda p: seen.append(p) or rate_factor(p))
-    monkeypatch.setattr("gsparc.peers.trained.time.process_time", lambda: next(ticks) * 0.05)
+    monkeypatch.setattr("gsparc.methods.time_budget.time.process_time", lambda: next(ticks) * 0.05)
     torch.set_num_threads(1)
     method = brief("swiftwrf", max_steps=None, budget_s=0.5)
-    method.fit(data, fold, FitContext(tmp_path))
+    assert method.fit(data, fold, FitContext(tmp_path)).limited_by == "processor"  # whatever the run's is
     assert len(set(seen)) == method.steps > 3 and 0.8 < seen[-1] < 1 and sorted(seen) == seen
     assert rate_factor(0.0) < 0.1 < rate_factor(0.05) and rate_factor(1.0) < 0.05
+
+
+def test_steps_that_are_given_repeat_exactly_or_the_clock_is_named(tmp_path, monkeypatch):
+    """The schedule followed the seconds where these were ahead: three runs, three models, and no word."""
+    data, fold = lobes(tmp_path)
+    clock, weights = wound(monkeypatch).process_time, []
+    for slow_s in (0.0, 0.2, 9.0):
+        method = brief("swiftwrf", budget_s=1.0)
+        build = method.build
+        method.build = lambda *a, build=build, slow_s=slow_s: clock.wind(slow_s) or build(*a)
+        report = method.fit(data, fold, FitContext(tmp_path))
+        assert report.limited_by == ("processor" if slow_s > 1 else None)
+        assert method.steps == (1 if slow_s > 1 else 3)
+        weights.append(torch.cat([w.flatten() for w in method.fitted().state_dict().values()]))
+    assert torch.equal(weights[0], weights[1]) and not torch.equal(weights[0], weights[2])
 
 
 def test_budgets_are_processor_time(tmp_path):

@@ -118,6 +118,18 @@ def test_an_edit_after_a_prediction_is_seen_by_the_next(tmp_path):
     assert method.predict(batch.tx, batch.rx).mean.sum() < 0.1 * before.sum()
 
 
+@pytest.mark.parametrize("cut", ["last.ckpt", "refit/last.ckpt"])
+def test_a_run_on_a_single_tone_can_be_resumed(tmp_path, cut):
+    """`loaded state dict has a different number of parameter groups`: its delays are not learned."""
+    file = channels(tmp_path / "own.npz", shape="S")
+    method, data, fold = fitted(file, tmp_path)
+    resumed = learned(file)
+    context = short(tmp_path / "on", 15, every=5, validate_every=10, resume=tmp_path / cut)
+    resumed.fit(data, fold, context)
+    before, after = method.fitted().state_dict(), resumed.fitted().state_dict()
+    assert all(torch.equal(before[key], after[key]) for key in before)
+
+
 def test_refit_learns_from_validation_rows_too_and_keeps_the_confidence(tmp_path):
     file = spectra(tmp_path / "own.npz")
     seen = {}

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import lightning.pytorch as L
 import pytest
 from campaigns import brief, compose, spectra
+from clocks import wound
+from contexts import short
 from torch import nn
 
 from gsparc.commands.train import train
+from gsparc.data.load import load as load_data
+from gsparc.data.load import split_for
 from gsparc.methods.method import FitContext
-from gsparc.training import time_budget
+from gsparc.methods.registry import build
+from gsparc.methods.time_budget import Spent, TimeBudget
+from gsparc.training import splatting
 from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
 from gsparc.training.time_budget import Budget, Pace, Stretched
 
@@ -63,25 +70,82 @@ def test_callbacks_see_the_step_of_the_schedule():
 
 
 def test_validation_is_not_billed_and_a_resumed_run_has_the_rest(monkeypatch):
-    now = SimpleNamespace(value=50.0)
-    monkeypatch.setattr(time_budget.time, "perf_counter", lambda: now.value)
+    clocks = wound(monkeypatch)
     trainer = SimpleNamespace(should_stop=False, state=SimpleNamespace(fn="fit"))
-    watch = Budget(Pace(100, 10.0))
+
+    def watching() -> Budget:
+        budget = TimeBudget(before=Spent(wall=30.0))  # preparation, which the pace does not see
+        budget.pause()
+        return Budget(Pace(100, 10.0), budget)
+
+    watch = watching()
     watch.on_train_start(trainer, None)
-    now.value += 4
+    clocks.monotonic.wind(4)
     watch.on_train_batch_end(trainer, None)
     watch.on_validation_start(trainer, None)
-    now.value += 1000
+    clocks.monotonic.wind(1000)
     watch.on_validation_end(trainer, None)
-    now.value += 2
-    assert watch.state_dict() == {"seconds": 6.0} and not trainer.should_stop
-    again = Budget(Pace(100, 10.0))
-    again.load_state_dict(watch.state_dict())
+    clocks.monotonic.wind(2)
+    state = watch.state_dict()
+    assert state["seconds"] == pytest.approx(6.0, abs=0.01) and not trainer.should_stop
+    again = watching()
+    again.load_state_dict(state)
     again.on_train_start(trainer, None)
     assert again.pace.step == 60
-    now.value += 4
+    clocks.monotonic.wind(4)
     again.on_train_batch_end(trainer, None)
     assert trainer.should_stop
+
+
+@pytest.fixture()
+def paces(monkeypatch):
+    """Seconds [s] of every stage's pace."""
+    found, make = [], splatting.Pace
+    monkeypatch.setattr(splatting, "Pace", lambda steps, left: found.append(left) or make(steps, left))
+    return found
+
+
+def fitted(tmp_path, monkeypatch, wall_s: float, processor_s: float, **context):
+    """Fit where preparing a stage takes so long [s], and every step a second by both clocks."""
+    clocks, prepare = wound(monkeypatch), splatting.prepare
+
+    def slow(task):
+        clocks.monotonic.wind(wall_s)
+        clocks.process_time.wind(processor_s)
+        return prepare(task)
+
+    class Ticking(L.Callback):
+        def on_before_optimizer_step(self, *unused):
+            clocks.monotonic.wind(1.0)
+            clocks.process_time.wind(1.0)
+
+    monkeypatch.setattr(splatting, "prepare", slow)
+    file = spectra(tmp_path / "own.npz")
+    data = load_data({"name": "own", "file": str(file)})
+    fold = split_for({"name": "random"}, data).folds[0]
+    method = build(compose(*brief(file)).model)
+    callbacks = context.pop("callbacks", lambda: [Ticking()])
+    return method.fit(data, fold, short(tmp_path, 30, callbacks=callbacks, every=2, **context))
+
+
+def test_preparation_and_earlier_stages_are_billed_by_the_clock_of_the_budget(tmp_path, monkeypatch, paces):
+    """They were billed in seconds of the wall: on a busy machine the refit had one step."""
+    report = fitted(tmp_path, monkeypatch, 500.0, 2.0, budget_s=20.0, budget_clock="processor")
+    assert paces == pytest.approx([10 - 2, 20 - 10 - 2], abs=1.2)  # the step in progress is finished
+    assert report.limited_by == "processor"
+
+
+def test_a_budget_that_is_spent_before_the_first_step_says_so(tmp_path, monkeypatch, paces, caplog):
+    fitted(tmp_path, monkeypatch, 6.0, 0.0, budget_s=11.0)
+    assert max(paces) < 0
+    assert "budget_s=11: 6.0 of 5.5 s went before the first step of stage train" in caplog.text
+    assert "of 11 s went before the first step of stage refit" in caplog.text
+
+
+def test_a_budgeted_run_that_goes_on_without_one_was_limited_all_the_same(tmp_path, monkeypatch):
+    fitted(tmp_path, monkeypatch, 0.0, 0.0, budget_s=10.0)
+    resumed = fitted(tmp_path, monkeypatch, 0.0, 0.0, resume=tmp_path / "last.ckpt")
+    assert resumed.limited_by == "wall"
 
 
 @pytest.mark.parametrize("wrong", [0, -3, float("inf")])

@@ -8,7 +8,9 @@ kriging; Matheron 1969). Images of several searches are averaged.
 from __future__ import annotations
 
 import logging
+import math
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -54,6 +56,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
     """
 
     effects = "moving_array"
+    takes_budget = True
 
     def __init__(
         self,
@@ -74,7 +77,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
         self.seed, self.name = seed, name
         self.trends: list[Trend] = []
-        self._budget: TimeBudget | None = None
+        self._budget = TimeBudget()
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Find sources, fit their powers and the residual.
@@ -85,8 +88,8 @@ class MovingArrayField(Interpolator, PredictsVariance):
         problem = site_problem(data)
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
-        self._budget = None if context.budget_s is None else context.time_budget(context.budget_s)
-        return super().fit(data, fold, context)
+        self._budget = context.time_budget()
+        return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
 
     def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
         """See `Explains`."""
@@ -130,7 +133,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
                 "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
                 self.name, len(errors), len(trend.sources), trend.kernel.length, errors[-1], now - begin,
             )  # fmt: skip
-            if budget is None:
+            if budget.seconds == math.inf:
                 done = len(errors) == self.searches
             else:
                 late = budget.over(BUDGET_SHARE - longest / budget.seconds)

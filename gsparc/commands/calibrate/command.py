@@ -69,8 +69,9 @@ def store(
 def _unseen(path: str, dataset: dict[str, Any], split: dict[str, Any]) -> Opened:
     """A checkpoint with test rows that it has not learned from: on others no promise would hold."""
     run = open_files([path], dataset, split)
-    if run.learned:
-        raise ValueError(f"{path} was trained on {run.foreign}; calibrate with the split of its training")
+    if run.learned != 0:
+        advice = "calibrate with the data and split of its training"
+        raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
     return run
 
 

@@ -13,6 +13,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.scores import score
 from gsparc.methods.method import FitContext, FitReport, Method
 from gsparc.methods.per_station import for_links
+from gsparc.methods.time_budget import Clock, weaker
 from gsparc.methods.timing import ClockSettings, cycling, interleaved
 
 QUERIES = 64  # different positions asked for
@@ -29,7 +30,7 @@ class Outcome:
         figures: accuracies pooled over folds, as in `Scores.figures`; empty when it was not scored.
         score_s: seconds that scoring took [s].
         notes: what the first fold's fit said.
-        time_limited: whether seconds ended a fit: on another machine the result may be another.
+        limited_by: the clock whose seconds decided something: on another machine the result may be another.
     """
 
     methods: tuple[Method, ...]
@@ -38,7 +39,7 @@ class Outcome:
     figures: dict[str, float | None]
     score_s: float
     notes: tuple[str, ...]
-    time_limited: bool = False
+    limited_by: Clock | None = None
 
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
         """The same fits scored on other data, such as displaced queries."""
@@ -76,7 +77,8 @@ def fit_and_score(
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
-    methods, seconds, processor, notes, limited = [], [], [], [], False
+    methods, seconds, processor, notes = [], [], [], []
+    limited: Clock | None = None
     for number, fold in enumerate(split.folds):
         there, rows = (data, fold) if learned is None else learned(data, fold)
         method, settings = for_links(make, there), context(number)
@@ -84,7 +86,7 @@ def fit_and_score(
         report = method.fit(there, rows, settings)
         processor.append(time.process_time() - before)
         seconds.append(report.seconds)
-        limited |= report.time_limited
+        limited = weaker(limited, report.limited_by)
         notes += [note for note in report.notes if number == 0]
         methods.append(method)
         if keep is not None:

@@ -22,7 +22,7 @@ from gsparc.data.files import platform_cache
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import baseline
 from gsparc.evaluation.figures import DECIDING, score_of
-from gsparc.evaluation.open_runs import Opened, open_files
+from gsparc.evaluation.open_runs import Opened, open_files, trained_on
 from gsparc.evaluation.scores import rows_of, score
 from gsparc.evaluation.summary import provenance, table, write_samples, write_summary
 from gsparc.methods import checkpoint, stored_front
@@ -104,7 +104,7 @@ def _others(config: DictConfig, run: Opened) -> dict[str, tuple[Method, float | 
         found[name] = (fitted.methods[0], fitted.scores.figures()[figure])
     for path in config.peers:
         method, other = checkpoint.load(path)
-        if other.extra.get("split_sha256") not in (None, run.split.sha256):
+        if trained_on([other], replace(run.split, folds=run.split.folds[:1])) is False:
             raise ValueError(f"peers: {path} was trained on another split than {config.ckpt}")
         names = (method.name, f"{method.name} ({Path(path).parent.name})", path)
         name = next(name for name in names if name not in found)

@@ -91,10 +91,10 @@ def test_several_searches_are_averaged(data, fold, fitted, tmp_path):
 def test_a_budget_is_spent_on_searches_while_they_help(data, fold, tmp_path):
     quick = dataclasses.replace(SEARCH, steps=5, candidates=500, rows=20)
     method = MovingArrayField(search=quick, components=16)
-    method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3))
-    assert len(method.trends) == 1
-    seconds = method.fit(data, fold, FitContext(tmp_path, budget_s=600.0)).seconds
-    assert len(method.trends) > 1 and seconds < 300
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=1e-3, budget_clock="processor"))
+    assert len(method.trends) == 1 and report.limited_by == "processor"  # which was not reported
+    report = method.fit(data, fold, FitContext(tmp_path, budget_s=600.0))
+    assert len(method.trends) > 1 and report.seconds < 300 and report.limited_by is None
     assert not method.resumable
 
 
