@@ -22,8 +22,21 @@ from gsparc.methods.registry import method_class
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 3  # raise it when a baseline or a metric changes its results
+CACHE_VERSION = 4  # raise it when a baseline or a metric changes its results
 STORE_ABOVE_S = 3.0  # processor time; cheaper fits are repeated, so that their times are current
+
+
+def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
+    """Names of all plain methods that serve these measurements and rows."""
+    site, names = data.site, BASELINES
+    if site.kind == "rssi":
+        return (*names, "distance_law", "kriging")
+    carrier = site.carrier_hz is not None or (
+        site.stations is not None and site.stations.carrier_hz is not None
+    )
+    if site.kind == "csi" and carrier and site.static_end is not None and split.name != "stations":
+        return (*names, "complex_gp")
+    return names
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from gsparc.data.files import whole_file
 from gsparc.evaluation.figures import DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
-ORDER = ("zero", "mean", "nearest", "idw", "gp")  # of the baselines
+ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
