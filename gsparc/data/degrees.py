@@ -14,7 +14,7 @@ def in_metres(check: Checker) -> Georeference | None:
         pair = check.given(f"{prefix}latitude", f"{prefix}longitude")
         if len(pair) == 1:
             return check.refuse(pair[0], "given alone; expected latitude and longitude")
-    arrays = check.raw.arrays
+    arrays, before = check.raw.arrays, len(check.problems)
     if "latitude" not in arrays:
         if "station_latitude" in arrays:
             return check.refuse("station_latitude", "given without latitude and longitude of the other end")
@@ -24,7 +24,7 @@ def in_metres(check: Checker) -> Georeference | None:
             "station_position", "in metres beside places in degrees; expected station_latitude"
         )
     places = {prefix: _read(check, prefix) for prefix in ("", "station_") if f"{prefix}latitude" in arrays}
-    if check.problems:
+    if len(check.problems) > before:
         return None
     origin = Georeference.about(*places[""])
     end = _moving(check)

@@ -29,8 +29,9 @@ def expand(check: Checker, measured: str) -> Links | None:
         measured: name of the measurement.
     """
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
+    before = len(check.problems)  # what is already noted does not keep from noting more
     origin = in_metres(check)
-    if check.problems or not _heights(check):
+    if len(check.problems) > before or not _heights(check):
         return None
     links = (
         _with_table(check, measured) if check.given("station_position") else _without_table(check, measured)
@@ -59,6 +60,7 @@ def _without_table(check: Checker, measured: str) -> Links | None:
 
 def _with_table(check: Checker, measured: str) -> Links | None:
     """A file with a table of stations, wide or long, as one row per link."""
+    before = len(check.problems)
     stations = station_table(check)
     given = check.given("rx_position", "tx_position")
     if len(given) != 1:
@@ -80,13 +82,13 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     run = _run(check, rows)
     which = station_of_row(check, rows, count) if long else None
     carriers = check.real("carrier_hz", (), (count,), (rows,)) if "carrier_hz" in check.raw.arrays else None
-    if check.problems:
+    if len(check.problems) > before:
         return None
     place = np.arange(rows)
     if long:
         assert which is not None
         positions = np.atleast_2d(check.real(f"{moving}_position", (3,), (rows, 3)))
-        if not len(check.problems) and len(positions) == rows:
+        if len(check.problems) == before and len(positions) == rows:
             place = numbered(positions)
         links = Links(OTHER[moving], stations, which, place, run=run)
     else:
