@@ -54,7 +54,8 @@ def _without_table(check: Checker, measured: str) -> Links | None:
         ends = [check.real(f"{end}_position", (3,), (rows, 3)) for end in ("rx", "tx")]
         if any(end is None for end in ends):
             return Links("tx", run=run)  # what is missing is said where positions are read
-        links = ends_of(check, *(np.broadcast_to(end, (rows, 3)) for end in ends), run)  # type: ignore[arg-type]
+        rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
+        links = ends_of(check, rx, tx, run)
     return _heard(check, measured, links, np.zeros(rows, np.int64))
 
 
@@ -87,8 +88,8 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     place = np.arange(rows)
     if long:
         assert which is not None
-        positions = np.atleast_2d(check.real(f"{moving}_position", (3,), (rows, 3)))
-        if len(check.problems) == before and len(positions) == rows:
+        positions = check.real(f"{moving}_position", (rows, 3))
+        if positions is not None:
             place = numbered(positions)
         links = Links(OTHER[moving], stations, which, place, run=run)
     else:

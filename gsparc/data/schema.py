@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -262,16 +262,19 @@ class Measurements:
 
     def subset(self, rows: np.ndarray, site: Site | None = None) -> Measurements:
         """Rows (n,) alone, seen as measurements of `site`."""
-        names = ("directions", "row_names")
-        parts = {
-            name: value
-            if value is None or name in ("site", "provenance", "release_split")
-            else [value[i] for i in rows]
-            if name in names
-            else value[rows]
-            for name, value in vars(self).items()
-        }
-        return Measurements(**{**parts, "site": site or self.site, "release_split": None})
+
+        def of(value: Any) -> Any:
+            return (
+                None
+                if value is None
+                else [value[i] for i in rows]
+                if isinstance(value, list)
+                else value[rows]
+            )
+
+        whole = ("site", "provenance", "release_split")
+        parts = {name: of(value) for name, value in vars(self).items() if name not in whole}
+        return Measurements(site=site or self.site, provenance=self.provenance, **parts)
 
     def batch(self, index: np.ndarray | Tensor) -> Batch:
         """The given rows as one batch."""

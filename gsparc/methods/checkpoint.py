@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import pickle
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import partial
 from io import BytesIO
@@ -219,7 +219,7 @@ def restore(stored: Stored) -> Method:
     model = stored.configuration.get("model")
     try:
         if isinstance(model, dict) and model.get("_target_") == stored.target:
-            make = partial(build, model, trusted=False)
+            make: Callable[[], Method] = partial(build, model, trusted=False)
         else:
             make = method_class(_registered(stored))
         method = PerStation(make) if "per_station" in stored.state else make()

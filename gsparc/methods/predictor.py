@@ -206,9 +206,9 @@ class Predictor:
             end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
         }
         moving, static = self.site.moving_end, self.site.static_end or "tx"
-        for end in (moving,) if self.site.static_end else ("rx", "tx"):
-            if end not in places:
-                raise ValueError(f"{end}= is needed: it moved when {self.site.name} was measured")
+        for needed in (moving,) if self.site.static_end else ("rx", "tx"):
+            if needed not in places:
+                raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
         single = all(place.ndim == 1 for place in places.values())
         if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
             asked = _float(np.atleast_2d(places[moving] - self.site.origin))
