@@ -33,9 +33,8 @@ def expand(check: Checker, measured: str) -> Links | None:
     origin = in_metres(check)
     if len(check.problems) > before or not _heights(check):
         return None
-    links = (
-        _with_table(check, measured) if check.given("station_position") else _without_table(check, measured)
-    )
+    read = _with_table if "station_position" in check.raw.arrays else _without_table
+    links = read(check, measured)
     return None if links is None else replace(links, georeference=origin)
 
 
@@ -139,14 +138,11 @@ def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray) ->
     mask = arrays.get("mask")
     if mask is not None and mask.shape != values.shape:
         return links  # said where the mask is read
-    if (
-        values.dtype.kind not in "iufc"
-        or values.ndim == 0
-        or (measured not in POWERS and links.stations is None)
-    ):
+    may_miss = measured in POWERS or links.stations is not None
+    if values.dtype.kind not in "iufc" or values.ndim == 0 or not may_miss:
         return links
     axes = tuple(range(1, values.ndim))
-    unknown = ~np.isfinite(values)
+    unknown = np.isnan(values)
     told = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
     censored = np.zeros(len(values), bool)
     if level is not None:
@@ -158,29 +154,21 @@ def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray) ->
             wrong = f"row {row} of {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
         arrays[measured] = np.where(censored, floor, values)
-    told_unknown = (
-        unknown if values.ndim == 1 else (unknown & (True if mask is None else mask)).any(axis=axes)
-    )
-    keep = told & ~(told_unknown & ~censored)
-    if mask is not None and not censored.any() and (told_unknown & told).any():
+    lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
+    if mask is not None and lost.any():
         return links  # marked as measured, and is not: refused where values are read
+    keep = told & ~lost
     if not keep.any():
         return check.refuse(measured, "nothing was measured; expected numbers")
     if not keep.all() or censored.any():
         _say_missing(check, measured, links, keep, censored)
         _keep(check.raw, measured, keep)
-        pick = {
-            name: value[keep]
-            for name, value in vars(links).items()
-            if name in ("station", "place", "run") and value is not None
-        }
+        parts = {name: getattr(links, name) for name in ("station", "place", "run")}
+        pick = {name: value[keep] for name, value in parts.items() if value is not None}
         links = replace(links, **pick)
         censored = censored[keep]
     if censored.any():
-        arrays = check.raw.arrays
-        shape = arrays[measured].shape
         arrays["mask"] = ~censored if "mask" not in arrays else arrays["mask"].astype(bool) & ~censored
-        assert arrays["mask"].shape == shape
         return replace(links, censored=censored)
     return links
 
