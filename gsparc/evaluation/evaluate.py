@@ -12,6 +12,7 @@ import numpy as np
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
+from gsparc.evaluation.intervals import power_intervals
 from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods import timing
@@ -74,14 +75,19 @@ def evaluate(
     others = {name: baseline(name, data, split, eval_on, cache) for name in names}
     facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
     facts |= {f"{eval_on}/{k}": v for k, v in scores.decided_by().items()}
+    powers = data.site.kind == "rssi"
+    if powers:
+        facts |= {f"{eval_on}/{k}": v for k, v in power_intervals(scores, data).items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
-    unheard = data.station if split.name == "stations" and data.site.kind == "rssi" else None
+    unheard = data.station if split.name == "stations" and powers else None
     if unheard is not None:
         facts[f"{eval_on}/rmse_db_after_constant"] = scores.after_constant(unheard)
     for name, other in others.items():
         own = {**other.scores.figures(), "skill": _skill(other.scores, others)}
         if unheard is not None:
             own["rmse_db_after_constant"] = other.scores.after_constant(unheard)
+        if powers:
+            own |= power_intervals(other.scores, data)
         own["train_s"] = float(np.mean(other.train_s))
         facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:

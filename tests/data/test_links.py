@@ -145,7 +145,7 @@ SPOILT = {
     "no end": (town(tx_position=None), "of the end that moves; found neither"),
     "no table": (town(station_position=None, station=np.zeros(PLACES, int)), "without station_position"),
     "all missing": (town(rssi_db=LEVELS * np.nan), "nothing was measured"),
-    "an infinite power": (town(rssi_db=np.where(LEVELS == LEVELS.max(), np.inf, LEVELS)), "not finite"),
+    "an infinite power": (town(rssi_db=np.where(LEVELS.max() == LEVELS, np.inf, LEVELS)), "not finite"),
     "below the level": (town(sensitivity_db=-50.0), r"row \d+ of rssi_db is .* below -50"),
     "level of channels": (town(rssi_db=None, rssi=LEVELS**2, sensitivity_db=-80.0), "goes with rssi_db"),
     "level of 1e9": (town(sensitivity_db=1e9), "expected dB between -400 and 400"),
