@@ -18,9 +18,9 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     """Figures of predicted normal distributions of decibels; empty where the method has no variance.
 
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
-    `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share of
-    rows that were, and `outage/brier` the mean square of (predicted probability - what happened): 0 is perfect,
-    and `outage/brier_rate` is what always saying the rate gives.
+    `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
+    of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
+    perfect, and `outage/brier_rate` what always saying the rate gives.
 
     Args:
         scores: of powers (kind rssi).
