@@ -17,7 +17,7 @@ import numpy as np
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
-from gsparc.data.outliers import loud, peaks
+from gsparc.data.outliers import peaks, too_strong
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import LIGHT, Kind, Measurements
@@ -301,7 +301,7 @@ def _scaled(name: str, values: np.ndarray, mask: np.ndarray | None) -> tuple[np.
         values = 10 ** (values / 10) * (1 if mask is None else mask)
     if name == "spectrum":
         highest = peaks(values)
-        largest = float(highest[~loud(highest)].max(initial=0.0))
+        largest = float(highest[~too_strong(highest)].max(initial=0.0))
         scale = 1.0 if 0.1 <= largest <= 1 else largest
     elif name == "csi":
         scale = rounded_rms(values, mask)
