@@ -94,7 +94,7 @@ class ArrayField(PredictsVariance):
             f"{self.name}: phase retrieval {recovery_s:.1f} s (this run {elapsed:.1f} s), training "
             f"{seconds - recovery_s:.1f} s, {int(found.suspect.sum())} suspect spectra"
         ]
-        return FitReport(seconds, tuple(notes), "processor" if found.hurried.any() else None)
+        return FitReport(seconds, tuple(notes), "processor" if found.time_limited.any() else None)
 
     def _learn(self, data: Measurements, rows: np.ndarray, vectors: np.ndarray) -> None:
         site = data.site

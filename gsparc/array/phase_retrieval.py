@@ -40,7 +40,7 @@ class Recovered:
         residual: (n,) root mean square over pixels of `|A^H h|^2 - image^2`, the part inside the lags.
         floor: (n,) the same for the part that no array vector can explain.
         expected: (n,) the same as quantisation alone would make it.
-        hurried: (n,) bool: seconds ended the search, so that another machine's result may differ.
+        time_limited: (n,) bool: seconds ended the search, so that another machine's result may differ.
     """
 
     vectors: np.ndarray
@@ -48,7 +48,7 @@ class Recovered:
     residual: np.ndarray
     floor: np.ndarray
     expected: np.ndarray
-    hurried: np.ndarray
+    time_limited: np.ndarray
 
     @property
     def suspect(self) -> np.ndarray:
@@ -70,7 +70,7 @@ def recover(
             after this many seconds of the processor, because runs of either clock share the result (spectra
             of another array never converge) [s].
     """
-    budget, hurried = TimeBudget(budget_s, "processor"), np.zeros(len(images), dtype=bool)
+    budget, time_limited = TimeBudget(budget_s, "processor"), np.zeros(len(images), dtype=bool)
     problem = _Problem.of(site, images)
     generator = torch.Generator().manual_seed(seed)
     n = len(images)
@@ -90,7 +90,7 @@ def recover(
         if not len(unsolved):
             break
         if turn > 1 and budget.over():
-            hurried[unsolved.numpy()] = True
+            time_limited[unsolved.numpy()] = True
             break
         for rows in unsolved.split(max(1, 1536 // starts)):
             keep(rows, _search(problem, rows, problem.random(rows, starts, generator), enough))
@@ -107,7 +107,7 @@ def recover(
         log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
     for rows in every.split(512):
         keep(rows, _search(problem, rows, state[rows], torch.zeros_like(enough), FINAL_ITERATIONS))
-    return problem.result(state, cost, hurried)
+    return problem.result(state, cost, time_limited)
 
 
 def _solved_neighbours(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
@@ -184,12 +184,12 @@ class _Problem:
         error = error - 2 * o * self.z1[rows] - o.square() * self.z0
         return error, torch.cat([2 * half, (-2 * self.z1[rows] - 2 * o * self.z0)[:, :, None]], 2)
 
-    def result(self, state: Tensor, cost: Tensor, hurried: np.ndarray) -> Recovered:
+    def result(self, state: Tensor, cost: Tensor, time_limited: np.ndarray) -> Recovered:
         m = len(self.forms) // 2
         vectors = torch.complex(state[:, :m], state[:, m : 2 * m]).numpy()
         offset = state[:, -1].numpy() if self.offsets else np.zeros(len(state))
         residual, floor, expected = (v.numpy() for v in (cost.sqrt(), self.floor, self.expected))
-        return Recovered(vectors, offset, residual, floor, expected, hurried)
+        return Recovered(vectors, offset, residual, floor, expected, time_limited)
 
 
 def _search(

@@ -40,7 +40,7 @@ class Vectors:
         vectors: (n, M) complex128.
         prior: features of the emission.
         elapsed, training: time of phase retrieval in this run, and when it was computed.
-        hurried: whether seconds ended it.
+        time_limited: whether seconds ended it.
     """
 
     rows: np.ndarray
@@ -48,7 +48,7 @@ class Vectors:
     prior: Prior
     elapsed: Spent
     training: Spent
-    hurried: bool
+    time_limited: bool
 
 
 class ThroughArray:
@@ -60,7 +60,7 @@ class ThroughArray:
         found = aligned_vectors(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         solve = partial(start, data=task.data, found=found, receiver=task.receiver)
         return Start(
-            found.prior, None, solve, astuple(found.training), astuple(found.elapsed), found.hurried
+            found.prior, None, solve, astuple(found.training), astuple(found.elapsed), found.time_limited
         )  # fmt: skip
 
 
@@ -80,7 +80,7 @@ def aligned_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: in
     if len(rows) > anchors:
         places = places[np.sort(np.random.default_rng(seed).choice(len(rows), anchors, replace=False))]
     prior = Prior(torch.from_numpy(places.astype(np.float32)), kernel.length, max(kernel.noise, MIN_NOISE))
-    return Vectors(rows, process.vectors, prior, elapsed, training, bool(found.hurried.any()))
+    return Vectors(rows, process.vectors, prior, elapsed, training, bool(found.time_limited.any()))
 
 
 @torch.no_grad()

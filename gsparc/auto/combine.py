@@ -27,7 +27,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import ComparesWithGP, Differentiable, FitContext, LeaveOneOut, LeftOut, Method
 from gsparc.methods.registry import method_class
-from gsparc.methods.time_budget import Clock, TimeBudget, weaker
+from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
 from gsparc.ops import Pose
 
 LEVEL_DB = 0.25  # a process on images this far behind an array, both left out alike, is level with it
@@ -147,12 +147,12 @@ def held_out_ratio(
     for number, fold in enumerate(fifths(rows, seed)):
         if number and budget.over():
             break
-        limited = weaker(limited, trial.fit(data, fold, FitContext(budget_clock=clock)).limited_by)
+        limited = less_repeatable(limited, trial.fit(data, fold, FitContext(budget_clock=clock)).limited_by)
         held.append(nmse_of(trial, data, fold.test))
         promised.append(left_out_nmse(trial, data))
     error = float(np.mean(held))
     ratio = max(error / max(float(np.mean(promised)), 1e-30), 1.0)
-    return error, ratio, weaker(limited, budget.limited_by)
+    return error, ratio, less_repeatable(limited, budget.limited_by)
 
 
 def weight_of(directed: Method, searched: Method, ratio: float) -> float:

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import Explains, FitContext, Method
-from gsparc.methods.time_budget import Clock, weaker
+from gsparc.methods.time_budget import Clock, less_repeatable
 
 Switch = bool | Literal["auto", "splat"]
 SPLAT: Literal["splat"] = "splat"
@@ -193,7 +193,7 @@ def probe_phase(
         return Decision("phase", False, silent, time.perf_counter() - started)
     errors = []
     for method in (trial, rival):
-        limited = weaker(limited, method.fit(data, inner, FitContext(budget_clock=clock)).limited_by)
+        limited = less_repeatable(limited, method.fit(data, inner, FitContext(budget_clock=clock)).limited_by)
         errors.append(nmse_of(method, data, inner.test))
     reason = (
         f"neighbours are {dense:.2f} wavelengths apart"
@@ -236,7 +236,7 @@ def contest_array(trial: Method, rival: Method, data: Measurements, fold: Fold, 
     batch, errors = data.batch(inner.test), []
     for method in (trial, rival):
         with tempfile.TemporaryDirectory() as aside:  # what a trial writes is no part of the run
-            limited = weaker(limited, method.fit(data, inner, FitContext(Path(aside))).limited_by)
+            limited = less_repeatable(limited, method.fit(data, inner, FitContext(Path(aside))).limited_by)
         errors.append(float((method.predict(batch.tx, batch.rx).mean - batch.target).square().mean()))
     reason = (
         f"neighbours are {apart:.2f} wavelengths apart; on a held-out fifth of the training spectra the "

@@ -28,7 +28,7 @@ from gsparc.methods.method import (
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import method_class
-from gsparc.methods.time_budget import Clock, weaker
+from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.ops import Pose
 from gsparc.training.splatting import LearnedField
 
@@ -116,7 +116,7 @@ class Gsparc(LearnedField):
             log.info("%s", decision)
             self.decisions = (*self.decisions, decision)
             self._weigh_directional()
-        limited = weaker(report.limited_by, *(d.limited_by for d in self.decisions))
+        limited = less_repeatable(report.limited_by, *(d.limited_by for d in self.decisions))
         seconds = report.seconds + sum(d.seconds for d in self.decisions)
         return replace(report, seconds=seconds, limited_by=limited)
 

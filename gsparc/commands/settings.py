@@ -48,9 +48,8 @@ class RunSettings(Checked):
         known: dict[str, Any] = {f.name: given[f.name] for f in fields(cls) if f.name in given}
         found = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
         trainer = given.get("trainer") or {}
-        or_null(POSITIVE).check(
-            "trainer.gradient_clip_val", trainer.get("gradient_clip_val")
-        )  # Lightning takes any
+        clip = trainer.get("gradient_clip_val")
+        or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
         if trainer.get("accelerator") in ("gpu", "cuda") and not torch.cuda.is_available():
             raise SettingError(
                 f"trainer.accelerator={trainer['accelerator']}: there is no GPU here; say trainer=cpu"

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gsparc.data.errors import Problems
-from gsparc.data.outliers import far, loud, peaks
+from gsparc.data.outliers import peaks, too_far, too_strong
 from gsparc.data.schema import Links, Measurements, Site
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
@@ -37,11 +37,11 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     """Root mean square of rows `values` (S, ...), real or complex, in whole dB; 0 if all are zero.
 
-    This is a constant of the site, taken over all rows but those that `loud` finds far above the others:
+    This is a constant of the site, taken over all rows but those that are `too_strong` for the others:
     rounding keeps any single row (which may be a test row) from influencing it. `weight` is a bool mask of
     measured entries.
     """
-    usual = ~loud(peaks(values, weight))
+    usual = ~too_strong(peaks(values, weight))
     values, weight = values[usual], None if weight is None else weight[usual]
     magnitude = np.abs(values if weight is None else values[weight]).astype(np.float64)
     peak = float(magnitude.max(initial=0.0))
@@ -101,7 +101,7 @@ def assemble(
     links = links or Links(static_end)
     stations, unknown = links.stations, links.unknown_transmitter
     # A place far outside would put the middle there, where float32 has lost centimetres.
-    usual = ~far(tx if static_end == "rx" else rx)
+    usual = ~too_far(tx if static_end == "rx" else rx)
     ends = np.concatenate([rx[usual]] if unknown else [tx[usual], rx[usual]])
     lower, upper = ends.min(axis=0), ends.max(axis=0)
     origin = (lower + upper) / 2

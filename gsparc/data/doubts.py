@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from gsparc.data.level_steps import MOST_BLOCKS, level_steps
-from gsparc.data.outliers import far
+from gsparc.data.outliers import too_far
 
 NAMED = 5  # rows or stations in a line
 HIGHEST_DBM = 60.0  # a kilowatt received
@@ -58,7 +58,7 @@ def position_doubts(position: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Positions (n, 2) or (n, 3) that may be degrees or millimetres, do not differ, or lie far off."""
     if not np.ptp(position, axis=0).any():
         return ["all positions are the same, a box of 0 m: is it the moving end's column?"]
-    lost = far(position)
+    lost = too_far(position)
     found = []
     if lost.any():
         which = _some(rows, np.flatnonzero(lost))

@@ -19,7 +19,7 @@ FAR_M = 50.0  # and this much farther: in a small box nothing is far
 NAMED = 5  # rows in a message
 
 
-def loud(peaks: np.ndarray) -> np.ndarray:
+def too_strong(peaks: np.ndarray) -> np.ndarray:
     """Rows (S,) bool whose largest magnitude `peaks` (S,) is far above all others'; silent rows are not."""
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
@@ -29,7 +29,7 @@ def loud(peaks: np.ndarray) -> np.ndarray:
     return found
 
 
-def far(positions: np.ndarray) -> np.ndarray:
+def too_far(positions: np.ndarray) -> np.ndarray:
     """Rows (S,) bool of `positions` (S, 3) [m] that lie far outside the region of all others."""
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
@@ -55,8 +55,8 @@ def outliers(data: Measurements) -> dict[str, np.ndarray]:
     amplitude = peaks(data.target, data.mask)
     amplitude = np.sqrt(amplitude) if data.site.kind == "rssi" else amplitude
     found = {
-        "measure far more power than all others": np.flatnonzero(loud(amplitude)),
-        "lie far outside the region of all others": np.flatnonzero(far(data.moving)),
+        "measure far more power than all others": np.flatnonzero(too_strong(amplitude)),
+        "lie far outside the region of all others": np.flatnonzero(too_far(data.moving)),
     }
     return {what: rows for what, rows in found.items() if len(rows)}
 

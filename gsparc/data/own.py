@@ -18,7 +18,7 @@ from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.links import expand
-from gsparc.data.outliers import loud, peaks
+from gsparc.data.outliers import peaks, too_strong
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import LIGHT, Kind, Links, Measurements
@@ -308,7 +308,7 @@ def _scaled(
         values = 10 ** (values / 10) * (1 if mask_or_level is None else mask_or_level)
     if name == "spectrum":
         highest = peaks(values)
-        largest = float(highest[~loud(highest)].max(initial=0.0))
+        largest = float(highest[~too_strong(highest)].max(initial=0.0))
         scale = 1.0 if 0.1 <= largest <= 1 else largest
     elif name == "csi":
         scale = rounded_rms(values, mask)

@@ -98,9 +98,8 @@ def _write_hdf5(path: Path, raw: Raw) -> None:
                 stored.attrs["units"] = np.bytes_(raw.units[name], "utf-8")
         for name, value in raw.attributes.items():
             file.attrs[name] = np.bytes_(value, "utf-8") if isinstance(value, str) else value
-        file.attrs[DIGEST] = np.bytes_(
-            _digest(raw), "utf-8"
-        )  # HDF5 has no checksums of numbers and attributes
+        # HDF5 has no checksums of numbers and attributes.
+        file.attrs[DIGEST] = np.bytes_(_digest(raw), "utf-8")
 
 
 def _digest(raw: Raw) -> str:
@@ -118,10 +117,10 @@ def _digest(raw: Raw) -> str:
 
 def is_archive(path: Path) -> bool:
     """Whether a file is a zip archive from its first byte on."""
-    with path.open("rb") as file:
-        if file.read(4) != b"PK\x03\x04":
-            return False
     try:
+        with path.open("rb") as file:
+            if file.read(4) != b"PK\x03\x04":
+                return False
         return zipfile.is_zipfile(path)
     except zipfile.BadZipFile:  # a damaged directory of a large archive
         return False
@@ -130,7 +129,11 @@ def is_archive(path: Path) -> bool:
 def _read_npz(path: Path) -> Raw:
     arrays: dict[str, np.ndarray] = {}
     name = "the archive"
-    if not is_archive(path):
+    try:
+        archive = is_archive(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read ({reason(error)})") from None
+    if not archive:
         # numpy would take anything else for a pickle and speak of that.
         raise DataError(f"{path}: damaged or not an npz archive; save with numpy.savez")
     try:

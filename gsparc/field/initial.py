@@ -66,7 +66,7 @@ class Start:
         solve: sets the parameters of a fresh model.
         billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
             the processor [s].
-        hurried: whether seconds ended that work.
+        time_limited: whether seconds ended that work.
     """
 
     prior: Prior | None
@@ -74,7 +74,7 @@ class Start:
     solve: Callable[[GaussianModel], None] = unchanged
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
-    hurried: bool = False
+    time_limited: bool = False
 
 
 class Initialiser(Protocol):

@@ -109,8 +109,8 @@ def amend(path: str | Path, extra: Mapping[str, Any]) -> None:
         CheckpointError: as `read` and `save` do; the file is then as it was.
     """
     path = Path(path)
-    read(path)  # refuses what is no good checkpoint
-    content = torch.load(_checked(path), map_location="cpu", weights_only=True)
+    content = _content(path)
+    _stored(content, path)  # refuses what is incomplete
     content["extra"] = {**content["extra"], **_plain(dict(extra), "extra")}
     _write(path, content)
 
@@ -138,6 +138,11 @@ def read(path: str | Path) -> Stored:
             that are NaN or infinite.
     """
     path = Path(path)
+    return _stored(_content(path), path)
+
+
+def _content(path: Path) -> dict[str, Any]:
+    """What the archive holds, of our format and of finite numbers (CheckpointError)."""
     if path.is_dir():
         inside = [*path.glob(MODEL), *sorted(path.glob(f"fold*/{MODEL}"))]
         hint = f"say {inside[0]}" if inside else f"give the file itself, {MODEL} of a run"
@@ -171,6 +176,10 @@ def read(path: str | Path) -> Stored:
         where = non_finite(content.get(part), part)
         if where is not None:  # its checksum is right: it was written like this
             raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
+    return content
+
+
+def _stored(content: Mapping[str, Any], path: Path) -> Stored:
     try:
         return Stored(
             method=str(content["method"]),

@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 # Settings that a run must share with what it goes on from.
 DECIDING = ("model", "dataset.batch_size", "init_from")
-RHYTHM = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
+CHANGEABLE = ("trainer", "callbacks", "budget_s", "budget_clock", "model.refit")
 """Settings that may change on the way, and are then named."""
 UNHASHED = (
     "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
@@ -31,7 +31,7 @@ UNHASHED = (
 # What is hashed, the group of settings that names it, in words.
 _HASHED = (
     ("data", "dataset", "data"),
-    ("beside", "dataset", "directions or uplink"),
+    ("auxiliary", "dataset", "directions or uplink"),
     ("rows", "split", "rows"),
 )
 
@@ -42,14 +42,14 @@ class Origin:
 
     Attributes:
         site: of the measurements.
-        beside: hash of their directions and uplink, which their content hash leaves out.
+        auxiliary: hash of their directions and uplink, which their content hash leaves out.
         rows: hash of the fold's indices.
         seed: of the run.
         config: YAML text; "" from Python without one.
     """
 
     site: Site
-    beside: str
+    auxiliary: str
     rows: str
     seed: int
     config: str = ""
@@ -58,18 +58,18 @@ class Origin:
     def of(cls, data: Measurements, fold: Fold, context: FitContext) -> Origin:
         """Of a fit that begins."""
         directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
-        beside = content_hash({**directions, "uplink": data.uplink})
-        return cls(data.site, beside, indices_hash((fold,)), context.seed, context.config_yaml)
+        auxiliary = content_hash({**directions, "uplink": data.uplink})
+        return cls(data.site, auxiliary, indices_hash((fold,)), context.seed, context.config_yaml)
 
     def marks(self) -> dict[str, Any]:
         """For the `extra` of a checkpoint, which holds the configuration itself."""
         return {"origin": {**self._hashes(), "seed": self.seed}}
 
     def _hashes(self) -> dict[str, str]:
-        return {"data": self.site.sha256, "beside": self.beside, "rows": self.rows}
+        return {"data": self.site.sha256, "auxiliary": self.auxiliary, "rows": self.rows}
 
     def refuse_other(self, stored: Stored) -> None:
-        """Whether training may go on from `stored`; settings of its rhythm that changed are logged.
+        """Whether training may go on from `stored`; settings of its schedule that changed are logged.
 
         Raises:
             ValueError: it is of other data, rows, seed or settings, which are named.
@@ -94,7 +94,7 @@ class Origin:
                 f"ckpt_path={stored.path}: was trained with {'; '.join(found)}: "
                 "go on with the same, or start again without ckpt_path"
             )
-        changed = _differences(before, now, RHYTHM)
+        changed = _differences(before, now, CHANGEABLE)
         if changed:
             log.warning("going on from %s, which had %s", stored.path, "; ".join(changed))
 
@@ -105,7 +105,7 @@ def _differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[
         return []
     one, two = dict(_leaves(before)), dict(_leaves(now))
     under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
-    under = [k for k in under if keys is RHYTHM or k not in RHYTHM]
+    under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
     return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
 
 

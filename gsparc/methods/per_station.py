@@ -18,7 +18,7 @@ from torch import Tensor
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
-from gsparc.methods.time_budget import Clock, weaker
+from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.ops import Pose
 
 SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
@@ -95,7 +95,7 @@ class PerStation(Method):
             where = context.run_dir / f"station{number}" if number != UNHEARD else context.run_dir / "unheard"
             report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
             self._copies[number] = copy
-            seconds, limited = seconds + report.seconds, weaker(limited, report.limited_by)
+            seconds, limited = seconds + report.seconds, less_repeatable(limited, report.limited_by)
             name = "stations never heard" if number == UNHEARD else data.site.stations.name[number]
             notes += [f"{name}: {note}" for note in report.notes]
         return FitReport(seconds, tuple(notes), limited)

@@ -38,7 +38,7 @@ class Spent:
 NOTHING = Spent()
 
 
-def weaker(*clocks: Clock | None) -> Clock | None:
+def less_repeatable(*clocks: Clock | None) -> Clock | None:
     """Of clocks that decided something, the one whose seconds repeat a result worst; None of none."""
     return "wall" if "wall" in clocks else next(filter(None, clocks), None)
 

@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
-from gsparc.methods.time_budget import TimeBudget, weaker
+from gsparc.methods.time_budget import TimeBudget, less_repeatable
 from gsparc.multipath.diffraction import (
     Edges,
     diffracted,
@@ -142,7 +142,7 @@ class ImageSourceGP(FramedMethod):
         if len(clutter):
             these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
             notes.append(f"{self.name}: clutter: {these}")
-        limited = weaker(budget.limited_by, cache.limited_by)
+        limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
 
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:

@@ -13,7 +13,7 @@ import torch
 
 from gsparc.data.files import whole_file
 from gsparc.methods.checkpoint import SEARCHES
-from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget, weaker
+from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget, less_repeatable
 from gsparc.multipath.phased_gp import PhasedScene
 
 log = logging.getLogger(__name__)
@@ -88,7 +88,7 @@ class SearchCache:
     def put(self, name: str, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
-            self.limited_by = weaker(self.limited_by, limited_by)
+            self.limited_by = less_repeatable(self.limited_by, limited_by)
             self._kept[name] = {"scene": member.phased.state(), "left_out": member.left_out}
             if self._path is None:
                 return

@@ -203,7 +203,7 @@ def _quieten_lightning() -> None:
     for pointless in (
         r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
         r".*does not have many workers.*",  # data this small is faster without
-        r".*callbacks used to create the checkpoint need to be provided.*",  # a rhythm may change
+        r".*callbacks used to create the checkpoint need to be provided.*",  # schedules may change
         r".*The dirpath has changed.*",  # a resumed run may have a directory of its own
         r".*recommended to use `self.log\(.*sync_dist=True.*",  # every device validates all rows
         r".*Grad strides do not match bucket view strides.*",  # of DistributedDataParallel, for harmonics

@@ -28,7 +28,7 @@ from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.origin import Origin
-from gsparc.methods.time_budget import Clock, Spent, TimeBudget, weaker
+from gsparc.methods.time_budget import Clock, Spent, TimeBudget, less_repeatable
 from gsparc.ops import Pose
 from gsparc.training import reduce
 from gsparc.training.auto_settings import Choices, resolve, settled
@@ -115,7 +115,7 @@ class LearnedField(Method):
         budget = context.time_budget(before=Spent(*marks.get("spent", (seconds, seconds))))
         budget.pause()
         now = None if context.budget_s is None else context.budget_clock
-        self._billed, self._limited_by = Spent(), weaker(now, marks.get("limited_by"))
+        self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
@@ -159,7 +159,7 @@ class LearnedField(Method):
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
             budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
             self._billed = Spent(*start.billed_s)
-            self._limited_by = weaker(self._limited_by, "processor" if start.hurried else None)
+            self._limited_by = less_repeatable(self._limited_by, "processor" if start.time_limited else None)
         else:
             self.restore(data.site, checkpoint.read(resume).state)
         if confidence is not None:

@@ -73,7 +73,7 @@ def test_rows_that_seconds_gave_up_are_known_also_from_the_cache(known_campaign,
     monkeypatch.setattr(vector_cache, "recover", partial(recover, budget_s=0.0))
     for cache in (tmp_path, tmp_path):
         found, _ = vector_cache.recovered(spoilt, np.arange(8), cache)
-        assert np.flatnonzero(found.hurried).tolist() == [5]
+        assert np.flatnonzero(found.time_limited).tolist() == [5]
     fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
     for measured, clock in ((spoilt, "processor"), (data, None)):
         assert ArrayField(cache=False).fit(measured, fold, FitContext(tmp_path)).limited_by == clock

@@ -310,7 +310,7 @@ def test_a_training_state_that_is_not_finite_is_refused_before_training(interrup
     assert not (tmp_path / "run" / "learning_curve.csv").exists()
 
 
-def test_settings_of_the_rhythm_may_change_and_are_named(interrupted, tmp_path, caplog):
+def test_settings_of_the_schedule_may_change_and_are_named(interrupted, tmp_path, caplog):
     file, last = interrupted
     train(compose(*brief(file, "model.refit=false", "trainer.max_steps=25", f"ckpt_path={last}")), tmp_path)
     assert re.search(r"which had trainer\.max_steps=\d+ \(here 25\)", caplog.text)

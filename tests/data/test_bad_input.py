@@ -4,6 +4,7 @@
 import json
 import warnings
 import zipfile
+from pathlib import Path
 
 import h5py
 import numpy as np
@@ -317,6 +318,18 @@ def test_an_array_twice_in_an_archive_is_refused(tmp_path, csi_arrays):
         warnings.simplefilter("ignore")  # Python warns of the name
         archive.writestr("csi.npy", archive.read("csi.npy"))
     with pytest.raises(DataError, match=r"csi: damaged .*twice"):
+        load_own(tmp_path / "a.npz")
+
+
+def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, monkeypatch):
+    """The reason is the system's, not a traceback, and not "damaged"."""
+    np.savez(tmp_path / "a.npz", **csi_arrays)
+
+    def refuse(*unused, **more):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "open", refuse)
+    with pytest.raises(DataError, match=r"a\.npz: cannot be read .*Permission denied"):
         load_own(tmp_path / "a.npz")
 
 

@@ -10,7 +10,7 @@ from campaigns import channels, powers, spectra
 
 from gsparc.commands.check import main as check
 from gsparc.data.load import load, split_for
-from gsparc.data.outliers import far, loud, outliers
+from gsparc.data.outliers import outliers, too_far, too_strong
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
 KINDS = pytest.mark.parametrize("kind", MAKERS)
@@ -108,11 +108,14 @@ def test_rows_to_leave_out_may_be_numbers_of_numpy(rows, tmp_path):
 def test_real_dynamics_are_no_outliers():
     """Free space from 3 cm to 30 m is 60 dB, and a silent half leaves nothing suspicious."""
     distance = np.geomspace(0.03, 30, 200)
-    assert not loud(1 / distance).any()
-    assert not loud(np.where(np.arange(200) % 2, 1 / distance, 0)).any() and not loud(np.zeros(9)).any()
-    assert loud(np.append(1 / distance, 1e12)).nonzero()[0].tolist() == [200]
+    assert not too_strong(1 / distance).any()
+    assert (
+        not too_strong(np.where(np.arange(200) % 2, 1 / distance, 0)).any()
+        and not too_strong(np.zeros(9)).any()
+    )
+    assert too_strong(np.append(1 / distance, 1e12)).nonzero()[0].tolist() == [200]
     track = np.stack([np.linspace(0, 5e3, 300), np.zeros(300), np.zeros(300)], 1)
-    assert not far(track).any() and not far(np.zeros((5, 3))).any()
+    assert not too_far(track).any() and not too_far(np.zeros((5, 3))).any()
 
 
 def test_a_row_beyond_float32_is_refused(tmp_path):
@@ -127,17 +130,17 @@ def test_a_row_beyond_float32_is_refused(tmp_path):
 def test_rows_with_signal_are_no_outliers_among_rows_without(others):
     """Where most rows stood at a floor, all rows with signal were called outliers and left out of scale."""
     heard = np.linspace(-95, -50, 40)
-    assert not loud(10 ** (np.concatenate([others, heard]) / 20)).any()
-    assert loud(10 ** (np.append(heard, 20.0) / 20)).sum() == 1
+    assert not too_strong(10 ** (np.concatenate([others, heard]) / 20)).any()
+    assert too_strong(10 ** (np.append(heard, 20.0) / 20)).sum() == 1
 
 
 def test_a_robot_that_waits_makes_no_outliers():
     """With most rows at one place the median distance is 0, and everything else was far."""
     places = np.random.default_rng(0).uniform(0, [10, 10, 2], (100, 3))
     places[:60] = 5.0
-    assert not far(places).any()
+    assert not too_far(places).any()
     places[99] = [300, 5, 1]
-    assert np.flatnonzero(far(places)).tolist() == [99]
+    assert np.flatnonzero(too_far(places)).tolist() == [99]
 
 
 def test_passing_a_station_is_no_outlier():
@@ -148,4 +151,4 @@ def test_passing_a_station_is_no_outlier():
     with np.load(file) as stored:
         powers_db = stored["rssi_db"]
     for column in powers_db.T:
-        assert not loud(10 ** (column[np.isfinite(column)] / 20)).any()
+        assert not too_strong(10 ** (column[np.isfinite(column)] / 20)).any()

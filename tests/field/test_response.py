@@ -64,7 +64,7 @@ def test_one_channel_learns_no_delay():
 
 @pytest.mark.slow
 def test_1664_channels_cost_no_more_than_twice_one(tmp_path):
-    """64 antennas x 26 subcarriers through the whole model; median of interleaved rounds."""
+    """64 antennas x 26 subcarriers through the whole model; the quicker of interleaved rounds."""
     data = load_data({"name": "own", "file": str(channel_file(tmp_path / "own.npz"))})
     calls = {}
     for name, shape in (("one", (1, 1)), ("many", (64, 26))):
@@ -81,7 +81,8 @@ def test_1664_channels_cost_no_more_than_twice_one(tmp_path):
             begin = time.perf_counter()
             method.predict(batch.tx, batch.rx)
             times[name].append(time.perf_counter() - begin)
-    assert np.median(times["many"]) <= 2 * np.median(times["one"])
+    many, one = (np.quantile(times[name], 0.2) for name in ("many", "one"))
+    assert many <= 2 * one
 
 
 # ---- carrier phase ----

@@ -11,7 +11,7 @@ from clocks import wound
 from rooms import shoebox
 
 from gsparc.methods.method import FitContext
-from gsparc.methods.time_budget import Spent, TimeBudget, weaker
+from gsparc.methods.time_budget import Spent, TimeBudget, less_repeatable
 from gsparc.multipath.image_source_gp import ImageSourceGP
 
 
@@ -46,9 +46,12 @@ def test_pauses_are_not_counted_and_charges_are(monkeypatch):
     assert budget.over() and budget.limited_by == "processor"
 
 
-def test_of_two_clocks_the_wall_is_the_weaker():
-    assert weaker("processor", None, "wall") == "wall" and weaker(None, "processor") == "processor"
-    assert weaker() is None is weaker(None, None)
+def test_of_two_clocks_the_wall_is_less_repeatable():
+    assert (
+        less_repeatable("processor", None, "wall") == "wall"
+        and less_repeatable(None, "processor") == "processor"
+    )
+    assert less_repeatable() is None is less_repeatable(None, None)
 
 
 def test_a_budget_survives_pickling():

@@ -13,7 +13,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.scores import score
 from gsparc.methods.method import FitContext, FitReport, Method
 from gsparc.methods.per_station import for_links
-from gsparc.methods.time_budget import Clock, weaker
+from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.methods.timing import ClockSettings, cycling, interleaved
 
 QUERIES = 64  # different positions asked for
@@ -86,7 +86,7 @@ def fit_and_score(
         report = method.fit(there, rows, settings)
         processor.append(time.process_time() - before)
         seconds.append(report.seconds)
-        limited = weaker(limited, report.limited_by)
+        limited = less_repeatable(limited, report.limited_by)
         notes += [note for note in report.notes if number == 0]
         methods.append(method)
         if keep is not None:
