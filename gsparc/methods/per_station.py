@@ -68,19 +68,24 @@ class PerStation(Method):
         self._copies: dict[int, Method] = {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit every station that is asked for; seconds are shared equally.
+        """Fit every station that is asked for, or all together as if both ends moved; seconds are shared equally.
 
         Raises:
-            ValueError: a station of the test rows has too few training rows, and the method cannot take both
-                ends for moving.
+            ValueError: a station of the test rows has too few training rows, or all are learned together, and
+                the method cannot take both ends for moving.
         """
         assert data.station is not None and data.site.stations is not None
+        together = context.stations == "together"
+        if together and not self.wrapped.both_ends:
+            raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
         self._shape = tuple(data.target.shape[1:])
         heard = np.bincount(data.station[fold.train], minlength=len(data.site.stations)) >= LEAST_ROWS
         asked = np.bincount(data.station[fold.test], minlength=len(heard)) > 0
         numbers = [int(t) for t in np.flatnonzero(heard)]
-        if (asked & ~heard).any():
+        if together:
+            numbers = [UNHEARD]
+        elif (asked & ~heard).any():
             if not self.wrapped.both_ends:
                 names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(asked & ~heard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
@@ -96,7 +101,8 @@ class PerStation(Method):
             report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
             self._copies[number] = copy
             seconds, limited = seconds + report.seconds, less_repeatable(limited, report.limited_by)
-            name = "stations never heard" if number == UNHEARD else data.site.stations.name[number]
+            unheard = "all stations" if together else "stations never heard"
+            name = unheard if number == UNHEARD else data.site.stations.name[number]
             notes += [f"{name}: {note}" for note in report.notes]
         return FitReport(seconds, tuple(notes), limited)
 

@@ -20,13 +20,11 @@ from gsparc.commands.compare.cells import Budget, contenders, plan
 from gsparc.commands.compare.fitting import (
     Filled,
     Prepared,
-    Problem,
     fill,
-    load_problems,
     prepare,
-    stored_problems,
 )
 from gsparc.commands.compare.latency import Latency, latencies
+from gsparc.commands.compare.problem import Problem, load_problems, split_choices, stored_problems
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
@@ -49,40 +47,47 @@ def task(config: DictConfig) -> list[table.Row]:
         Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
-    wanted = plan([(r.dataset, r.split, r.kind) for r in problems], methods, budgets, settings["only"])
-    by_name = {(r.dataset, r.split): r for r in problems}
     prepared = [
-        prepare(c, methods[c.method], settings["datasets"][c.dataset], by_name[c.dataset, c.split], kept)
-        for c in wanted
+        prepare(cell, methods[cell.method], settings["datasets"][cell.dataset] or {}, problem, kept)
+        for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     filled = fill_all(prepared, bool(settings["train"]), limit_s)
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
+    by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
     timed = _timed(filled, by_name, kept, bool(settings["latency"]))
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 
 def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
-    """Every dataset under every split, splits outermost: the best-known come first.
+    """Every dataset under every split that is meant for it, first draws first: the best-known come first.
 
     Without its path a dataset is there as far as results were kept, for the table alone.
     """
     wanted = [str(pattern) for pattern in settings["only"]]
+    splits = split_choices(settings["splits"])
     problems: list[Problem] = []
-    for name, paths in settings["datasets"].items():
-        splits = [s for s in settings["splits"] if not wanted or any(_may_match(p, name, s) for p in wanted)]
-        if any((paths or {}).values()):
-            problems += load_problems(name, paths, splits) if splits else []
+    here = {name: bool((of or {}).get("root") or (of or {}).get("file")) for name, of in settings["datasets"].items()}
+    for name, own in settings["datasets"].items():
+        meant = [
+            split
+            for split in splits.values()
+            if (not split.datasets or name in split.datasets)
+            and (not wanted or any(_may_match(p, name, split.name) for p in wanted))
+        ]
+        if here[name]:
+            problems += load_problems(name, own, meant) if meant else []
             continue
-        stored = stored_problems(kept, name, splits)
+        stored = stored_problems(kept, name, meant)
         problems += stored
         log.warning(
             "%s %s: say datasets.%s.root=DIR or .file=FILE",
             name, "is here as far as results were kept" if stored else "is left out", name,
         )  # fmt: skip
-    problems.sort(key=lambda problem: settings["splits"].index(problem.split))
-    if not problems and not any(any((paths or {}).values()) for paths in settings["datasets"].values()):
+    order = list(splits)
+    problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
+    if not problems and not any(here.values()):
         raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
     if not problems:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
