@@ -12,8 +12,8 @@ import numpy as np
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
-from gsparc.evaluation.intervals import power_intervals
 from gsparc.evaluation.metrics import paired_values
+from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods import timing
 from gsparc.methods.method import Method
@@ -73,21 +73,11 @@ def evaluate(
     scores = score(methods, data, split, eval_on)
     names = fitting(data, split) if baselines is None else baselines
     others = {name: baseline(name, data, split, eval_on, cache) for name in names}
-    facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
+    facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in pooled(scores, data, split).items()}
     facts |= {f"{eval_on}/{k}": v for k, v in scores.decided_by().items()}
-    powers = data.site.kind == "rssi"
-    if powers:
-        facts |= {f"{eval_on}/{k}": v for k, v in power_intervals(scores, data).items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
-    unheard = data.station if split.name == "stations" and powers else None
-    if unheard is not None:
-        facts[f"{eval_on}/rmse_db_after_constant"] = scores.after_constant(unheard)
     for name, other in others.items():
-        own = {**other.scores.figures(), "skill": _skill(other.scores, others)}
-        if unheard is not None:
-            own["rmse_db_after_constant"] = other.scores.after_constant(unheard)
-        if powers:
-            own |= power_intervals(other.scores, data)
+        own = {**pooled(other.scores, data, split), "skill": _skill(other.scores, others)}
         own["train_s"] = float(np.mean(other.train_s))
         facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:

@@ -68,7 +68,7 @@ class PerStation(Method):
         self._copies: dict[int, Method] = {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit every station that is asked for, or all together as if both ends moved; seconds are shared equally.
+        """Fit every station that is asked for, or all together as if both ends moved; seconds are shared.
 
         Raises:
             ValueError: a station of the test rows has too few training rows, or all are learned together, and

@@ -136,7 +136,9 @@ def plan(
     for turn in range(turns):  # first seeds of all budgets before second ones
         for budget in (b for b in budgets if turn < len(b.seeds)):
             for problem, those in able:
-                if (budget.splits and problem.split not in budget.splits) or (turn and problem.draw is not None):
+                if (budget.splits and problem.split not in budget.splits) or (
+                    turn and problem.draw is not None
+                ):
                     continue
                 cells += [
                     (problem, cell(problem, m, budget.seconds, budget.seeds[turn]))

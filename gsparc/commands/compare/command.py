@@ -68,7 +68,10 @@ def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
     wanted = [str(pattern) for pattern in settings["only"]]
     splits = split_choices(settings["splits"])
     problems: list[Problem] = []
-    here = {name: bool((of or {}).get("root") or (of or {}).get("file")) for name, of in settings["datasets"].items()}
+    here = {
+        name: bool((of or {}).get("root") or (of or {}).get("file"))
+        for name, of in settings["datasets"].items()
+    }
     for name, own in settings["datasets"].items():
         meant = [
             split
@@ -172,13 +175,14 @@ def _timed(
 def report(
     filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
 ) -> list[table.Row]:
-    """Write `compare.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
+    """Write `compare.csv`, `cells.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
     rows = table.rows(filled, timed)
     blocks = table.blocks(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
     page = table.markdown(blocks, ours, only_timed)
     write_samples(run_dir / "compare.csv", columns(rows, table.Row))
+    write_samples(run_dir / "cells.csv", columns(table.results(filled), table.Result))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
     figure.draw(rows, run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}

@@ -51,6 +51,11 @@ class Filled:
         """Commit of an earlier program text that it was measured with; None for this one's."""
         return self.facts.get(EARLIER)
 
+    @property
+    def drawn(self) -> bool:
+        """Whether its seed is a draw of the split."""
+        return bool(self.facts.get("problem/drawn"))
+
     def scored(self) -> bool:
         """Whether it was tested, not only timed."""
         return any(name.startswith("test/") for name in self.facts)
@@ -150,6 +155,7 @@ def fill(prepared: Prepared) -> Filled:
         "model/num_gaussians": found.methods[0].size(),
         "model/effects": found.methods[0].effects,
         "model/notes": "; ".join(found.notes),
+        "problem/drawn": prepared.problem.draw is not None,
         "problem/stations": prepared.problem.stations,
         "seed": prepared.cell.seed,
         "budget_s": prepared.cell.budget_s,

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import score
 from gsparc.methods.method import FitContext, FitReport, Method
 from gsparc.methods.per_station import for_links
@@ -44,7 +45,7 @@ class Outcome:
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
         """The same fits scored on other data, such as displaced queries."""
         started = time.perf_counter()
-        figures = score(self.methods, data, split, eval_on).figures()
+        figures = pooled(score(self.methods, data, split, eval_on), data, split)
         return replace(self, figures=figures, score_s=time.perf_counter() - started)
 
 
