@@ -9,7 +9,7 @@ from gsparc.evaluation.scores import Scores
 
 
 def pooled(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Accuracies, and of powers how honest their variances are; of stations held out `rmse_db_after_constant`.
+    """Accuracies, of powers how honest variances are; `rmse_db_after_constant` where stations are held out.
 
     Args:
         scores: of rows of `data`.
