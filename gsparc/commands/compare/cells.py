@@ -43,11 +43,11 @@ class Contender:
     only_longest: bool = False
     timed_only: bool = False
 
-    def overrides(self, budget_s: float | None, seed: int | None) -> list[str]:
-        """Overrides of train.yaml for one cell."""
+    def overrides(self, budget_s: float | None) -> list[str]:
+        """Overrides of train.yaml, but for the seed."""
         left = None if budget_s is None else max(budget_s - self.reserve_s, 1.0)
         timed = [] if left is None else [text.format(budget_s=f"{left:g}") for text in self.budget]
-        return [*self.choose, *timed, f"seed={seed or 0}"]
+        return [*self.choose, *timed]
 
 
 @dataclass(frozen=True)

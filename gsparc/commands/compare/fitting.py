@@ -112,8 +112,8 @@ def prepare(
 ) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
     chosen = problem.chosen or (f"dataset={settings.get('dataset', cell.dataset)}",)
-    own = {name: value for name, value in settings.items() if name != "dataset"}
-    config = compose(own, [*chosen, *contender.overrides(cell.budget_s, cell.seed)])
+    overrides = [*chosen, *contender.overrides(cell.budget_s)]
+    config = compose(settings, overrides, problem.draw, cell.seed)
     whole = plain(config)
     trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
     if whole["stations"] != "each":  # cells from before there was a choice keep their names

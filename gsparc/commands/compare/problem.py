@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,10 +38,10 @@ class SplitChoice:
     datasets: tuple[str, ...] = ()
     draws: int = 0
 
-    def overrides(self, draw: int | None) -> list[str]:
-        """Overrides of train.yaml for one draw."""
-        chosen = list(self.choose or (f"split={self.name}",))
-        return chosen if draw is None else [*chosen, f"split.seed={draw}"]
+    @property
+    def overrides(self) -> tuple[str, ...]:
+        """Overrides of train.yaml, but for the draw."""
+        return self.choose or (f"split={self.name}",)
 
     @property
     def numbers(self) -> tuple[int | None, ...]:
@@ -58,7 +60,7 @@ class Problem:
         hashes: of measurements and folds.
         draw: number of the split's draw; None where it is not drawn again.
         stations: whether there are several.
-        chosen: overrides of train.yaml for dataset and split.
+        chosen: overrides of train.yaml for dataset and split, but for the draw.
         data: measurements; None where they are not here.
         folds: which rows learn and which test.
     """
@@ -102,18 +104,16 @@ def split_choices(config: Mapping[str, Any]) -> dict[str, SplitChoice]:
 
 def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]) -> list[Problem]:
     """Load what `conf/dataset` names, with the given settings, once for all draws of all splits."""
-    of = [f"dataset={settings.get('dataset', name)}"]
-    own = {key: value for key, value in settings.items() if key != "dataset"}
     data: Measurements | None = None
     problems = []
     for split in splits:
+        chosen = (f"dataset={settings.get('dataset', name)}", *split.overrides)
         for draw in split.numbers:
-            config = compose(own, [*of, *split.overrides(draw)])
+            config = compose(settings, chosen, draw)
             data = load(plain(config.dataset)) if data is None else data
             folds = split_for(plain(config.split), data)
             hashes = (data.site.sha256, folds.sha256)
             several = data.site.stations is not None and folds.name != "stations"
-            chosen = tuple([*of, *split.overrides(draw)])
             problems.append(
                 Problem(name, split.name, data.site.kind, hashes, draw, several, chosen, data, folds)
             )
@@ -138,9 +138,28 @@ def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> 
     return found
 
 
-def compose(settings: Mapping[str, Any], overrides: Sequence[str]) -> DictConfig:
-    """The configuration `train.py` would see, with these settings of its dataset."""
-    chosen = ["logger=none", "~callbacks.pictures", *overrides]
-    config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
-    OmegaConf.update(config, "dataset", dict(settings), merge=True)
+def compose(
+    settings: Mapping[str, Any], overrides: Sequence[str], draw: int | None = None, seed: int | None = None
+) -> DictConfig:
+    """The configuration `train.py` would see.
+
+    Args:
+        settings: of its dataset; `dataset` is the choice itself, and left out.
+        overrides: of train.yaml.
+        draw: `split.seed`; None: as the split has it.
+        seed: None: 0.
+    """
+    config = deepcopy(_composed(tuple(overrides)))
+    own = {name: value for name, value in settings.items() if name != "dataset"}
+    OmegaConf.update(config, "dataset", own, merge=True)
+    OmegaConf.update(config, "seed", seed or 0)
+    if draw is not None:
+        OmegaConf.update(config, "split.seed", draw)
     return config
+
+
+@functools.cache
+def _composed(overrides: tuple[str, ...]) -> DictConfig:
+    """Composing takes half a second, and draws differ in numbers only."""
+    chosen = ["logger=none", "~callbacks.pictures", *overrides]
+    return hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
