@@ -262,8 +262,8 @@ def changed_levels(
             verb = "rises" if step.change_db > 0 else "falls"
             found.append(
                 f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the "
-                "places do not explain: another gain or antenna? give the rows after it another station's "
-                "name, or leave them out"
+                "places do not explain: another gain or antenna? dataset.level_steps={STATION: [ROW]} makes "
+                "it another station from there on"
             )
     return found
 

@@ -19,6 +19,7 @@ from gsparc.data.fields import MEASUREMENTS
 from gsparc.data.instantiate import suggest
 from gsparc.data.raw import Raw
 
+FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
 SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Arrays with a row per sample, and the number of their axes where they have one.
@@ -117,10 +118,11 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     if count is None:
         raise DataError(f"dataset.stations: {source} has no stations; expected station_position")
     names = [str(name) for name in raw.arrays.get("station_name", np.zeros(0, str)).ravel()]
-    chosen = np.unique([_station(wanted, names, count, source) for wanted in stations])
+    numbers = [station_number(w, names, count, f"dataset.stations={w}", source) for w in stations]
+    chosen = np.unique([part for number in numbers for part in parts_of(number, names)])
     note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
     arrays = {
-        name: array[chosen] if _per_station(name, array, count) else array
+        name: array[chosen] if per_station(name, array, count) else array
         for name, array in raw.arrays.items()
     }
     if "station" in arrays:
@@ -133,7 +135,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
         return Selected(replace(kept, arrays={**kept.arrays, "station": renumbered}), (note,))
     for name in (*MEASUREMENTS, "mask"):
         if name in arrays:
-            _refuse_columns(arrays[name], name, count, source)
+            refuse_columns(arrays[name], name, count, source)
             arrays[name] = arrays[name][:, chosen]
     return Selected(replace(raw, arrays=arrays), (note,))
 
@@ -172,7 +174,7 @@ def keep_loud(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
     low &= True if given is None else given.astype(bool)
     if low.ndim == 1:
         return _kept(raw, ~low, said, source)
-    measured = ~low & (_present(raw, values) if given is None else given.astype(bool))
+    measured = ~low & measured_links(raw, source)
     marked = replace(raw, arrays={**raw.arrays, "mask": measured})
     links = (f"{said}: {int(low.sum())} links left out",) if low.any() else ()
     rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), said, source)
@@ -251,14 +253,26 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _station(wanted: str | int, names: list[str], count: int, source: str | Path) -> int:
+def parts_of(number: int, names: Sequence[str]) -> list[int]:
+    """Numbers of a station and of what its level steps made of it (`station_parts`), in the order of rows."""
+    if number >= len(names):
+        return [number]
+    return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
+
+
+def station_number(wanted: str | int, names: Sequence[str], count: int, said: str, source: str | Path) -> int:
+    """Number of the station of a name, or number from 0; the setting `said` is named in errors.
+
+    Raises:
+        DataError: there is none.
+    """
     if str(wanted) in names:
-        return names.index(str(wanted))
+        return list(names).index(str(wanted))
     if isinstance(wanted, int) and 0 <= wanted < count:
         return wanted
     if isinstance(wanted, int) or not names:
-        raise DataError(f"dataset.stations={wanted}: {source} has stations 0 to {count - 1}")
-    raise DataError(f"dataset.stations={wanted}: no such station in {source}{suggest(wanted, names)}")
+        raise DataError(f"{said}: {source} has stations 0 to {count - 1}")
+    raise DataError(f"{said}: no station {wanted} in {source}{suggest(wanted, names)}")
 
 
 def _measurement(raw: Raw, source: str | Path) -> str:
@@ -268,12 +282,20 @@ def _measurement(raw: Raw, source: str | Path) -> str:
     return str(named) if named in held else held[0]
 
 
-def _present(raw: Raw, values: np.ndarray) -> np.ndarray:
-    """Where a power says something: NaN is missing, or, with a sensitivity, not heard."""
+def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
+    """Where the measurement says something, of its shape: NaN is missing, or, with a sensitivity, not heard.
+
+    Raises:
+        DataError: the file holds no measurement.
+    """
+    values, given = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
+    if given is not None:
+        return given.astype(bool)
     return np.ones(values.shape, bool) if "sensitivity_db" in raw.arrays else ~np.isnan(values)
 
 
-def _per_station(name: str, array: np.ndarray, count: int) -> bool:
+def per_station(name: str, array: np.ndarray, count: int) -> bool:
+    """Whether an array of a file has an entry for each of `count` stations."""
     return STATION_AXES.get(name) == array.ndim and len(array) == count
 
 
@@ -307,7 +329,8 @@ def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[s
     return found
 
 
-def _refuse_columns(array: np.ndarray, name: str, count: int, source: str | Path) -> None:
+def refuse_columns(array: np.ndarray, name: str, count: int, source: str | Path) -> None:
+    """Refuse (DataError) what has no column for each of `count` stations."""
     if array.ndim < 2 or array.shape[1] != count:
         wanted = f"expected a column for each of the {count} stations, or an array station"
         raise DataError(f"{source}, {name}: {wanted}; found shape {array.shape}")

@@ -191,7 +191,7 @@ CANNOT = {
     "misspelt station": (
         wide,
         {"stations": ["senor42"]},
-        "no such station in file; did you mean 'sensor42'?",
+        "no station senor42 in file; did you mean 'sensor42'?",
     ),
     "station of another file": (
         wide,

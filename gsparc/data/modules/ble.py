@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsparc.data.ble import raw_of_ble
@@ -15,7 +15,7 @@ class BLE(Campaign):
 
     Args:
         file: *.npz.
-        stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
+        stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
         name, batch_size: see `DataModule`.
     """
 
@@ -26,10 +26,11 @@ class BLE(Campaign):
         runs: Sequence[str | int] | None = None,
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
         name: str = "ble",
         batch_size: int = 16,
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows)
+        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
 
     def raw(self) -> Raw:
         """Powers (S, T) of a moving transmitter at T stations."""

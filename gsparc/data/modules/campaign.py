@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsparc.data.datamodule import DataModule
@@ -13,6 +13,7 @@ from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection, select
+from gsparc.data.station_parts import rows_by_station, split_stations
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +25,7 @@ class Campaign(DataModule):
         file: what `raw` reads.
         name, batch_size: see `DataModule`.
         stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
+        level_steps: by station, rows from which it counts as another; see `gsparc.data.station_parts`.
     """
 
     def __init__(
@@ -35,10 +37,12 @@ class Campaign(DataModule):
         runs: Sequence[str | int] | None = None,
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
     ) -> None:
         super().__init__(name, batch_size)
         self.file = Path(file)
         self.selection = Selection(stations, runs, min_rssi_db, max_rows)
+        self.level_steps = rows_by_station(level_steps or {})
 
     @abstractmethod
     def raw(self) -> Raw:
@@ -51,7 +55,7 @@ class Campaign(DataModule):
     def load(self) -> Measurements:
         """Read, select and interpret; what is left out and what is doubtful is logged."""
         raw = self.raw()
-        selected = select(raw, self.selection, self.file)
+        selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         said = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
         for note in (*said, *selected.notes, *reading.notes):

@@ -20,7 +20,7 @@ class Own(Campaign):
         file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
-        name, batch_size, stations, runs, min_rssi_db, max_rows: see `Campaign`.
+        name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
     """
 
     def __init__(
@@ -32,10 +32,11 @@ class Own(Campaign):
         runs: Sequence[str | int] | None = None,
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
         columns: Mapping[str, object] | None = None,
         stations_file: str | Path | None = None,
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows)
+        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
         self.columns, self.stations_file = columns or {}, stations_file
 
     def raw(self) -> Raw:

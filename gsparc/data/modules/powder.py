@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsparc.data.modules.campaign import Campaign
@@ -17,7 +17,7 @@ class Powder(Campaign):
         file: *.npz, or the release's *.csv.
         station_table: coordinates of the stations of a CSV; None: `location_coordinates.json` beside it.
         tx_height, station_height: above ground [m].
-        stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
+        stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
         name, batch_size: see `DataModule`.
     """
 
@@ -31,10 +31,11 @@ class Powder(Campaign):
         runs: Sequence[str | int] | None = None,
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
         name: str = "powder",
         batch_size: int = 16,
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows)
+        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
         self.station_table, self.heights = station_table, (tx_height, station_height)
 
     def raw(self) -> Raw:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gsparc.data.modules.campaign import Campaign
@@ -16,7 +16,7 @@ class Techtile(Campaign):
     Args:
         file: *.npz, or the release's *.nc.
         antennas: places of the antennas of a NetCDF file; None: `techtile_antenna_locations.yml` beside it.
-        stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
+        stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
         name, batch_size: see `DataModule`.
     """
 
@@ -28,10 +28,11 @@ class Techtile(Campaign):
         runs: Sequence[str | int] | None = None,
         min_rssi_db: float | None = None,
         max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
         name: str = "techtile",
         batch_size: int = 16,
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows)
+        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
         self.antennas = antennas
 
     def raw(self) -> Raw:
