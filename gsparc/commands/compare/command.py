@@ -68,6 +68,7 @@ def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
     wanted = [str(pattern) for pattern in settings["only"]]
     splits = split_choices(settings["splits"])
     problems: list[Problem] = []
+    absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
     here = {
         name: bool((of or {}).get("root") or (of or {}).get("file"))
         for name, of in settings["datasets"].items()
@@ -84,10 +85,10 @@ def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
             continue
         stored = stored_problems(kept, name, meant)
         problems += stored
-        log.warning(
-            "%s %s: say datasets.%s.root=DIR or .file=FILE",
-            name, "is here as far as results were kept" if stored else "is left out", name,
-        )  # fmt: skip
+        absent["here as far as results were kept" if stored else "left out"].append(name)
+    for how, names in absent.items():
+        if names:
+            log.warning("%s %s: say datasets.NAME.root=DIR or .file=FILE", ", ".join(names), how)
     order = list(splits)
     problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
     if not problems and not any(here.values()):

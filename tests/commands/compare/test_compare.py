@@ -108,7 +108,7 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     assert "3 cells, 3 of them are there" in again.stdout
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
     absent = compare(tmp_path, only, "datasets.own.file=null", "train=false")
-    assert absent.returncode == 0 and "as far as results were kept" in absent.stdout + absent.stderr
+    assert absent.returncode == 0 and "here as far as results were kept" in absent.stdout + absent.stderr
     assert "3 cells, 3 of them are there" in absent.stdout
     # A cell whose result is not whole does not count.
     (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")
