@@ -15,7 +15,7 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsparc.commands.compare import figure, table
+from gsparc.commands.compare import draws_figure, figure, table
 from gsparc.commands.compare.cells import Budget, contenders, plan
 from gsparc.commands.compare.fitting import (
     Filled,
@@ -176,7 +176,10 @@ def _timed(
 def report(
     filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
 ) -> list[table.Row]:
-    """Write `compare.csv`, `cells.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
+    """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
+
+    Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`.
+    """
     rows = table.rows(filled, timed)
     blocks = table.blocks(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
@@ -185,7 +188,11 @@ def report(
     write_samples(run_dir / "compare.csv", columns(rows, table.Row))
     write_samples(run_dir / "cells.csv", columns(table.results(filled), table.Result))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
-    figure.draw(rows, run_dir / "compare.png", ours)
+    drawn = [row for row in rows if row.draws]
+    for dataset in dict.fromkeys(row.dataset for row in drawn):
+        draws_figure.draw([row for row in drawn if row.dataset == dataset], run_dir / f"{dataset}.png")
+    if len(drawn) < len(rows):
+        figure.draw([row for row in rows if not row.draws], run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}
     for block in blocks:
         stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"

@@ -205,7 +205,7 @@ class Block:
         """Names and budget."""
         budget = "" if self.budget_s is None else f", {self.budget_s:g} s of training per model"
         draws = max(row.seeds for row in self.rows) if any(row.draws for row in self.rows) else 0
-        drawn = f", {draws} draws (± standard error of the mean)" if draws else ""
+        drawn = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
         return f"{self.dataset}, split {self.split}{budget}{drawn}"
 
 

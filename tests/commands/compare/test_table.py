@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from gsparc.commands.compare import draws_figure
 from gsparc.commands.compare.cells import Cell
 from gsparc.commands.compare.figure import draw
 from gsparc.commands.compare.fitting import EARLIER, Filled
@@ -63,6 +64,27 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     )
     assert "simple baseline wins" not in page, "there are no others"
     assert [(r.seed, r.value) for r in results(found)][:2] == [(0, 5.0), (0, 6.0)]
+
+
+def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path):
+    facts = {"dataset/kind": "rssi", "test/rmse_db": 5.0, "problem/drawn": True, "time/train_s": 1.0,
+             "time/train_cpu_s": 1.0}  # fmt: skip
+    there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
+    found = rows([Filled(Cell("city", s, m, None, 0), None, facts) for s, m in there], {})
+    said = []
+    original = draws_figure.panels
+
+    def watched(*size, **how):
+        figure, axes = original(*size, **how)
+        said.append(axes)
+        return figure, axes
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(draws_figure, "panels", watched)
+        draws_figure.draw(found, tmp_path / "city.png")
+    texts = [[text.get_text() for text in axis.texts] for axis in said[0][0]]
+    assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
+    assert (tmp_path / "city.png").stat().st_size > 5_000
 
 
 def test_losers_are_not_hidden():
