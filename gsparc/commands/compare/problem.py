@@ -94,7 +94,9 @@ def split_choices(config: Mapping[str, Any]) -> dict[str, SplitChoice]:
     """
     found = {}
     for name, entry in config.items():
-        lists = {k: tuple(v) if isinstance(v, list) else v for k, v in dict(entry or {}).items()}
+        lists: dict[str, Any] = {
+            k: tuple(v) if isinstance(v, list) else v for k, v in dict(entry or {}).items()
+        }
         unknown = sorted(set(lists) - {"choose", "datasets", "draws"})
         if unknown:
             raise ValueError(f"splits.{name}: unknown {unknown[0]!r}; there are choose, datasets and draws")
