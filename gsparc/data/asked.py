@@ -151,7 +151,7 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> Asked:
     return _checked(Asked(source, ends, rows, _stations(raw, source, len(rows))))
 
 
-def _same(raw: Raw, source: str, pair: list[str]) -> list[str]:
+def _same(raw: Raw, source: str, pair: Sequence[str]) -> Sequence[str]:
     if raw.arrays[pair[0]].shape != raw.arrays[pair[1]].shape:
         shapes = " and ".join(str(raw.arrays[name].shape) for name in pair)
         raise DataError(f"{source}: latitude and longitude have shapes {shapes}; expected one shape")

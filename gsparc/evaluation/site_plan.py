@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
@@ -65,8 +65,8 @@ def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
         wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
         doubtful[cKDTree(place).query(wild)[1]] = True
     level, label = _levels(data, which, count)
-    rows = [data.row_names[i].partition(", station")[0] for i in first[order]]
-    return Spots(place[:, :2] + site.origin[:2], level, label, rows, far, doubtful)
+    names = [data.row_names[i].partition(", station")[0] for i in first[order]]
+    return Spots(place[:, :2] + site.origin[:2], level, label, names, far, doubtful)
 
 
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
@@ -115,7 +115,7 @@ def draw_site(
         figure, axes = panels(width, height)
         axis = axes[0, 0]
     else:
-        how = {"width_ratios": [width, 6.0]}
+        how: dict[str, Any] = {"width_ratios": [width, 6.0]}
         figure, axes = panels(width + 6.0, max(height, 2.2 * len(jumping)), len(jumping), 2, **how)
         place = axes[0, 0].get_gridspec()[:, 0]
         for one in axes[:, 0]:
@@ -126,12 +126,13 @@ def draw_site(
             _draw_level(one, levels, t, [step for u, step in steps if u == t])
     _draw_map(axis, data, found, low, high, jumping)
     legend = figure.legend(loc="outside lower left", ncols=4, fontsize="small", frameon=False)
+    mark: Any
     for mark, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
         if text.get_text() in PLAIN:  # whose colours and sizes are those of the first place
             mark.set_array(None)
             mark.set_color("0.4")
             mark.set_sizes([25])
-    engine = figure.get_layout_engine()
+    engine: Any = figure.get_layout_engine()
     engine.set(w_pad=0.12, h_pad=0.08)  # axes of equal scales take more than their share
     figure.suptitle(_title(data, found))
     save(figure, path)
@@ -166,7 +167,7 @@ def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_map(
-    axis: Axes, data: Measurements, found: Spots, low: np.ndarray, high: np.ndarray, jumping: Sequence[int]
+    axis: Any, data: Measurements, found: Spots, low: np.ndarray, high: np.ndarray, jumping: Sequence[int]
 ) -> None:
     site, inside = data.site, ~found.far
     size = _size(found.place[inside], float((high - low).max()))
@@ -199,7 +200,7 @@ def _size(place: np.ndarray, extent: float) -> float:
     return float(np.clip(72 * INCHES * apart / extent, 2.5, 9.0)) ** 2
 
 
-def _draw_stations(axis: Axes, data: Measurements, jumping: Sequence[int]) -> None:
+def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> None:
     place, site = _still(data), data.site
     if not len(place):
         return
@@ -215,7 +216,7 @@ def _draw_stations(axis: Axes, data: Measurements, jumping: Sequence[int]) -> No
         _say(axis, name, where, "red" if number in jumping else "black")
 
 
-def _draw_doubts(axis: Axes, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
+def _draw_doubts(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
     near, far = np.flatnonzero(found.doubtful & ~found.far), np.flatnonzero(found.far)
     if len(near):
         marks = {"s": 90, "facecolors": "none", "edgecolors": "red", "linewidths": 1.5}
@@ -239,7 +240,7 @@ def _draw_doubts(axis: Axes, found: Spots, low: np.ndarray, high: np.ndarray) ->
         _say(axis, found.rows[row], found.place[row], "red", above=False)
 
 
-def _say(axis: Axes, text: str, where: np.ndarray, colour: str, above: bool = True) -> None:
+def _say(axis: Any, text: str, where: np.ndarray, colour: str, above: bool = True) -> None:
     """Write beside a point: above to its right, or below to its left, where the map does not end there."""
     low, high = axis.get_xlim()
     left = where[0] > low + (0.75 if above else 0.25) * (high - low)
@@ -259,7 +260,7 @@ def _labels(data: Measurements) -> dict[str, str]:
     return {"xlabel": f"metres east of {where}", "ylabel": f"metres north of {north}"}
 
 
-def _draw_level(axis: Axes, levels: LinkLevels, station: int, steps: Sequence[LevelStep]) -> None:
+def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep]) -> None:
     """Levels of a station by row; those between two steps in one colour."""
     rows = np.flatnonzero(levels.station == station)
     level = levels.level_db[rows]

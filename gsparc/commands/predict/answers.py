@@ -10,6 +10,7 @@ import numpy as np
 from gsparc.data.asked import Asked
 from gsparc.data.errors import DataError
 from gsparc.data.schema import End
+from gsparc.methods.method import Prediction
 from gsparc.methods.predictor import Predictor
 
 CHUNK = 512  # places predicted at a time
@@ -61,7 +62,7 @@ def answers(
     row = np.array([row for row, _ in pairs], np.int64)
     number = np.array([-1 if number is None else number for _, number in pairs], np.int64)
     stations = predictor.site.stations
-    parts: list[tuple[np.ndarray, list]] = []
+    parts: list[tuple[np.ndarray, Prediction]] = []
     silent: list[str] = []
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
@@ -77,15 +78,17 @@ def answers(
             said = asking.predict(**{end: places[row[rows]] for end, places in world.items()})
             if not parts:
                 accept(tuple(said.mean.shape[1:]))
-            parts.append((rows, [said.mean, said.variance, said.confidence]))
+            parts.append((rows, said))
     if not parts:
         raise DataError(silent[0])
     rows = np.concatenate([rows for rows, _ in parts])
     order = np.argsort(rows, kind="stable")
-    joined = []
-    for values in zip(*(said for _, said in parts), strict=True):
-        missing = any(value is None for value in values)
-        joined.append(None if missing else np.concatenate([value.numpy() for value in values])[order])
-    rows = rows[order]
+
+    def joined(name: str) -> np.ndarray | None:
+        values = [getattr(said, name) for _, said in parts]
+        return None if any(v is None for v in values) else np.concatenate([v.numpy() for v in values])[order]
+
+    rows, mean = rows[order], joined("mean")
+    assert mean is not None
     names = None if stations is None else np.array(stations.name)[number[rows]]
-    return Answers(row[rows], names, *joined), silent
+    return Answers(row[rows], names, mean, joined("variance"), joined("confidence")), silent

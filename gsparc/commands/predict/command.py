@@ -117,7 +117,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     )
     write_summary(run_dir / "summary.json", {**facts, **provenance(), "ckpt": str(config.ckpt)})
     stations = facts["predict/stations"]
-    said = f"{facts['predict/places']} places" + (f", {stations} stations" if stations else "")
+    said = f"{facts['predict/places']} places" + (
+        f", {stations} station{'s' * (stations > 1)}" if stations else ""
+    )
     if "predict/lowest_db" in facts:
         said += f": {facts['predict/lowest_db']:.1f} to {facts['predict/highest_db']:.1f} dB"
     show(run_dir, before=f"{said}; predictions in {facts['out']}; summary ")
