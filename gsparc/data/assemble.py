@@ -105,6 +105,8 @@ def assemble(
     ends = np.concatenate([rx[usual]] if unknown else [tx[usual], rx[usual]])
     lower, upper = ends.min(axis=0), ends.max(axis=0)
     origin = (lower + upper) / 2
+    places = {"rx": tx - origin, "tx": rx - origin}
+    moving = np.hstack([tx - origin, rx - origin]) if static_end is None else places[static_end]
     hashed = {
         "tx": tx, "rx": rx, "rx_rotation": rx_rotation, "target": target, "mask": mask, "array": array,
         "target_scale": np.array(target_scale), "subcarriers_hz": subcarriers_hz,
@@ -119,6 +121,7 @@ def assemble(
         static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,
         origin=origin, box=np.stack([lower - origin, upper - origin]), sha256=content_hash(hashed),
         target_scale=target_scale, static_position=still, georeference=links.georeference,
+        moving_box=np.stack([moving[usual].min(axis=0), moving[usual].max(axis=0)]),
         stations=None if stations is None else replace(stations, position=stations.position - origin),
         rx_rotation=np.array(rx_rotation[0], dtype=np.float64), **facts,
     )  # fmt: skip

@@ -9,8 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data import outliers
-from gsparc.data.doubts import as_links, doubts
+from gsparc.data.campaigns import campaign_of, is_release, raw_of_campaign
+from gsparc.data.doubts import doubts
 from gsparc.data.errors import DataError
+from gsparc.data.level_steps import LevelStep
+from gsparc.data.link_levels import LinkLevels
 from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
@@ -26,7 +29,7 @@ ENDS = {"rx": "receiver", "tx": "transmitter"}
 def read_any(
     path: str | Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
 ) -> Reading:
-    """Read a folder in the RFID release's layout, a NeWRF room, a file of one's own, or a table.
+    """Read a folder of the RFID release, a file of another campaign, one of one's own, or a table.
 
     Args:
         path: folder or file.
@@ -43,7 +46,12 @@ def read_any(
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
+    if is_release(path):
+        return interpret(raw_of_campaign("techtile", path), path)
     raw, notes = raw_of(path, columns, stations_file)
+    campaign = campaign_of(raw)
+    if campaign is not None:
+        raw, notes = raw_of_campaign(campaign, path), (f"this is a file of dataset={campaign}",)
     reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
     return Reading(reading.data, (*notes, *reading.notes))
 
@@ -67,30 +75,17 @@ def raw_of(
     return found.raw, found.notes
 
 
-def doubtful(data: Measurements) -> list[str]:
-    """Doubts about powers in the order of measuring: copies, wild rows, levels that jump, outages."""
-    if data.site.kind != "rssi" or data.site.static_end is None:
+def doubtful(levels: LinkLevels | None, steps: list[tuple[int, LevelStep]] | None = None) -> list[str]:
+    """Doubts about powers in the order of measuring: copies, wild rows, levels that jump, outages.
+
+    Args:
+        levels: None of what is no power.
+        steps: those of `levels`, where they are known already.
+    """
+    if levels is None:
         return []
-    stations = data.site.stations
-    station = np.zeros(len(data), np.int64) if data.station is None else data.station
-    place = np.arange(len(data)) if data.place is None else data.place
-    _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    count = 1 if stations is None else len(stations)
-    with np.errstate(divide="ignore"):
-        level = 10 * np.log10(data.target[:, 0].astype(np.float64) * data.site.target_scale)
-    heard = np.ones(len(data), bool) if data.censored is None else ~data.censored
-    table, which = np.full((len(first), count), np.nan), which.reshape(-1)
-    table[which[heard], station[heard]] = level[heard]
-    rows = [data.row_names[i].partition(", station")[0] for i in first]
-    position, of_link, levels, called = as_links(data.moving[first], table, rows)
-    if data.censored is not None:  # what is missing there is known to be weak
-        kept = np.isfinite(levels)
-        position, of_link, levels = position[kept], of_link[kept], levels[kept]
-        called = [row for row, keep in zip(called, kept, strict=True) if keep]
-    known = None if data.site.static_position is None else data.site.static_position[None]
-    known = known if stations is None else stations.position
-    names = ["the station"] if stations is None else list(stations.name)
-    return doubts(position, of_link, levels, names, called, known)
+    rows = levels.position, levels.station, levels.level_db, levels.names, levels.rows
+    return doubts(*rows, levels.station_position, steps)
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
-from gsparc.data.level_steps import MOST_BLOCKS, level_steps
+from gsparc.data.level_steps import MOST_BLOCKS, LevelStep, level_steps
 from gsparc.data.outliers import too_far
 
 NAMED = 5  # rows or stations in a line
@@ -34,6 +35,7 @@ def doubts(
     names: Sequence[str],
     rows: Sequence[str],
     station_position: np.ndarray | None = None,
+    steps: list[tuple[int, LevelStep]] | None = None,
 ) -> list[str]:
     """All doubts about levels at places.
 
@@ -44,13 +46,14 @@ def doubts(
         names: of the stations.
         rows: what messages call each row.
         station_position: (T, 2) or (T, 3) [m]; None where it is not known.
+        steps: `steps_of` them, where they are known already.
     """
     station = np.zeros(len(level_db), np.int64) if station is None else station
     found = position_doubts(position, rows) + level_doubts(level_db)
     found += direction_doubts(position, station, level_db, station_position)
     found += copies(position, station, level_db, names, rows)
     found += wild_rows(station, level_db, names, rows)
-    found += changed_levels(position, station, level_db, names, rows, station_position)
+    found += changed_levels(position, station, level_db, names, rows, station_position, steps)
     return found + gaps(station, level_db, names, rows)
 
 
@@ -222,6 +225,15 @@ def wild_rows(
 ) -> list[str]:
     """Single rows whose level is far from those of the rows before and after them at the same station."""
     found = []
+    for t, bad, most in wild_of(station, level_db):
+        where = f"station {names[t]}: " if len(names) > 1 else ""
+        found.append(f"{where}{_some(rows, bad)}: up to {most:.0f} dB from the rows around; wrong?")
+    return found
+
+
+def wild_of(station: np.ndarray, level_db: np.ndarray) -> list[tuple[int, np.ndarray, float]]:
+    """(station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
+    found = []
     for t in np.unique(station):
         used = np.flatnonzero((station == t) & np.isfinite(level_db))
         if len(used) < 4 * NEIGHBOURS:
@@ -235,9 +247,7 @@ def wild_rows(
         alone = wild & ~np.roll(wild, 1) & ~np.roll(wild, -1)
         bad = np.flatnonzero(alone)
         if 0 < len(bad) <= max(NAMED, len(used) // 100):
-            most = difference[bad].max()
-            where = f"station {names[t]}: " if len(names) > 1 else ""
-            found.append(f"{where}{_some(rows, used[bad])}: up to {most:.0f} dB from the rows around; wrong?")
+            found.append((int(t), used[bad], float(difference[bad].max())))
     return found
 
 
@@ -248,8 +258,29 @@ def changed_levels(
     names: Sequence[str],
     rows: Sequence[str],
     station_position: np.ndarray | None = None,
+    steps: list[tuple[int, LevelStep]] | None = None,
 ) -> list[str]:
     """Stations whose level changes at a row though the places do not explain it (`level_steps`)."""
+    found = []
+    for t, step in steps_of(position, station, level_db, station_position) if steps is None else steps:
+        who = f"station {names[t]}" if len(names) > 1 else "the level"
+        verb = "rises" if step.change_db > 0 else "falls"
+        before, after = rows[step.last], rows[step.first]
+        what, _, number = after.partition(" ")
+        named = what == "row" and number.isdigit() and len(names) > 1
+        setting = f"{{{names[t]}:[{number}]}}" if named else "{STATION:[ROW]}"
+        found.append(
+            f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the places do "
+            f"not explain: another gain or antenna? dataset.level_steps={setting} makes it another station "
+            "from there on"
+        )
+    return found
+
+
+def steps_of(
+    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
+) -> list[tuple[int, LevelStep]]:
+    """Stations and their steps, which name rows of these arrays."""
     found = []
     stations = np.unique(station)
     blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
@@ -257,14 +288,7 @@ def changed_levels(
         used = np.flatnonzero(station == t)
         where = None if station_position is None else station_position[t]
         for step in level_steps(position[used], level_db[used], where, blocks):
-            before, after = rows[used[step.last]], rows[used[step.first]]
-            who = f"station {names[t]}" if len(names) > 1 else "the level"
-            verb = "rises" if step.change_db > 0 else "falls"
-            found.append(
-                f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the "
-                "places do not explain: another gain or antenna? dataset.level_steps={STATION: [ROW]} makes "
-                "it another station from there on"
-            )
+            found.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return found
 
 

@@ -100,6 +100,8 @@ class Site:
         antennas: (A,) rows of `uplink_array` that the target's antennas are.
         stations: the static ends where there are several; `Measurements.station` says which a row is of.
         georeference: where on Earth the world's origin lies; None when unknown.
+        moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*; (2, 6)
+            of both as in `Measurements.moving`; None in models of earlier versions.
     """
 
     name: str
@@ -123,6 +125,7 @@ class Site:
     antennas: np.ndarray | None = None
     stations: Stations | None = None
     georeference: Georeference | None = None
+    moving_box: np.ndarray | None = None
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

@@ -30,7 +30,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     known = np.isfinite(variance) & (variance > 0) & (mean > 0)
     if not known.any():
         return {}
-    mean_db, spread_db = 10 * np.log10(mean[known]), DB * np.sqrt(variance[known]) / mean[known]
+    mean_db, spread_db = in_decibels(mean[known], variance[known])
     row = scores.row[known]
     power = data.target[row, 0].astype(np.float64) * data.site.target_scale
     silent = np.zeros(len(row), bool) if data.censored is None else data.censored[row]
@@ -52,6 +52,11 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         "outage/brier": float(np.mean((chance - silent[told]) ** 2)),
         "outage/brier_rate": rate * (1 - rate),
     }
+
+
+def in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
+    return 10 * np.log10(mean), DB * np.sqrt(variance) / mean
 
 
 def levels(data: Measurements) -> np.ndarray | None:

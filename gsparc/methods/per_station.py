@@ -120,6 +120,19 @@ class PerStation(Method):
 
         return self._gathered(self._stations(tx, rx)[everyone], ask)
 
+    def of(self, number: int) -> Method:
+        """The copy that answers for a station.
+
+        Raises:
+            ValueError: it had too few training rows, and there is no copy for such stations.
+        """
+        copy = self._copies.get(number, self._copies.get(UNHEARD))
+        if copy is None:
+            assert self.site is not None and self.site.stations is not None
+            name = self.site.stations.name[number]
+            raise ValueError(f"{self.name}: station {name} had too few training rows")
+        return copy
+
     def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands."""
         assert self.site is not None and self.site.stations is not None
@@ -135,12 +148,7 @@ class PerStation(Method):
         parts: list[tuple[Tensor, Prediction]] = []
         for number in stations.unique().tolist():
             chosen = (stations == number).nonzero()[:, 0]
-            copy = self._copies.get(number, self._copies.get(UNHEARD))
-            if copy is None:
-                assert self.site is not None and self.site.stations is not None
-                name = self.site.stations.name[number]
-                raise ValueError(f"{self.name}: station {name} had too few training rows")
-            parts.append((chosen, ask(copy, chosen)))
+            parts.append((chosen, ask(self.of(number), chosen)))
         order = torch.argsort(torch.cat([chosen for chosen, _ in parts]))
 
         def joined(name: str) -> Tensor | None:

@@ -6,7 +6,9 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsparc.data.campaigns import campaign_of
 from gsparc.data.describe import raw_of
+from gsparc.data.errors import DataError
 from gsparc.data.modules.campaign import Campaign
 from gsparc.data.raw import Raw
 
@@ -42,6 +44,9 @@ class Own(Campaign):
     def raw(self) -> Raw:
         """The file's arrays, or the table's under the schema's names."""
         raw, notes = raw_of(self.file, self.columns, self.stations_file)
+        campaign = campaign_of(raw)
+        if campaign is not None:
+            raise DataError(f"{self.file}: this is a file of dataset={campaign}; say dataset={campaign}")
         for note in notes:
             log.info("%s: %s", self.file, note)
         return raw

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,7 +67,11 @@ Chosen = dict[str, tuple[Column, ...]]
 
 
 def choose(
-    sheet: Sheet, said: Mapping[str, object], problems: Problems, labelled: Iterable[str] = ()
+    sheet: Sheet,
+    said: Mapping[str, object],
+    problems: Problems,
+    labelled: Iterable[str] = (),
+    only: Container[str] | None = None,
 ) -> tuple[Chosen, list[str]]:
     """The columns of each quantity, and a note for each that was guessed.
 
@@ -76,6 +80,7 @@ def choose(
         said: heads, patterns with a `*` or numbers by quantity, as in `dataset.columns`.
         problems: takes what is wrong.
         labelled: names of stations; columns called so are taken as their levels.
+        only: quantities that are guessed; None: all.
     """
     chosen: Chosen = {}
     for key, value in said.items():
@@ -92,7 +97,11 @@ def choose(
         found = understand(head) if head and head not in taken else Head()
         if head not in taken and head in set(labelled):
             found = Head("rssi_db", label=head, word="station")
-        if found.role is None or _settled(found.role, chosen):
+        if (
+            found.role is None
+            or (only is not None and found.role not in only)
+            or _settled(found.role, chosen)
+        ):
             continue
         if found.strange:
             fault = f"[{found.strange}] is no known unit; expected one of {known(KINDS[found.role])}"

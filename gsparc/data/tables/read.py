@@ -58,11 +58,11 @@ def understand_table(
     path: str | Path, columns: Mapping[str, object] = NOTHING, stations_file: str | Path | None = None
 ) -> Table:
     """As `read_table`, with the notes."""
-    sheet, notes = _sheet(path)
+    sheet, notes = sheet_of(path)
     problems = Problems(path)
     listed = None
     if stations_file is not None:
-        second, _ = _sheet(stations_file)
+        second, _ = sheet_of(stations_file)
         listed, said = read_stations(second, problems)
         notes += said
         problems.raise_if_any()
@@ -74,7 +74,12 @@ def understand_table(
     return Table(Raw(arrays), (*notes, *guessed, *builder.notes))
 
 
-def _sheet(path: str | Path) -> tuple[Sheet, list[str]]:
+def sheet_of(path: str | Path) -> tuple[Sheet, list[str]]:
+    """The cells of a table, and notes on what was recognised.
+
+    Raises:
+        DataError: no such file, another ending, or no table.
+    """
     path = Path(path)
     if not path.is_file():
         raise DataError(f"{path}: no such file; expected *.csv, *.tsv, *.txt or *.parquet")
