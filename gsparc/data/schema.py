@@ -279,7 +279,7 @@ class Measurements:
     def batch(self, index: np.ndarray | Tensor) -> Batch:
         """The given rows as one batch."""
         rows = np.asarray(index)
-        if self.site.static_end == "rx" and self.site.stations is None:
+        if self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1):
             first = rows[:1]
             rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
         else:

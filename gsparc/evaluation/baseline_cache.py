@@ -16,7 +16,7 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, Method
-from gsparc.methods.per_station import for_links
+from gsparc.methods.per_station import for_links, taught
 from gsparc.methods.registry import method_class
 
 log = logging.getLogger(__name__)
@@ -34,9 +34,16 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
     carrier = site.carrier_hz is not None or (
         site.stations is not None and site.stations.carrier_hz is not None
     )
-    if site.kind == "csi" and carrier and site.static_end is not None and split.name != "stations":
+    if site.kind == "csi" and carrier and site.static_end is not None and _all_taught("complex_gp", data, split):
         return (*names, "complex_gp")
     return names
+
+
+def _all_taught(name: str, data: Measurements, split: Split) -> bool:
+    """Whether the training rows tell of every station that is asked for."""
+    if data.station is None:
+        return True
+    return not any(taught(method_class(name)(), data, fold)[1].any() for fold in split.folds)
 
 
 @dataclass(frozen=True)
