@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data import outliers
-from gsparc.data.doubts import as_links, doubts
+from gsparc.data.doubts import doubts
 from gsparc.data.errors import DataError
 from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
@@ -78,19 +78,21 @@ def doubtful(data: Measurements) -> list[str]:
     count = 1 if stations is None else len(stations)
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(data.target[:, 0].astype(np.float64) * data.site.target_scale)
-    heard = np.ones(len(data), bool) if data.censored is None else ~data.censored
-    table, which = np.full((len(first), count), np.nan), which.reshape(-1)
-    table[which[heard], station[heard]] = level[heard]
-    rows = [data.row_names[i].partition(", station")[0] for i in first]
-    position, of_link, levels, called = as_links(data.moving[first], table, rows)
-    if data.censored is not None:  # what is missing there is known to be weak
-        kept = np.isfinite(levels)
-        position, of_link, levels = position[kept], of_link[kept], levels[kept]
-        called = [row for row, keep in zip(called, kept, strict=True) if keep]
+    link, called = which.reshape(-1) * count + station, data.row_names
+    rows = np.arange(len(data)) if data.censored is None else np.flatnonzero(~data.censored)
+    absent = np.zeros(0, np.int64)
+    # What was not heard is known to be weak; a file with a station for each place has no empty cells.
+    if data.censored is None and len(first) < len(data):
+        absent = np.setdiff1d(np.arange(len(first) * count), link)
+    order = np.argsort(np.concatenate([link[rows], absent]), kind="stable")
+    of_row = np.concatenate([rows, first[absent // count]])[order]
+    of_link = np.concatenate([station[rows], absent % count])[order]
+    levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
+    names = [called[i].partition(", station")[0] for i in of_row]
     known = None if data.site.static_position is None else data.site.static_position[None]
     known = known if stations is None else stations.position
-    names = ["the station"] if stations is None else list(stations.name)
-    return doubts(position, of_link, levels, names, called, known)
+    of_station = ["the station"] if stations is None else list(stations.name)
+    return doubts(data.moving[of_row], of_link, levels, of_station, names, known)
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:

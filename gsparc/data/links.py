@@ -12,7 +12,7 @@ import numpy as np
 
 from gsparc.data.degrees import in_metres
 from gsparc.data.own_checks import Checker
-from gsparc.data.raw import Raw
+from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import End, Links
 from gsparc.data.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
 
@@ -29,6 +29,8 @@ def expand(check: Checker, measured: str) -> Links | None:
         measured: name of the measurement.
     """
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
+    if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
+        check.raw.arrays.setdefault("row_name", numbered_rows(len(check.raw.arrays[measured])))
     before = len(check.problems)  # what is already noted does not keep from noting more
     origin = in_metres(check)
     if len(check.problems) > before or not _heights(check):
@@ -151,7 +153,8 @@ def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray) ->
         below = ~unknown & told & (values < floor)
         if below.any():
             row = int(np.flatnonzero(below)[0])
-            wrong = f"row {row} of {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
+            named = links.named([str(name) for name in arrays["row_name"]])[row]
+            wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
         arrays[measured] = np.where(censored, floor, values)
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored

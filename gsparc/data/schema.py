@@ -64,11 +64,9 @@ class Links:
 
     def named(self, rows: list[str]) -> list[str]:
         """Names (S,) of rows, with their stations."""
-        if self.stations is None or self.station is None or self.place is None:
+        if self.stations is None or self.station is None:
             return rows
         names = self.stations.name
-        if len(set(rows)) == len(rows) and rows[:1] == ["row 0"]:  # not called anything by the user
-            rows = [f"row {i}" for i in self.place]
         return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
 
 

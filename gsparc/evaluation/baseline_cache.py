@@ -34,7 +34,12 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
     carrier = site.carrier_hz is not None or (
         site.stations is not None and site.stations.carrier_hz is not None
     )
-    if site.kind == "csi" and carrier and site.static_end is not None and _all_taught("complex_gp", data, split):
+    if (
+        site.kind == "csi"
+        and carrier
+        and site.static_end is not None
+        and _all_taught("complex_gp", data, split)
+    ):
         return (*names, "complex_gp")
     return names
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class Scores:
         """Flat figures over all folds together."""
         return type(metrics_for(self.kind)).summary(self.samples)
 
-    def decided_by(self) -> dict[str, float | int]:
+    def decided_by(self) -> dict[str, Any]:
         """The row that alone makes more than half of all error or power, and a figure that no row decides.
 
         `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /

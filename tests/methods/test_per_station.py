@@ -172,9 +172,7 @@ def test_the_place_of_a_single_station_was_sought():
     walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
     for end in ("tx", "rx"):
         levels_db = -20 * np.log10(np.linalg.norm(walk - POSTS[1], axis=1))[:, None]
-        data = from_arrays(
-            {f"{end}_position": walk, "station_position": POSTS[1:2], "rssi_db": levels_db}
-        )
+        data = from_arrays({f"{end}_position": walk, "station_position": POSTS[1:2], "rssi_db": levels_db})
         np.testing.assert_allclose(data.site.static_position + data.site.origin, POSTS[1])
         split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
         method = for_links(method_class("distance_law"), data)
