@@ -20,6 +20,7 @@ from scipy.spatial.distance import cdist, pdist
 
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Prediction, PredictsVariance
+from gsparc.methods.power_process import MOST_ROWS, draw
 from gsparc.methods.target_rows import entry_variance, to_real
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
@@ -89,6 +90,11 @@ class Kriging(Interpolator, PredictsVariance):
     name = "kriging"
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        notes = []
+        if len(targets) > MOST_ROWS:  # the system is solved whole
+            notes.append(f"kriging: learned from {MOST_ROWS} of {len(targets)} rows, drawn evenly")
+            kept = draw(np.zeros(len(targets), bool), MOST_ROWS, 0)
+            positions, targets = positions[kept], targets[kept]
         # Repeated places would make the system singular: their mean is kriged.
         self.positions, group = np.unique(positions, axis=0, return_inverse=True)
         decibels, group = self._decibels(targets), group.reshape(-1)
@@ -97,7 +103,8 @@ class Kriging(Interpolator, PredictsVariance):
         self.variogram = fit_variogram(positions, decibels)
         self._solve()
         v = self.variogram
-        return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m",)
+        found = f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m"
+        return (found, *notes)
 
     def _decibels(self, targets: np.ndarray) -> np.ndarray:
         if self.kind == "csi":

@@ -213,7 +213,7 @@ def test_degrees_that_are_none_are_one_line(case):
 
 
 def test_messages_name_the_rows_of_the_file():
-    """Rows were numbered after those without a value were gone, places in a long file, links in a wide one."""
+    """Rows were counted after those without a value were gone, or places, or links were."""
     one = {"rx_position": WALK, "tx_position": POSTS[0]}
     levels_db = LEVELS[:, 0].copy()
     levels_db[[3, 7]] = np.nan, np.inf

@@ -342,7 +342,7 @@ def test_names_of_files(write, tmp_path):
 def test_marks_between_thousands_were_decimal_commas(write):
     """\"448,262\" in quotes between commas was 448.262 m."""
     with pytest.raises(
-        DataError, match="line 2: '448,262': is no finite number; .* no marks between thousands"
+        DataError, match=r"line 2: '448,262': is no finite number; .* no marks between thousands"
     ):
         read_table(write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n'))
     some = read_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n'))
