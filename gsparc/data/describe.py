@@ -84,7 +84,7 @@ def doubtful(data: Measurements) -> list[str]:
     # What was not heard is known to be weak; a file with a station for each place has no empty cells.
     if data.censored is None and len(first) < len(data):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
-    order = np.argsort(np.concatenate([link[rows], absent]), kind="stable")
+    order = np.argsort(np.concatenate([rows, first[absent // count]]), kind="stable")
     of_row = np.concatenate([rows, first[absent // count]])[order]
     of_link = np.concatenate([station[rows], absent % count])[order]
     levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
@@ -200,6 +200,12 @@ def suspicious_values(data: Measurements) -> list[str]:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             found.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+    if site.kind == "rssi" and (data.target == 0).any():
+        count = int((data.target == 0).sum())
+        found.append(
+            f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
+            "rssi_db and sensitivity_db"
+        )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         if 0 < spread < 0.1:

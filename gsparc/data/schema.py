@@ -219,8 +219,8 @@ class Measurements:
         provenance: where the data came from, as their makers wrote it down.
         uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or None.
         station: (S,) int64, which of `site.stations` a row is of; None where there is one.
-        place: (S,) int64, the row of the file that a link came from: one place, several stations; None where
-            every row is one.
+        place: (S,) int64, the number of the place that a row is of: one place, several stations, or visits;
+            None where every row is one.
         censored: (S,) bool, True where a power was below what can be heard: the target is that level, and its
             mask is False. None where nothing is.
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.

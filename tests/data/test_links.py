@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.data.describe import describe
+from gsparc.data.describe import describe, suspicious_values
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret, load_own
 from gsparc.data.raw import Raw
@@ -235,3 +235,20 @@ def test_rows_keep_their_numbers_when_a_part_is_taken():
     raw = Raw(town(run=np.array(["a"] * 4 + ["b"] * 6)))
     part = interpret(select(raw, Selection(runs=["b"], stations=["roof"]), "town.npz").raw, "town.npz")
     assert part.data.row_names == [f"row {i}, station roof" for i in range(4, 10)]
+
+
+def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers():
+    levels_db = np.where(LEVELS < -80, np.nan, LEVELS)
+    carriers = np.where(np.arange(PLACES) % 2, 1e9, 2e9)
+    data = read(town(rssi_db=levels_db, carrier_hz=carriers, sensitivity_db=np.array([-80.0, -81, -82]))).data
+    assert len(data.site.stations) == 2 * STATIONS and data.censored.any()
+    level_db = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
+    expected = [{"n": -80.0, "e": -81.0, "r": -82.0}[data.site.stations.name[t][0]] for t in data.station]
+    np.testing.assert_allclose(level_db[data.censored], np.array(expected)[data.censored], atol=1e-3)
+
+
+def test_powers_of_zero_are_doubted():
+    """They are learned as -300 dB, which nobody said."""
+    powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
+    data = read({**town(rssi_db=None), "rssi": powers}).data
+    assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in suspicious_values(data)[0]
