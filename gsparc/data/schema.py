@@ -181,6 +181,7 @@ class Batch:
         noise_variance: (B,) float32 in target units; None when unknown.
         uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
         station: (B,) int64, which of the site's stations each is of; None where there is one.
+        run: (B,) int64, see `Measurements`; None where all are in phase.
     """
 
     index: Tensor
@@ -191,6 +192,7 @@ class Batch:
     noise_variance: Tensor | None = None
     uplink: Tensor | None = None
     station: Tensor | None = None
+    run: Tensor | None = None
 
     def __len__(self) -> int:
         return self.index.shape[0]
@@ -291,6 +293,7 @@ class Measurements:
             noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
             uplink=None if self.uplink is None else torch.from_numpy(self.uplink[rows]),
             station=None if self.station is None else torch.from_numpy(self.station[rows]),
+            run=None if self.run is None else torch.from_numpy(self.run[rows]),
         )
 
     @staticmethod

@@ -79,8 +79,10 @@ def baseline(
         cache: folder of earlier results; None keeps nothing.
     """
     unseen = eval_on == "val"
-    # The same data may be in another model's local coordinates and units.
-    frame = f"{data.site.origin.tolist()} {data.site.target_scale}"
+    # The same data may be in another model's local coordinates and units, and count its stations.
+    stations = data.site.stations
+    listed = "" if stations is None else f" {stations.name} {stations.position.tolist()}"
+    frame = f"{data.site.origin.tolist()} {data.site.target_scale}{listed}"
     key = hashlib.sha256(f"{data.site.sha256} {split.sha256} {frame}".encode()).hexdigest()[:24]
     folder = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)

@@ -196,7 +196,7 @@ class PowerMetrics(SampleMetric):
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "mse": _statistic(samples["mse"]),
             "silent_samples": silent,
-            "samples": len(samples["target"]),
+            "samples": int((~np.isnan(samples["target"])).sum()),  # those where something was heard
         }
 
 

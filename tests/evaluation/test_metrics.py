@@ -163,6 +163,8 @@ def test_power_figures_in_decibels(caplog):
     # Black is read as the weakest power of the set: 0, 10 and 20 dB off.
     black = summarise(PowerMetrics(), torch.zeros(3, 1), target)
     assert black["mae_db"] == pytest.approx(10, rel=1e-5) and "3 predictions" in caplog.text
+    heard = summarise(PowerMetrics(), target, target, torch.tensor([[True], [False], [True]]))
+    assert heard["samples"] == 2  # what was not heard is in no figure, and was counted
     silent = summarise(PowerMetrics(), target, torch.zeros(3, 1))
     assert silent["rmse_db"] is None and silent["silent_samples"] == 3
 
