@@ -190,7 +190,9 @@ def _some(names: Sequence[str], count: int = 4) -> str:
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position])
-    found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
+    found = []
+    if site.georeference is None:  # degrees are in no doubt
+        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -221,7 +223,8 @@ def _units(positions: np.ndarray) -> list[str]:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
-        return [f"heights differ by {height:.4g} m; {hint}"]
+        far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
+        return [f"{far}; {hint}"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []

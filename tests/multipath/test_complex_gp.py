@@ -91,7 +91,7 @@ def test_runs_are_brought_together(tmp_path):
 
 def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(tmp_path):
     """A right prediction of a row in another run's phase was an error of up to four times its power."""
-    clean, spread, fold = _in_runs([1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)])
+    _, spread, fold = _in_runs([1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)])
     method = ComplexGP()
     method.fit(spread, fold, FitContext(tmp_path))
     batch = spread.batch(fold.test)
