@@ -115,7 +115,7 @@ def assemble(
         "carriers_hz": None if stations is None else stations.carrier_hz,
     }  # fmt: skip
     still = None
-    if static_end is not None and stations is None and not unknown:
+    if static_end is not None and (stations is None or len(stations) == 1) and not unknown:
         still = (rx if static_end == "rx" else tx)[0] - origin
     site = Site(
         static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,

@@ -183,7 +183,9 @@ def _some(names: Sequence[str], count: int = 4) -> str:
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position])
-    found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
+    found = []
+    if site.georeference is None:  # degrees are in no doubt
+        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -193,6 +195,12 @@ def suspicious_values(data: Measurements) -> list[str]:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             found.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+    if site.kind == "rssi" and (data.target == 0).any():
+        count = int((data.target == 0).sum())
+        found.append(
+            f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
+            "rssi_db and sensitivity_db"
+        )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         if 0 < spread < 0.1:
@@ -208,7 +216,8 @@ def _units(positions: np.ndarray) -> list[str]:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
-        return [f"heights differ by {height:.4g} m; {hint}"]
+        far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
+        return [f"{far}; {hint}"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []

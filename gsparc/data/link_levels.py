@@ -6,13 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.data.doubts import as_links
 from gsparc.data.schema import Measurements
 
 
 @dataclass(frozen=True)
 class LinkLevels:
-    """One row for every place and station, whether it was heard there or not.
+    """One row for every measurement, and for every place and station without one.
 
     Attributes:
         position: (n, 3) of the moving end, *local* [m].
@@ -43,16 +42,18 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     count = 1 if stations is None else len(stations)
     with np.errstate(divide="ignore"):
         level = 10 * np.log10(data.target[:, 0].astype(np.float64) * site.target_scale)
-    heard = np.ones(len(data), bool) if data.censored is None else ~data.censored
-    table, which = np.full((len(first), count), np.nan), which.reshape(-1)
-    table[which[heard], station[heard]] = level[heard]
-    rows = [data.row_names[i].partition(", station")[0] for i in first]
-    position, of_link, levels, called = as_links(data.moving[first], table, rows)
-    if data.censored is not None:  # what is missing there is known to be weak
-        kept = np.isfinite(levels)
-        position, of_link, levels = position[kept], of_link[kept], levels[kept]
-        called = [row for row, keep in zip(called, kept, strict=True) if keep]
+    link, called = which.reshape(-1) * count + station, data.row_names
+    rows = np.arange(len(data)) if data.censored is None else np.flatnonzero(~data.censored)
+    absent = np.zeros(0, np.int64)
+    # What was not heard is known to be weak; a file with a station for each place has no empty cells.
+    if data.censored is None and len(first) < len(data):
+        absent = np.setdiff1d(np.arange(len(first) * count), link)
+    order = np.argsort(np.concatenate([rows, first[absent // count]]), kind="stable")
+    of_row = np.concatenate([rows, first[absent // count]])[order]
+    of_link = np.concatenate([station[rows], absent % count])[order]
+    levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
+    of_file = [called[i].partition(", station")[0] for i in of_row]
     known = None if site.static_position is None else site.static_position[None]
     known = known if stations is None else stations.position
     names = ["the station"] if stations is None else list(stations.name)
-    return LinkLevels(position, of_link, levels, called, names, known)
+    return LinkLevels(data.moving[of_row], of_link, levels, of_file, names, known)

@@ -12,7 +12,7 @@ import numpy as np
 
 from gsparc.data.degrees import in_metres
 from gsparc.data.own_checks import Checker
-from gsparc.data.raw import Raw
+from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import End, Links
 from gsparc.data.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
 
@@ -29,6 +29,8 @@ def expand(check: Checker, measured: str) -> Links | None:
         measured: name of the measurement.
     """
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
+    if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
+        check.raw.arrays.setdefault("row_name", numbered_rows(len(check.raw.arrays[measured])))
     before = len(check.problems)  # what is already noted does not keep from noting more
     origin = in_metres(check)
     if len(check.problems) > before or not _heights(check):
@@ -49,12 +51,17 @@ def _without_table(check: Checker, measured: str) -> Links | None:
         check.notes.append("no tx_position: the transmitter's place is unknown")
         arrays["tx_position"] = np.full(3, np.nan)
         links = Links("tx", run=run, unknown_transmitter=True)
+        moving = arrays["rx_position"]
     else:
         ends = [check.real(f"{end}_position", (3,), (rows, 3)) for end in ("rx", "tx")]
         if any(end is None for end in ends):
             return Links("tx", run=run)  # what is missing is said where positions are read
         rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
-        links = ends_of(check, rx, tx, run)
+        links, moving = ends_of(check, rx, tx, run), np.hstack([rx, tx])
+    if links.place is None and moving.ndim == 2 and len(moving) == rows:
+        place = numbered(moving)
+        if len(np.unique(place)) < rows:  # a place visited twice is not learned from and tested on
+            links = replace(links, place=place)
     return _heard(check, measured, links, np.zeros(rows, np.int64))
 
 
@@ -84,12 +91,10 @@ def _with_table(check: Checker, measured: str) -> Links | None:
     carriers = check.real("carrier_hz", (), (count,), (rows,)) if "carrier_hz" in check.raw.arrays else None
     if len(check.problems) > before:
         return None
-    place = np.arange(rows)
+    positions = check.real(f"{moving}_position", (rows, 3))
+    place = np.arange(rows) if positions is None else numbered(positions)
     if long:
         assert which is not None
-        positions = check.real(f"{moving}_position", (rows, 3))
-        if positions is not None:
-            place = numbered(positions)
         links = Links(OTHER[moving], stations, which, place, run=run)
     else:
         check.raw = _unrolled(check.raw, measured, moving, count)
@@ -97,6 +102,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
             OTHER[moving], stations, np.tile(np.arange(count), rows), np.repeat(place, count),
             run=None if run is None else np.repeat(run, count),
         )  # fmt: skip
+    of_level = links.station  # a station at two carriers has one level
     links = by_carrier(check, links, carriers, rows)
     check.raw.arrays[f"{OTHER[moving]}_position"] = links.stations.position[links.station]  # type: ignore[union-attr, index]
     if links.stations is not None and links.stations.rotation is not None:
@@ -105,7 +111,7 @@ def _with_table(check: Checker, measured: str) -> Links | None:
         check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
     for name in STATION_FIELDS[:-1]:
         check.raw.arrays.pop(name, None)
-    return _heard(check, measured, links, links.station)  # type: ignore[arg-type]
+    return _heard(check, measured, links, of_level, count)  # type: ignore[arg-type]
 
 
 def _unrolled(raw: Raw, measured: str, moving: End, count: int) -> Raw:
@@ -124,10 +130,10 @@ def _unrolled(raw: Raw, measured: str, moving: End, count: int) -> Raw:
     return replace(raw, arrays=arrays)
 
 
-def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray) -> Links | None:
+def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
     """Rows without a missing value; censored ones hold the level below which nothing is heard, masked."""
     values, arrays = check.raw.arrays[measured], check.raw.arrays
-    level = check.real("sensitivity_db", (), (len(links.stations) if links.stations is not None else 1,))
+    level = check.real("sensitivity_db", (), (count,))
     if "sensitivity_db" in arrays and level is None:
         return None
     if level is not None and measured != "rssi_db":
@@ -151,7 +157,8 @@ def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray) ->
         below = ~unknown & told & (values < floor)
         if below.any():
             row = int(np.flatnonzero(below)[0])
-            wrong = f"row {row} of {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
+            named = links.named([str(name) for name in arrays["row_name"]])[row]
+            wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
         arrays[measured] = np.where(censored, floor, values)
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored

@@ -64,11 +64,9 @@ class Links:
 
     def named(self, rows: list[str]) -> list[str]:
         """Names (S,) of rows, with their stations."""
-        if self.stations is None or self.station is None or self.place is None:
+        if self.stations is None or self.station is None:
             return rows
         names = self.stations.name
-        if len(set(rows)) == len(rows) and rows[:1] == ["row 0"]:  # not called anything by the user
-            rows = [f"row {i}" for i in self.place]
         return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
 
 
@@ -186,6 +184,7 @@ class Batch:
         noise_variance: (B,) float32 in target units; None when unknown.
         uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
         station: (B,) int64, which of the site's stations each is of; None where there is one.
+        run: (B,) int64, see `Measurements`; None where all are in phase.
     """
 
     index: Tensor
@@ -196,6 +195,7 @@ class Batch:
     noise_variance: Tensor | None = None
     uplink: Tensor | None = None
     station: Tensor | None = None
+    run: Tensor | None = None
 
     def __len__(self) -> int:
         return self.index.shape[0]
@@ -224,8 +224,8 @@ class Measurements:
         provenance: where the data came from, as their makers wrote it down.
         uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or None.
         station: (S,) int64, which of `site.stations` a row is of; None where there is one.
-        place: (S,) int64, the row of the file that a link came from: one place, several stations; None where
-            every row is one.
+        place: (S,) int64, the number of the place that a row is of: one place, several stations, or visits;
+            None where every row is one.
         censored: (S,) bool, True where a power was below what can be heard: the target is that level, and its
             mask is False. None where nothing is.
         run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
@@ -282,7 +282,7 @@ class Measurements:
     def batch(self, index: np.ndarray | Tensor) -> Batch:
         """The given rows as one batch."""
         rows = np.asarray(index)
-        if self.site.static_end == "rx" and self.site.stations is None:
+        if self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1):
             first = rows[:1]
             rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
         else:
@@ -296,6 +296,7 @@ class Measurements:
             noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
             uplink=None if self.uplink is None else torch.from_numpy(self.uplink[rows]),
             station=None if self.station is None else torch.from_numpy(self.station[rows]),
+            run=None if self.run is None else torch.from_numpy(self.run[rows]),
         )
 
     @staticmethod

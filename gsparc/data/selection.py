@@ -17,7 +17,7 @@ import numpy as np
 from gsparc.data.errors import DataError
 from gsparc.data.fields import MEASUREMENTS
 from gsparc.data.instantiate import suggest
-from gsparc.data.raw import Raw
+from gsparc.data.raw import Raw, numbered_rows
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
@@ -205,6 +205,7 @@ def take_rows(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
         DataError: an array has another number of rows than the measurement.
     """
     count, stations = row_count(raw, source), station_count(raw)
+    raw = replace(raw, arrays={"row_name": numbered_rows(count), **raw.arrays})  # numbers stay the file's
     arrays = {}
     for name, array in raw.arrays.items():
         arrays[name] = array[rows] if _per_row(name, array, count, stations, source) else array

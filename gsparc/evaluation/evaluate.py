@@ -74,7 +74,10 @@ def evaluate(
     names = fitting(data, split) if baselines is None else baselines
     others = {name: baseline(name, data, split, eval_on, cache) for name in names}
     facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in pooled(scores, data, split).items()}
-    facts |= {f"{eval_on}/{k}": v for k, v in scores.decided_by().items()}
+    decided = scores.decided_by()
+    if decided and data.row_names:
+        decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
+    facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
     for name, other in others.items():
         own = {**pooled(other.scores, data, split), "skill": _skill(other.scores, others)}

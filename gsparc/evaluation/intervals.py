@@ -45,6 +45,8 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         return found
     of_row = level_db[0 if data.station is None else data.station[row]]
     told = np.isfinite(of_row)
+    if not told.any():  # all of them are of stations that heard everything
+        return found
     chance = norm.cdf((of_row[told] - mean_db[told]) / spread_db[told])
     rate = float(silent[told].mean())
     return found | {

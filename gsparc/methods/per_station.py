@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.methods.censored import heard
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.ops import Pose
@@ -37,6 +38,15 @@ def for_links(make: Callable[[], Method], data: Measurements) -> Method:
     if data.site.static_end is None and not method.both_ends:
         raise ValueError(f"{method.name}: both ends move here; it needs one that stands still")
     return method
+
+
+def taught(method: Method, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
+    """Stations (T,) bool with training rows enough for `method`, and those that are asked for without."""
+    assert data.station is not None and data.site.stations is not None
+    count = len(data.site.stations)
+    rows = fold.train if method.uses_censored else heard(data, fold.train)
+    known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
+    return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
 
 
 def of_station(site: Site, number: int) -> Site:
@@ -80,14 +90,13 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
         self._shape = tuple(data.target.shape[1:])
-        heard = np.bincount(data.station[fold.train], minlength=len(data.site.stations)) >= LEAST_ROWS
-        asked = np.bincount(data.station[fold.test], minlength=len(heard)) > 0
-        numbers = [int(t) for t in np.flatnonzero(heard)]
+        known, unheard = taught(self.wrapped, data, fold)
+        numbers = [int(t) for t in np.flatnonzero(known)]
         if together:
             numbers = [UNHEARD]
-        elif (asked & ~heard).any():
+        elif unheard.any():
             if not self.wrapped.both_ends:
-                names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(asked & ~heard)[:3])
+                names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
         share = None if context.budget_s is None else context.budget_s / len(numbers)
@@ -134,11 +143,17 @@ class PerStation(Method):
         return copy
 
     def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands."""
+        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
         assert self.site is not None and self.site.stations is not None
         ends = tx if self.site.static_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
         table = torch.from_numpy(self.site.stations.position)
-        apart, number = torch.cdist(ends.detach().cpu().double(), table).min(dim=1)
+        distance = torch.cdist(ends.detach().cpu().double(), table)
+        apart, number = distance.min(dim=1)
+        shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
+        if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
+            here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
+            names = " and ".join(self.site.stations.name[t] for t in here)
+            raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
         if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
             row = int(apart.argmax())
             raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")

@@ -4,20 +4,20 @@ Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R
 of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2
 envelope over distance bounds the correlation. Real and imaginary parts share one kernel: the circular complex
 process. Rows of a run (`Measurements.run`) share an unknown complex factor, estimated by likelihood;
-predictions are those of the largest run.
+predictions at places are those of the largest run, those of measured rows their own run's where it is known.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
 from gsparc.multipath.ridge import cholesky
@@ -80,6 +80,8 @@ class ComplexGP(PredictsVariance):
         notes = [f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"]
         if len(known) > CHOSEN_ON:
             notes.append(f"complex_gp: settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
+        self.runs, first = names.astype(np.int64), np.unique(run, return_index=True)[1]
+        self.factors = self.turned[torch.from_numpy(first)]
         if len(names) > 1:
             notes.append(self._said_of(names, run))
         return FitReport(time.monotonic() - started, tuple(notes))
@@ -136,6 +138,17 @@ class ComplexGP(PredictsVariance):
             variance=(self.power * variance).float(),
         )
 
+    def answer(self, batch: Batch) -> Prediction:
+        """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
+        found = self.predict(batch.tx, batch.rx)
+        if batch.run is None or len(self.runs) == 1:
+            return found
+        same = batch.run.cpu()[:, None] == torch.from_numpy(self.runs)
+        factor = torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
+        assert found.variance is not None
+        mean = found.mean * factor.to(found.mean.dtype)[:, None, None]
+        return replace(found, mean=mean, variance=found.variance * factor.abs().square().float())
+
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64; see `Differentiable`."""
         return self._mean(self._cross(tx, rx))
@@ -160,7 +173,8 @@ class ComplexGP(PredictsVariance):
         if self.site is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
         names = ("places", "weights", "factor", "length", "noise", "power", "turned")
-        return {**{name: getattr(self, name) for name in names}, "shape": list(self.shape)}
+        runs = {"runs": torch.from_numpy(self.runs), "factors": self.factors}
+        return {**{name: getattr(self, name) for name in names}, **runs, "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
@@ -168,6 +182,8 @@ class ComplexGP(PredictsVariance):
         self.places, self.weights, self.factor = state["places"], state["weights"], state["factor"]
         ones = torch.ones(len(self.places), dtype=torch.complex128)  # earlier versions knew no runs
         self.turned = state.get("turned", ones)
+        self.runs = state["runs"].numpy() if "runs" in state else np.zeros(1, np.int64)
+        self.factors = state.get("factors", ones[:1])
         self.length, self.noise, self.power = (float(state[k]) for k in ("length", "noise", "power"))
 
     def size(self) -> int:

@@ -6,8 +6,11 @@ from releases import real
 from scipy.spatial.distance import cdist
 
 from gsparc.data import doubts as doubt
+from gsparc.data.describe import doubtful
 from gsparc.data.errors import DataError
 from gsparc.data.level_steps import level_steps
+from gsparc.data.link_levels import link_levels
+from gsparc.data.own import from_arrays
 
 
 def names_of(count):
@@ -227,3 +230,20 @@ def test_other_real_campaigns_raise_few(campus):
     place, station, level, names, rows, fixed = campus
     assert doubt.position_doubts(place, rows) == [] and doubt.level_doubts(level) == []
     assert doubt.direction_doubts(place, station, level, fixed) == []
+
+
+def test_copies_in_a_file_of_links_were_one_row():
+    """Rows of one place and station were entered into one cell before anyone looked for copies."""
+    place, level, station = walk(0, 60)
+    where = np.repeat(np.column_stack([place, np.ones(60)]), 2, axis=0)
+    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
+    links = {"rx_position": where, "station_position": posts, "station": np.repeat(np.arange(60) % 2, 2)}
+    found = doubtful(link_levels(from_arrays({**links, "rssi_db": np.repeat(level, 2)})))
+    assert found[0].startswith("copies (same place, station and level): row 1 of row 0, row 3 of row 2")
+
+
+def test_a_station_for_each_place_is_no_outage_of_the_others():
+    place, level, station = walk(0, 60)
+    links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
+    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
+    assert not doubtful(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))

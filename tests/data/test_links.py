@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.data.describe import describe
+from gsparc.data.describe import describe, suspicious_values
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret, load_own
 from gsparc.data.raw import Raw
+from gsparc.data.selection import Selection, select
 
 PLACES, STATIONS = 10, 3
 RNG = np.random.default_rng(0)
@@ -146,7 +147,7 @@ SPOILT = {
     "no table": (town(station_position=None, station=np.zeros(PLACES, int)), "without station_position"),
     "all missing": (town(rssi_db=LEVELS * np.nan), "nothing was measured"),
     "an infinite power": (town(rssi_db=np.where(LEVELS.max() == LEVELS, np.inf, LEVELS)), "not finite"),
-    "below the level": (town(sensitivity_db=-50.0), r"row \d+ of rssi_db is .* below -50"),
+    "below the level": (town(sensitivity_db=-50.0), r"row \d+, station \w+: rssi_db is .* below -50"),
     "level of channels": (town(rssi_db=None, rssi=LEVELS**2, sensitivity_db=-80.0), "goes with rssi_db"),
     "level of 1e9": (town(sensitivity_db=1e9), "expected dB between -400 and 400"),
     "turned transmitters": (
@@ -209,3 +210,45 @@ def test_degrees_that_are_none_are_one_line(case):
     with pytest.raises(DataError, match=words) as refused:
         read(town(tx_position=None, **arrays))
     assert "\n" not in str(refused.value)
+
+
+def test_messages_name_the_rows_of_the_file():
+    """Rows were counted after those without a value were gone, or places, or links were."""
+    one = {"rx_position": WALK, "tx_position": POSTS[0]}
+    levels_db = LEVELS[:, 0].copy()
+    levels_db[[3, 7]] = np.nan, np.inf
+    with pytest.raises(DataError, match="rssi_db, row 7: not finite"):
+        read({**one, "rssi_db": levels_db})
+    walk, which = np.repeat(WALK, STATIONS, axis=0), np.tile(np.arange(STATIONS), PLACES)
+    levels_db = LEVELS.reshape(-1).copy()
+    levels_db[17] = np.inf
+    with pytest.raises(DataError, match="rssi_db, row 17, station roof: not finite"):
+        read(town(tx_position=walk, station=which, rssi_db=levels_db))
+    levels_db = LEVELS.copy()
+    levels_db[4, 1] = -120
+    with pytest.raises(DataError, match="row 4, station east: rssi_db is -120, below -100"):
+        read(town(rssi_db=levels_db, sensitivity_db=np.array(-100.0)))
+
+
+def test_rows_keep_their_numbers_when_a_part_is_taken():
+    """What was selected was counted from 0 again: a message named another row than the file's."""
+    raw = Raw(town(run=np.array(["a"] * 4 + ["b"] * 6)))
+    part = interpret(select(raw, Selection(runs=["b"], stations=["roof"]), "town.npz").raw, "town.npz")
+    assert part.data.row_names == [f"row {i}, station roof" for i in range(4, 10)]
+
+
+def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers():
+    levels_db = np.where(LEVELS < -80, np.nan, LEVELS)
+    carriers = np.where(np.arange(PLACES) % 2, 1e9, 2e9)
+    data = read(town(rssi_db=levels_db, carrier_hz=carriers, sensitivity_db=np.array([-80.0, -81, -82]))).data
+    assert len(data.site.stations) == 2 * STATIONS and data.censored.any()
+    level_db = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
+    expected = [{"n": -80.0, "e": -81.0, "r": -82.0}[data.site.stations.name[t][0]] for t in data.station]
+    np.testing.assert_allclose(level_db[data.censored], np.array(expected)[data.censored], atol=1e-3)
+
+
+def test_powers_of_zero_are_doubted():
+    """They are learned as -300 dB, which nobody said."""
+    powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
+    data = read({**town(rssi_db=None), "rssi": powers}).data
+    assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in suspicious_values(data)[0]

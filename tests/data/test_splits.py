@@ -6,6 +6,7 @@ import pytest
 
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
+from gsparc.data.own import from_arrays
 from gsparc.data.rfid import load_rfid
 from gsparc.data.splits import SplitSettings, make_split, path_order, read_split, write_split
 
@@ -273,3 +274,28 @@ def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path
     with pytest.raises(DataError, match=r"split\.json: not a split file") as error:
         read_split(file, 4)
     assert len(str(error.value)) < 300 and "sys." not in str(error.value)
+
+
+def test_a_place_visited_again_was_learned_from_and_tested_on():
+    """Ten samples at each of 30 places: every test row had others of its place to learn from."""
+    places = np.repeat(np.random.default_rng(0).uniform(0, 9, (30, 3)), 10, axis=0)
+    levels_db, post = -60 - places[:, 0], np.array([[0.0, 0, 5]])
+    for arrays in (
+        {"rx_position": places, "rssi_db": levels_db},
+        {"rx_position": places, "rssi_db": levels_db, "tx_position": post[0]},
+        {
+            "rx_position": places,
+            "rssi_db": levels_db[:, None] - [0, 3],
+            "station_position": [*post, post[0] + 9],
+        },
+        {
+            "rx_position": places,
+            "tx_position": np.concatenate([places[10:], places[:10]]),
+            "rssi_db": levels_db,
+        },
+    ):
+        data = from_arrays(arrays)
+        for name in ("random", "sparse"):
+            fold = split_for({"name": name}, data).folds[0]
+            known = {tuple(row) for row in data.moving[np.concatenate([fold.train, fold.val])]}
+            assert len(fold.test) and not known & {tuple(row) for row in data.moving[fold.test]}

@@ -339,6 +339,25 @@ def test_names_of_files(write, tmp_path):
         read_table(write(PLAIN, "drive.xlsx"))
 
 
+def test_marks_between_thousands_were_decimal_commas(write):
+    """\"448,262\" in quotes between commas was 448.262 m."""
+    with pytest.raises(
+        DataError, match=r"line 2: '448,262': is no finite number; .* no marks between thousands"
+    ):
+        read_table(write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n'))
+    some = read_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n'))
+    np.testing.assert_array_equal(some.arrays["rx_position"], [[448.262, 412.1], [448.263, 412.25]])
+
+
+def test_access_points_that_receive_were_transmitters(write):
+    """Stations whose places are called rx_x, ... receive: the other end is the transmitter, and moves."""
+    lines = [f"{i},{i % 7},1,{'ab'[i % 2]},{50 * (i % 2)},0,3,{-50 - i % 13}" for i in range(40)]
+    path = write("\n".join(["x,y,z,ap,rx_x,rx_y,rx_z,rssi", *lines]))
+    arrays = read_table(path).arrays
+    assert "tx_position" in arrays and "rx_position" not in arrays
+    assert "rx_position" in read_table(write(path.read_text().replace("rx_", "tx_"))).arrays
+
+
 def test_parquet(tmp_path):
     pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gsparc[tables]'")
     from pyarrow import parquet
@@ -352,6 +371,28 @@ def test_parquet(tmp_path):
     (tmp_path / "bad.parquet").write_bytes(b"PAR1" + bytes(20))
     with pytest.raises(DataError, match="damaged or not a Parquet file"):
         read_table(tmp_path / "bad.parquet")
+
+
+def test_an_index_of_parquet_was_dropped(tmp_path):
+    """pandas sets a column aside as the index: stations were lost, and all rows one station's."""
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gsparc[tables]'")
+    import pandas as pd
+
+    columns = {
+        "x": [0.0, 1],
+        "y": [0.0, 2],
+        "station": ["a", "b"],
+        "station_x": [5.0, 6],
+        "station_y": [0.0, 0],
+    }
+    frame = pd.DataFrame({**columns, "rssi": [-80.0, -70]})
+    for index in (["station"], ["station", "x"]):
+        frame.set_index(index).to_parquet(tmp_path / "drive.parquet")
+        arrays = read_table(tmp_path / "drive.parquet").arrays
+        assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rx_position"].tolist() == [
+            [0, 0],
+            [1, 2],
+        ]
 
 
 def test_parquet_without_pyarrow(write, monkeypatch):

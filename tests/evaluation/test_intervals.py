@@ -59,3 +59,20 @@ def test_no_variance_no_figures(drawn):
     data, mean_db = drawn
     scores = scored(data, mean_db, 6.0)
     assert power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
+
+
+def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
+    """The summary of the whole run was refused for it, after the training."""
+    walk = np.random.default_rng(0).uniform(0, 9, (40, 3))
+    levels_db = np.stack([-80 - walk[:, 0], -80 - walk[:, 1]], axis=1)
+    levels_db[levels_db[:, 0] < -85, 0] = np.nan
+    posts = {
+        "station_position": np.array([[0.0, 0, 5], [9, 9, 5]]),
+        "sensitivity_db": np.array([-85.0, -200]),
+    }
+    data = from_arrays({"rx_position": walk, "rssi_db": levels_db, **posts})
+    row = np.flatnonzero(data.station == 1)
+    mean = data.target[row, 0].astype(float) * data.site.target_scale
+    spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
+    scores = Scores("rssi", 0 * row, row, {"prediction": mean}, np.full(len(row), np.nan), spread)
+    assert set(power_intervals(scores, data)) == {"interval/coverage_90", "interval/width_db"}

@@ -11,8 +11,10 @@ import torch
 import gsparc
 from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.data.own import from_arrays
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.splits import Fold, Split, SplitSettings, make_split
+from gsparc.evaluation.baseline_cache import fitting
 from gsparc.evaluation.evaluate import evaluate
+from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.per_station import PerStation, for_links, of_station
@@ -129,3 +131,85 @@ def test_a_constant_of_each_station_can_be_taken_away(town, tmp_path):
     spread = np.std(10 * np.log10(town.target[:, 0]).reshape(-1, 4), axis=0)
     assert found["test/rmse_db_after_constant"] == pytest.approx(np.sqrt(np.mean(spread**2)), rel=0.01)
     assert found["test/rmse_db"] > 2 * found["test/rmse_db_after_constant"]
+
+
+def test_a_station_that_heard_nothing_ended_the_run():
+    """Methods that learn from what was heard alone found an empty training set there."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    levels_db = -20 * np.log10(np.linalg.norm(walk[:, None] - POSTS, axis=-1)) - 40
+    levels_db[:, 2] = np.nan
+    data = from_arrays(
+        {"tx_position": walk, "station_position": POSTS, "rssi_db": levels_db, "sensitivity_db": -80.0}
+    )
+    split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
+    for name in ("nearest", "kriging", "gp"):
+        method = for_links(method_class(name), data)
+        method.fit(data, split.folds[0], FitContext())
+        assert method.answer(data.batch(split.folds[0].test)).mean.isfinite().all()
+
+
+def test_sectors_of_one_mast_were_answered_by_the_first():
+    """A position does not say which of two stations there is meant: the first one answered for both."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    levels_db = np.stack([-walk[:, 0], -30 - walk[:, 1]], axis=1)
+    data = from_arrays(
+        {
+            "tx_position": walk, "station_position": POSTS[[0, 0]], "rssi_db": levels_db,
+            "station_name": np.array(["sector 1", "sector 2"]),
+        }
+    )  # fmt: skip
+    split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
+    method = for_links(method_class("idw"), data)
+    method.fit(data, split.folds[0], FitContext())
+    batch = data.batch(split.folds[0].test)
+    found = 10 * method.answer(batch).mean.log10()[:, 0]
+    assert (found[batch.station == 0] - found[batch.station == 1]).min() > 5
+    with pytest.raises(ValueError, match="sector 1 and sector 2 stand at one place"):
+        method.predict(batch.tx, batch.rx)
+
+
+def test_the_place_of_a_single_station_was_sought():
+    """A table of one station, or the one that `dataset.stations` keeps, had no place."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    for end in ("tx", "rx"):
+        levels_db = -20 * np.log10(np.linalg.norm(walk - POSTS[1], axis=1))[:, None]
+        data = from_arrays({f"{end}_position": walk, "station_position": POSTS[1:2], "rssi_db": levels_db})
+        np.testing.assert_allclose(data.site.static_position + data.site.origin, POSTS[1])
+        split = make_split(data.moving, SplitSettings(), place=data.place, station=data.station)
+        method = for_links(method_class("distance_law"), data)
+        notes = method.fit(data, split.folds[0], FitContext()).notes
+        assert len(notes) == 1 and "exponent 2" in notes[0]
+        assert data.batch(split.folds[0].test).rx.batched == (end == "rx")
+
+
+def test_a_baseline_that_cannot_ended_the_run_of_a_station_with_few_rows():
+    """`complex_gp` knows one end that stands still: it is left out where a station taught nothing."""
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (60, 3))
+    csi = np.exp(-2j * np.pi * np.linalg.norm(walk[:, None] - POSTS[:2], axis=-1))
+    mask = np.ones(csi.shape, bool)
+    mask[3:, 1] = False
+    data = from_arrays(
+        {"tx_position": walk, "station_position": POSTS[:2], "csi": csi, "mask": mask, "frequency_hz": 3e8}
+    )
+    folds = [
+        Fold(np.setdiff1d(np.arange(len(data)), rows), np.zeros(0, int), np.array(rows))
+        for rows in ([0, 4, 6], [1, 4, 6])
+    ]
+    kept = [fitting(data, Split("random", (fold,), "")) for fold in folds]
+    assert ["complex_gp" in names for names in kept] == [True, False]
+
+
+def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeypatch):
+    """A file of 50,000 rows at 12 stations read 12 large matrices for every 64 rows: half an hour."""
+    method = fitted("gp", town, fold, tmp_path)
+    whole = score([method], town, Split("random", (fold,), ""))
+    asked = []
+    monkeypatch.setattr("gsparc.evaluation.scores.CHUNK", 6)
+    answer = method.answer
+    monkeypatch.setattr(method, "answer", lambda b: asked.append(len(b.station.unique())) or answer(b))
+    parts = score([method], town, Split("random", (fold,), ""))
+    assert sum(asked) < len(asked) + len(POSTS)
+    np.testing.assert_array_equal(parts.row, whole.row)
+    for name in whole.samples:
+        np.testing.assert_allclose(parts.samples[name], whole.samples[name], rtol=1e-5)
+    np.testing.assert_allclose(parts.variance, whole.variance, rtol=1e-4)

@@ -89,6 +89,21 @@ def test_runs_are_brought_together(tmp_path):
     assert errors["known"] < 1.5 * errors["one"] < 0.5 * errors["ignored"], errors
 
 
+def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(tmp_path):
+    """A right prediction of a row in another run's phase was an error of up to four times its power."""
+    _, spread, fold = _in_runs([1.0, 0.5 * np.exp(2j), 1.7 * np.exp(-1j)])
+    method = ComplexGP()
+    method.fit(spread, fold, FitContext(tmp_path))
+    batch = spread.batch(fold.test)
+    truth, here = batch.target.numpy(), method.answer(batch)
+    assert nmse(here.mean.numpy(), truth) < 0.2 * nmse(method.predict(batch.tx, batch.rx).mean.numpy(), truth)
+    again = ComplexGP()
+    again.restore(spread.site, method.state())
+    assert torch.equal(again.answer(batch).mean, here.mean)
+    strange = replace(batch, run=torch.full((len(batch),), 99))
+    assert torch.equal(method.answer(strange).mean, method.predict(batch.tx, batch.rx).mean)
+
+
 def test_factors_of_many_runs():
     """Forty runs of ten rows each of one smooth process."""
     rng = np.random.default_rng(0)

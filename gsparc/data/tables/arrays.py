@@ -116,17 +116,19 @@ class Builder:
         stations = self._stations(measured, found)
         if self.problems:
             return
-        moving, where = self._moving(found)
+        stay = next((end for end, where in given.items() if where is not None and end not in found), "")
+        moving, where = self._moving(found, stay)
         if stations is not None:
             self._add_stations(stations, where.degrees)
         self._add_places(moving, where)
         for other in found.values():  # the end that is left, where there are no stations
             self._add_other("tx" if moving == "rx" else "rx", other, where)
 
-    def _moving(self, found: dict[str, Places]) -> tuple[str, Places]:
-        """Which end the rows are places of; it is taken out of `found`."""
+    def _moving(self, found: dict[str, Places], stay: str) -> tuple[str, Places]:
+        """Which end the rows are places of, where `stay` are stations; it is taken out of `found`."""
         named = [end for end in ("rx_", "tx_") if end in found]
         if "" in found:
+            named = named or [stay] * bool(stay)
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
             if not named and station and station[0].word in HEARING:

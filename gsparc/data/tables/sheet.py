@@ -71,7 +71,9 @@ class Sheet:
         if bad.any():
             shown = column.astype(str).to_numpy(dtype=object)
             rows = (f"{self.rows[i]}: {_shown(shown[i])}" for i in np.flatnonzero(bad))
-            mark = "decimal commas" if self.decimal == "," else "decimal points"
+            mark = (
+                "decimal commas" if self.decimal == "," else "decimal points, and no marks between thousands"
+            )
             marks = f"; this table has {mark}" if any("," in c or "." in c for c in shown[bad]) else ""
             return problems.add_rows(self.where(head), rows, f"is no finite number{marks}; or leave it empty")
         return values
@@ -96,7 +98,10 @@ def read_parquet(source: str) -> Sheet:
         frame = read_table(source).to_pandas()
     except (ArrowException, OSError, ValueError) as error:
         raise DataError(f"{source}: damaged or not a Parquet file ({str(error).splitlines()[0]})") from None
-    frame = frame.reset_index(drop=True)
+    unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
+    frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
+    if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
+        frame = frame.reset_index(allow_duplicates=True)
     heads = tuple(str(name) for name in frame.columns)
     twice = [name for name in heads if heads.count(name) > 1]
     if twice:

@@ -15,6 +15,7 @@ from gsparc.data.errors import DataError, Problems
 from gsparc.data.tables.sheet import DECIMAL_COMMA, DECIMAL_POINT, Sheet
 
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousands, or three decimals
 LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
 COMMENTS = ("#", "%", "//")
 # What files of other kinds begin with: the name may say .csv all the same.
@@ -67,7 +68,7 @@ def read_text(path: Path) -> tuple[Sheet, list[str]]:
     if len(lines.text) == 1:
         raise DataError(f"{source}: line {lines.number[0]} names columns, but there are no rows below it")
     frame = _parsed(lines.text[1:], delimiter)
-    decimal = "." if delimiter == "," and '"' not in text else _decimal(frame)
+    decimal = "." if delimiter == "," and not _quoted_decimals(text, frame) else _decimal(frame)
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
     if decimal == ",":
@@ -188,6 +189,14 @@ def _parsed(lines: list[str], delimiter: str) -> pd.DataFrame:
         header=None, index_col=False, dtype=str, na_filter=False, skipinitialspace=True, encoding="utf-8",
         quoting=csv.QUOTE_NONE if spaces else csv.QUOTE_MINIMAL,
     )  # fmt: skip
+
+
+def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
+    """Whether cells in quotes hold decimal commas between commas, not marks between thousands alone."""
+    if '"' not in text:
+        return False
+    cells = pd.concat([frame[i] for i in frame.columns])
+    return bool((cells.str.fullmatch(DECIMAL_COMMA) & ~cells.str.fullmatch(THOUSANDS)).any())
 
 
 def _decimal(frame: pd.DataFrame) -> str:
