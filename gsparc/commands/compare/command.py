@@ -24,6 +24,7 @@ from gsparc.commands.compare.fitting import (
     prepare,
 )
 from gsparc.commands.compare.latency import Latency, latencies
+from gsparc.commands.compare.overview import overview
 from gsparc.commands.compare.problem import Problem, load_problems, split_choices, stored_problems
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
@@ -184,13 +185,16 @@ def report(
     blocks = table.blocks(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
-    page = table.markdown(blocks, ours, only_timed)
+    drawn = [row for row in rows if row.draws]
+    by_set = [
+        [row for row in drawn if row.dataset == name] for name in dict.fromkeys(r.dataset for r in drawn)
+    ]
+    page = "\n\n".join([*map(overview, by_set), table.markdown(blocks, ours, only_timed)])
     write_samples(run_dir / "compare.csv", columns(rows, table.Row))
     write_samples(run_dir / "cells.csv", columns(table.results(filled), table.Result))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
-    drawn = [row for row in rows if row.draws]
-    for dataset in dict.fromkeys(row.dataset for row in drawn):
-        draws_figure.draw([row for row in drawn if row.dataset == dataset], run_dir / f"{dataset}.png")
+    for one in by_set:
+        draws_figure.draw(one, run_dir / f"{one[0].dataset}.png")
     if len(drawn) < len(rows):
         figure.draw([row for row in rows if not row.draws], run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.commands.compare.overview import mean_behind
 from gsparc.commands.compare.table import Row
 from gsparc.evaluation.drawing import panels, save
 
@@ -22,7 +23,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         path: PNG file.
     """
     splits = list(dict.fromkeys(row.split for row in rows))
-    names = sorted({row.method for row in rows}, key=lambda name: _mean_rank(rows, name))
+    names = sorted({row.method for row in rows}, key=lambda name: mean_behind(rows, name))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
         here = {row.method: row for row in rows if row.split == split}
@@ -52,11 +53,6 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
     figure.suptitle(f"{rows[0].dataset}: mean and standard error over draws of the split; the best is blue")
     save(figure, path)
-
-
-def _mean_rank(rows: Sequence[Row], name: str) -> float:
-    """How far a method is behind the best, mean over the splits it is possible on [dB]."""
-    return float(np.mean([row.behind_db or 0.0 for row in rows if row.method == name]))
 
 
 def _seconds(value: float) -> str:

@@ -9,6 +9,7 @@ from gsparc.commands.compare.cells import Cell
 from gsparc.commands.compare.figure import draw
 from gsparc.commands.compare.fitting import EARLIER, Filled
 from gsparc.commands.compare.latency import Latency
+from gsparc.commands.compare.overview import overview
 from gsparc.commands.compare.table import blocks, markdown, remarks, results, rows, score_db
 
 
@@ -63,6 +64,12 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
         "3 draws (± standard error of the mean)" in page and "| 1.10 ± 0.06 |" in page and "| 0.80 |" in page
     )
     assert "simple baseline wins" not in page, "there are no others"
+    lines = overview([gp, idw]).splitlines()
+    assert lines[0] == "### city: RMSE, dB, 3 draws of each split"
+    assert lines[-2:] == [
+        "| gp | **7.00 ± 1.15** | 1 | - |",
+        "| idw | 8.10 ± 1.21 (1.10 ± 0.06 dB) | 1 | - |",
+    ]
     assert [(r.seed, r.value) for r in results(found)][:2] == [(0, 5.0), (0, 6.0)]
 
 
