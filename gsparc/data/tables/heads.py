@@ -27,7 +27,10 @@ OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "heigh
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
 _END = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
-_STATION = ("station", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb", "ap", "anchor", "pci", "bssid")
+_STATION = (
+    *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb", "ap"),
+    *("anchor", "pci", "bssid"),
+)
 _AXIS = {"x": "x", "easting": "x", "y": "y", "northing": "y", "z": "z"}
 _AXIS |= dict.fromkeys(("height", "alt", "altitude", "elevation", "elev"), "z")
 _AXIS |= dict.fromkeys(("lat", "latitude"), "latitude")
