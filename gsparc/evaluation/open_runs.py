@@ -234,8 +234,9 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measuremen
     if ours is None or theirs is None:
         if ours is theirs or (data.site.static_position is not None and site.static_position is not None):
             return data  # one place, a table of one or not
-        without, of = (data.site.name, "the model") if ours is None else ("the model", data.site.name)
-        raise ValueError(f"{without} has no stations, {of} has {len(theirs if ours is None else ours)}")
+        if ours is None:
+            raise ValueError(f"{data.site.name} has one static end, the model has stations")
+        raise ValueError(f"{data.site.name} has {len(ours)} stations, the model has one static end")
     number = np.empty(len(ours), np.int64)
     for t, name in enumerate(ours.name):
         near = np.linalg.norm(ours.position[t] + shift - theirs.position, axis=1) <= SAME_PLACE_M

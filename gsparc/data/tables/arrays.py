@@ -126,7 +126,7 @@ class Builder:
 
     def _moving(self, found: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations; it is taken out of `found`."""
-        named = [end for end in ("rx_", "tx_") if end in found]
+        named: list[str] = [end for end in ("rx_", "tx_") if end in found]
         if "" in found:
             named = named or [stay] * bool(stay)
             moving = "tx" if named == ["rx_"] else "rx"
