@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from gsparc.data.ble import raw_of_ble
@@ -10,7 +11,11 @@ from gsparc.data.powder import raw_of_powder
 from gsparc.data.raw import Raw
 from gsparc.data.techtile import raw_of_techtile
 
-LOADERS = {"techtile": raw_of_techtile, "powder": raw_of_powder, "ble": raw_of_ble}
+LOADERS: dict[str, Callable[[Path], Raw]] = {
+    "techtile": raw_of_techtile,
+    "powder": raw_of_powder,
+    "ble": raw_of_ble,
+}
 PLANE = 2  # coordinates of places in POWDER's files
 
 

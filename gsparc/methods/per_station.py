@@ -110,8 +110,8 @@ class PerStation(Method):
             report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
             self._copies[number] = copy
             seconds, limited = seconds + report.seconds, less_repeatable(limited, report.limited_by)
-            unheard = "all stations" if together else "stations never heard"
-            name = unheard if number == UNHEARD else data.site.stations.name[number]
+            all_or_new = "all stations" if together else "stations never heard"
+            name = all_or_new if number == UNHEARD else data.site.stations.name[number]
             notes += [f"{name}: {note}" for note in report.notes]
         return FitReport(seconds, tuple(notes), limited)
 
