@@ -17,6 +17,15 @@ from gsparc.methods.target_rows import from_real, training_targets
 from gsparc.ops import Pose
 
 
+def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
+    """What a reader must know of channels of several runs that are learned as if they were of one."""
+    count = 0 if data.run is None or data.site.kind != "csi" else len(np.unique(data.run[rows]))
+    said = (
+        f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
+    )
+    return (f"{said} some, model=complex_gp learns the factors",) if count > 1 else ()
+
+
 class Interpolator(Method):
     """Learns from `fold.train` and `fold.val` together (nothing is chosen on `val`) and looks up positions.
 
@@ -41,7 +50,7 @@ class Interpolator(Method):
             notes = self._learn_censored(places, targets, unheard)
         else:
             notes = (*self._learn(places, targets), *left_out_note(data, known))
-        return FitReport(time.perf_counter() - start, notes)
+        return FitReport(time.perf_counter() - start, (*notes, *_runs_note(data, known)))
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""

@@ -142,6 +142,14 @@ def test_every_guess_is_said_and_what_is_not_used(write):
     assert read_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).arrays["rssi_db"].tolist() == [4, 8]
 
 
+def test_many_transmitters_did_not_become_one_without_a_word(write):
+    rows = "".join(f"A{i % 3},{i},{i * i},2,-{60 + i % 7}\n" for i in range(24))
+    notes = understand_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes
+    assert sum("'Transmitter ID' holds 3 names again and again: stations?" in note for note in notes) == 1
+    other = understand_table(write("Operator ID,x,y,z,rssi\n" + rows)).notes
+    assert not any("stations?" in note for note in other)
+
+
 def test_what_is_said_wins_over_guesses(write):
     text = "lat,lon,px,py,RSRP,RSSI\n40,8,1,2,-80,-60\n40,9,3,4,-81,-61\n"
     said = {"rssi_db": "rsrp", "tx_x": "px", "tx_y": "py", "tx_z": 1.5, "rx_x": 0, "rx_y": 0, "rx_z": 2}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -138,3 +140,12 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
     assert method.system is None and "of 70 places each query's nearest 20" in report.notes[0]
     error = 10 * torch.log10(method.answer(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
     assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
+
+
+def test_runs_were_taken_as_one_without_a_word(campaign, folds, tmp_path):
+    data = campaign("csi")
+    fold = folds(len(data)).folds[0]
+    several = replace(data, run=np.arange(len(data)) % 2)
+    said = [InverseDistance().fit(d, fold, FitContext(tmp_path)).notes for d in (several, data)]
+    assert any("channels of 2 runs" in note for note in said[0])
+    assert not any("runs" in note for note in said[1])

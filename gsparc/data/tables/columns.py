@@ -13,6 +13,7 @@ import numpy as np
 from gsparc.data.errors import Problems
 from gsparc.data.tables.heads import (
     AXES,
+    END_WORDS,
     ENDS,
     KINDS,
     MANY,
@@ -28,6 +29,7 @@ from gsparc.data.tables.units import SCHEMA, UNITS, Unit, known
 
 LEVELS = ("rssi_db", "rssi")
 CHANNELS = ("csi_re", "csi_im")
+REPEATED = 4  # rows for each name of a column that may hold stations
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,24 @@ def choose(
     if unused:
         more = f" and {len(unused) - 8} more" if len(unused) > 8 else ""
         notes.append(f"not used: column{'s' * (len(unused) > 1)} {', '.join(unused[:8])}{more}")
+    if "station" not in chosen and not any(columns[0].label for columns in chosen.values()):
+        notes += _perhaps_stations(sheet, used)
     return chosen, notes
+
+
+def _perhaps_stations(sheet: Sheet, used: set[str]) -> list[str]:
+    """Columns that repeat few words and are called an end: without them all transmitters would be one."""
+    found = []
+    for head in (head for head in sheet.heads if head and head not in used):
+        if not set(words_of(head)) & set(END_WORDS):
+            continue
+        distinct = len(set(sheet.words(head).tolist()) - {""})
+        if 2 <= distinct <= len(sheet) // REPEATED:
+            found.append(
+                f"column {head!r} holds {distinct} names again and again: stations? say "
+                f"dataset.columns.station={head!r}, with their places in dataset.stations_file"
+            )
+    return found
 
 
 def _said(sheet: Sheet, key: str, role: str, value: object, problems: Problems) -> tuple[Column, ...]:

@@ -26,7 +26,7 @@ MANY = ("rssi_db", "rssi", "csi_re", "csi_im")  # may be several columns: statio
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
 OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
 
-_END = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
+END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
 _STATION = (
     *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb", "ap"),
     *("anchor", "pci", "bssid"),
@@ -135,7 +135,7 @@ def _axis(rest: list[str], unit: Unit | None) -> Head | None:
         return None
     if not ends:
         return Head(_AXIS[axes[0]], unit=unit, word=axes[0])
-    end = "station_" if ends[0] in _STATION else _END.get(ends[0])
+    end = "station_" if ends[0] in _STATION else END_WORDS.get(ends[0])
     return None if end is None else Head(end + _AXIS[axes[0]], unit=unit, word=axes[0])
 
 
