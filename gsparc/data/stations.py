@@ -93,6 +93,10 @@ def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: 
     if len(carriers) == len(stations) and len(stations) != rows:
         of_link = carriers[station]
     else:
+        if len(carriers) == len(stations) and len(np.unique(carriers)) > 1:
+            check.notes.append(
+                "carrier_hz: as many values as rows and as stations; taken as one for each row"
+            )
         of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, len(stations))
     pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)
     first, carrier = pairs[:, 0].astype(np.int64), pairs[:, 1]

@@ -132,6 +132,12 @@ def test_the_files_own_split_names_rows_of_the_file():
     np.testing.assert_array_equal(np.unique(data.place[data.release_split[1]]), [8, 9])
 
 
+def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
+    three = town(**{k: v[:3] for k, v in town().items() if isinstance(v, np.ndarray) and len(v) == PLACES})
+    found = read({**three, "carrier_hz": np.array([4e8, 5e8, 6e8])})
+    assert any("carrier_hz: as many values as rows and as stations" in note for note in found.notes)
+
+
 SPOILT = {
     "station out of range": (town(station=np.full(PLACES, 3), rssi_db=LEVELS[:, 0]), "row 0 is of station 3"),
     "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "numbers of stations"),
