@@ -356,16 +356,6 @@ def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: 
     return found
 
 
-def as_links(
-    position: np.ndarray, level_db: np.ndarray, rows: Sequence[str]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-    """Long arrays (position, station, level, rows) of a wide table: (S, d) places, (S, T) levels."""
-    count = level_db.shape[1]
-    station = np.tile(np.arange(count), len(level_db))
-    names = [row for row in rows for _ in range(count)]
-    return np.repeat(position, count, axis=0), station, level_db.reshape(-1), names
-
-
 def _some(rows: Sequence[str], which: np.ndarray) -> str:
     more = f" and {len(which) - NAMED} more" if len(which) > NAMED else ""
     return ", ".join(str(rows[i]) for i in which[:NAMED]) + more

@@ -1,5 +1,7 @@
 """Doubts about readable measurements: each is said where it should be, and nowhere else."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 from releases import real
@@ -27,6 +29,16 @@ def walk(seed, count=600, step=8.0):
     station = place.mean(0) + rng.normal(0, 200, 2)
     distance = np.linalg.norm(place - station, axis=1)
     return place, -30 - 35 * np.log10(distance + 5) + shadow + rng.normal(0, 2, count), station
+
+
+def as_links(
+    position: np.ndarray, level_db: np.ndarray, rows: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Long arrays (position, station, level, rows) of a wide table: (S, d) places, (S, T) levels."""
+    count = level_db.shape[1]
+    station = np.tile(np.arange(count), len(level_db))
+    names = [row for row in rows for _ in range(count)]
+    return np.repeat(position, count, axis=0), station, level_db.reshape(-1), names
 
 
 def room(seed=0, count=100):
@@ -178,7 +190,7 @@ def test_outages_and_what_was_not_heard():
     level[100:160, 0] = np.nan  # off
     level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
     level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
-    _, station, long, rows = doubt.as_links(place, level, names_of(600))
+    _, station, long, rows = as_links(place, level, names_of(600))
     found = doubt.gaps(station, long, ["a", "b", "c"], rows)
     assert (
         found[0]
@@ -196,7 +208,7 @@ def campus():
     with np.load(real("real/powder-rss-462mhz.npz")) as stored:
         given = {name: stored[name] for name in stored.files}
     place, level = given["mobile_position"], given["rssi_db"].astype(float)
-    links = doubt.as_links(place, level, names_of(len(place)))
+    links = as_links(place, level, names_of(len(place)))
     return (*links[:3], given["station"].tolist(), links[3], given["station_position"])
 
 
@@ -224,7 +236,7 @@ def test_other_real_campaigns_raise_few(campus):
         with np.load(real(f"real/{file}.npz")) as stored:
             place, wide = stored["mobile_position"], stored["rssi_db"].astype(float)
             names, fixed = stored["station"].tolist(), stored["station_position"]
-        links = doubt.as_links(place, wide, names_of(len(place)))
+        links = as_links(place, wide, names_of(len(place)))
         found = doubt.doubts(*links[:3], names, links[3], fixed)
         assert len(found) <= 1, found
     place, station, level, names, rows, fixed = campus
