@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 from rich.console import Console
 
-from gsparc.data.describe import describe, read_any
+from gsparc.data.describe import describe, doubtful, read_any
+from gsparc.data.doubts import steps_of
 from gsparc.data.errors import DataError
+from gsparc.data.level_steps import LevelStep
+from gsparc.data.link_levels import link_levels
 from gsparc.data.load import split_for
 
 
-def check(path: str, console: Console) -> bool:
-    """Write what was understood of `path`, or all its problems one per line; returns whether it is good."""
+def check(
+    path: str,
+    console: Console,
+    columns: Mapping[str, str] | None = None,
+    stations_file: str | None = None,
+    draw: str | None = None,
+) -> bool:
+    """Write what was understood of `path`, or all its problems one per line; returns whether it is good.
+
+    Args:
+        path: file or folder.
+        console: where lines go.
+        columns, stations_file: of a table.
+        draw: PNG file for a map; None draws none.
+    """
     try:
-        reading = read_any(path)
+        reading = read_any(path, columns, stations_file)
     except DataError as error:
         for problem in error.problems:
             _line(console, problem)
@@ -26,6 +43,21 @@ def check(path: str, console: Console) -> bool:
         _line(console, f"{topic:<12}{sentence}")
     for note in reading.notes:
         _line(console, f"{'note':<12}{note}")
+    levels = link_levels(reading.data)
+    steps: list[tuple[int, LevelStep]] = []
+    if levels is not None:
+        steps = steps_of(levels.position, levels.station, levels.level_db, levels.station_position)
+    for doubt in doubtful(levels, steps):
+        _line(console, f"{'doubt':<12}{doubt}")
+    if draw is not None:
+        from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
+
+        try:
+            draw_site(reading.data, Path(draw), levels, steps)
+        except OSError as error:
+            _line(console, f"{draw}: cannot be written ({error.strerror or error})")
+            return False
+        _line(console, f"{'drawn':<12}{draw}")
     try:
         split_for({"name": "random"}, reading.data).check()
     except DataError as error:
@@ -45,7 +77,20 @@ def _line(console: Console, text: str) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; exit status 0 when everything given is good, else 1."""
     parser = argparse.ArgumentParser(prog="gsparc check", description=__doc__)
-    parser.add_argument("path", nargs="+", help="npz or HDF5 file, or a folder like the RFID release")
+    parser.add_argument(
+        "path",
+        nargs="+",
+        help="npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the RFID release",
+    )
+    parser.add_argument(
+        "--column", action="append", default=[], metavar="NAME=HEAD", help="of a table: which column is what"
+    )
+    parser.add_argument("--stations-file", help="of a table: a second one that lists the stations")
+    parser.add_argument("--draw", metavar="FILE.png", help="a map of places, stations and doubts")
+    given = parser.parse_args(arguments)
+    if given.draw is not None and (len(given.path) > 1 or not given.draw.lower().endswith(".png")):
+        parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
+    columns = dict(text.partition("=")[::2] for text in given.column)
     console = Console()
-    good = [check(path, console) for path in parser.parse_args(arguments).path]
+    good = [check(path, console, columns, given.stations_file, given.draw) for path in given.path]
     return 0 if all(good) else 1

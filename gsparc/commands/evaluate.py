@@ -25,7 +25,7 @@ def evaluate_files(
     split: Mapping[str, Any] | None = None,
     *,
     eval_on: str = "test",
-    baselines: Sequence[str] = (),
+    baselines: Sequence[str] | None = (),
     cache: Path | None = None,
 ) -> tuple[Evaluation, Measurements, Split]:
     """Evaluate checkpoints of one run, one per fold.
@@ -33,7 +33,7 @@ def evaluate_files(
     Args:
         paths, dataset, split: see `open_files`.
         eval_on: `train`, `val` or `test`.
-        baselines: shown beside it.
+        baselines: shown beside it; None: all plain methods that serve the data.
         cache: where baselines are kept; None keeps nothing.
 
     Raises:

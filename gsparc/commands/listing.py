@@ -58,6 +58,9 @@ COMMANDS = {
             "what is in files of measurements, or what is wrong: FILE...",
             configured=False,
         ),
+        Command(
+            "predict", f"{ROOM}predict.command", "predictions at places of a table: ckpt=FILE places=FILE"
+        ),
         Command("simulate", f"{ROOM}simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
         Command(
             "study", f"{ROOM}study.command", "variants of one model: kind=effects, positions or measurements"

@@ -24,17 +24,19 @@ class RunSettings(Checked):
         seed: of whatever is random.
         threads: CPU threads; None takes what torch finds.
         eval_on: rows that are scored.
-        baselines: names of methods.
+        baselines: names of methods; None: all plain ones that serve the data.
         budget_s: seconds of training, or of timing; None: as the rest is configured.
         budget_clock: `wall` or `processor`.
+        stations: `each` or `together`.
     """
 
     seed: int = setting(0, whole(0, 2**32 - 1))
     threads: int | None = setting(None, or_null(whole(1)))
     eval_on: str = setting("test", choice("train", "val", "test"))
-    baselines: tuple[str, ...] = ()
+    baselines: tuple[str, ...] | None = ()
     budget_s: float | None = setting(None, or_null(POSITIVE))
     budget_clock: str = setting("wall", choice("wall", "processor"))
+    stations: str = setting("each", choice("each", "together"))
 
     @classmethod
     def of(cls, config: DictConfig) -> RunSettings:
@@ -66,7 +68,9 @@ class RunSettings(Checked):
         return found
 
 
-def _methods(names: Any) -> tuple[str, ...]:
+def _methods(names: Any) -> tuple[str, ...] | None:
+    if names is None:
+        return None
     if isinstance(names, list) and all(name in METHODS for name in names):
         return tuple(names)
     wrong = next((b for b in names if b not in METHODS), names) if isinstance(names, list) else names

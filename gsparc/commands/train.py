@@ -101,7 +101,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         methods = fitted.methods
         found = evaluate(
             methods, fitted.train_s, data, split,
-            eval_on=config.eval_on, baselines=list(config.baselines), cache=platform_cache(),
+            eval_on=config.eval_on, baselines=config.baselines, cache=platform_cache(),
         )  # fmt: skip
         run = {"seed": int(config.seed), "model/limited_by_clock": fitted.limited_by}
         facts = {**found.facts, **provenance(), **run}

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
 
 from gsparc.data.errors import Problems
 from gsparc.data.outliers import peaks, too_far, too_strong
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Links, Measurements, Site
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
@@ -66,7 +67,7 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
 
 def assemble(
     *,
-    static_end: Literal["rx", "tx"],
+    static_end: Literal["rx", "tx"] | None,
     tx: np.ndarray,
     rx: np.ndarray,
     rx_rotation: np.ndarray,
@@ -81,6 +82,7 @@ def assemble(
     array: np.ndarray | None = None,
     carrier_hz: float | None = None,
     subcarriers_hz: np.ndarray | None = None,
+    links: Links | None = None,
     **facts: Any,
 ) -> Measurements:
     """Measurements centred on the scene box, from validated world coordinates.
@@ -94,25 +96,38 @@ def assemble(
         noise_variance: (S,) in units of the stored target.
         release_split: (train, test) rows that the data themselves name.
         mask, directions, row_names, provenance: see `Measurements`.
+        links: of several stations, censored or unknown ends; None where there is nothing to say.
     """
+    links = links or Links(static_end)
+    stations, unknown = links.stations, links.unknown_transmitter
     # A place far outside would put the middle there, where float32 has lost centimetres.
     usual = ~too_far(tx if static_end == "rx" else rx)
-    ends = np.concatenate([tx[usual], rx[usual]])
+    ends = np.concatenate([rx[usual]] if unknown else [tx[usual], rx[usual]])
     lower, upper = ends.min(axis=0), ends.max(axis=0)
     origin = (lower + upper) / 2
+    places = {"rx": tx - origin, "tx": rx - origin}
+    moving = np.hstack([tx - origin, rx - origin]) if static_end is None else places[static_end]
     hashed = {
         "tx": tx, "rx": rx, "rx_rotation": rx_rotation, "target": target, "mask": mask, "array": array,
         "target_scale": np.array(target_scale), "subcarriers_hz": subcarriers_hz,
         "carrier_hz": None if carrier_hz is None else np.array(carrier_hz), "noise_variance": noise_variance,
+        "station": links.station, "place": links.place, "censored": links.censored, "run": links.run,
+        "carriers_hz": None if stations is None else stations.carrier_hz,
     }  # fmt: skip
+    still = None
+    if static_end is not None and (stations is None or len(stations) == 1) and not unknown:
+        still = (rx if static_end == "rx" else tx)[0] - origin
     site = Site(
         static_end=static_end, array=array, carrier_hz=carrier_hz, subcarriers_hz=subcarriers_hz,
         origin=origin, box=np.stack([lower - origin, upper - origin]), sha256=content_hash(hashed),
-        target_scale=target_scale, static_position=(rx if static_end == "rx" else tx)[0] - origin,
+        target_scale=target_scale, static_position=still, georeference=links.georeference,
+        moving_box=np.stack([moving[usual].min(axis=0), moving[usual].max(axis=0)]),
+        stations=None if stations is None else replace(stations, position=stations.position - origin),
         rx_rotation=np.array(rx_rotation[0], dtype=np.float64), **facts,
     )  # fmt: skip
     names = row_names or [f"row {i}" for i in range(len(target))]
     return Measurements(
         site, tx - origin, rx - origin, rx_rotation, target, mask, noise_variance, directions, names,
-        release_split, dict(provenance or {}),
+        release_split, dict(provenance or {}), station=links.station, place=links.place,
+        censored=links.censored, run=links.run,
     )  # fmt: skip

@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data import outliers
+from gsparc.data.campaigns import campaign_of, is_release, raw_of_campaign
+from gsparc.data.doubts import doubts
 from gsparc.data.errors import DataError
+from gsparc.data.level_steps import LevelStep
+from gsparc.data.link_levels import LinkLevels
 from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import read_raw
+from gsparc.data.raw import Raw, read_raw
 from gsparc.data.rfid import load_rfid
-from gsparc.data.schema import Measurements
+from gsparc.data.schema import Measurements, Site
+from gsparc.data.tables import is_table
 from gsparc.ops import SphereGrid
 
 LONG_ARRAY = 100  # wavelengths: no array of one receiver
 ENDS = {"rx": "receiver", "tx": "transmitter"}
 
 
-def read_any(path: str | Path) -> Reading:
-    """Read a folder in the RFID release's layout, a NeWRF room, or a file of one's own.
+def read_any(
+    path: str | Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+) -> Reading:
+    """Read a folder of the RFID release, a file of another campaign, one of one's own, or a table.
+
+    Args:
+        path: folder or file.
+        columns, stations_file: of a table, see `Own`.
 
     Raises:
         DataError: it is none of them, or something in it is wrong.
@@ -34,22 +46,58 @@ def read_any(path: str | Path) -> Reading:
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
-    raw = read_raw(path)
-    return read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    if is_release(path):
+        return interpret(raw_of_campaign("techtile", path), path)
+    raw, notes = raw_of(path, columns, stations_file)
+    campaign = campaign_of(raw)
+    if campaign is not None:
+        raw, notes = raw_of_campaign(campaign, path), (f"this is a file of dataset={campaign}",)
+    reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
+    return Reading(reading.data, (*notes, *reading.notes))
+
+
+def raw_of(
+    path: Path, columns: Mapping[str, object] | None = None, stations_file: str | Path | None = None
+) -> tuple[Raw, tuple[str, ...]]:
+    """The arrays of a file of the schema, or of a table, and how its columns were understood.
+
+    Raises:
+        DataError: not readable, or columns that nothing can be made of.
+    """
+    if not is_table(path):
+        told = any(value is not None for value in (columns or {}).values())
+        for name in [name for name, given in (("columns", told), ("stations_file", stations_file)) if given]:
+            raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
+        return read_raw(path), ()
+    from gsparc.data.tables.read import understand_table  # here, as pandas takes half a second to import
+
+    found = understand_table(path, columns or {}, stations_file)
+    return found.raw, found.notes
+
+
+def doubtful(levels: LinkLevels | None, steps: list[tuple[int, LevelStep]] | None = None) -> list[str]:
+    """Doubts about powers in the order of measuring: copies, wild rows, levels that jump, outages.
+
+    Args:
+        levels: None of what is no power.
+        steps: those of `levels`, where they are known already.
+    """
+    if levels is None:
+        return []
+    rows = levels.position, levels.station, levels.level_db, levels.names, levels.rows
+    return doubts(*rows, levels.station_position, steps)
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """(topic, sentence) pairs about a dataset."""
     site = data.site
-    moving, extent = data.moving, np.ptp(data.moving, axis=0)
-    # Local coordinates are centred in float64; the world is where the user put it.
-    still = (data.rx_position if site.static_end == "rx" else data.tx)[0] + site.origin
+    places = data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
-        ("stays", f"the {ENDS[site.static_end]}, at ({', '.join(f'{x:.3f}' for x in still)}) m"),
-        ("moves", f"the {ENDS[site.moving_end]}, in a box of {' x '.join(f'{e:.2f}' for e in extent)} m"),
-        ("neighbours", _neighbours(moving, site.wavelength)),
+        ("stays", _static(site)),
+        ("moves", _moving(data)),
+        ("neighbours", _neighbours(places, site.wavelength)),
     ]
     lines += [("units?", hint) for hint in suspicious_values(data)]
     lines += [("outliers?", said) for said in outliers.warnings(data)]
@@ -66,7 +114,11 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         lines.append(("array", f"{len(site.array)} receive antennas"))
     if site.target_scale != 1:
         lines.append(("scale", f"stored targets are the measurements divided by {site.target_scale:.4g}"))
-    if data.mask is not None:
+    if data.censored is not None:
+        lines.append(("censored", f"{data.censored.sum()} of {len(data)} powers were too weak to be heard"))
+    if data.run is not None:
+        lines.append(("runs", f"{data.run.max() + 1}, each with an unknown complex factor of its own"))
+    if data.mask is not None and data.censored is None:
         lines.append(("mask", f"{data.mask.mean():.1%} of the entries were measured"))
     if data.directions is not None:
         lines.append(("directions", f"{sum(map(len, data.directions))} directions of arrival"))
@@ -98,9 +150,42 @@ def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
     return text + (f"; {same} rows share their place with another" if same else "")
 
 
+def _static(site: Site) -> str:
+    """Which end stands still, and where in the world."""
+    if site.static_end is None:
+        return "neither end"
+    end = ENDS[site.static_end]
+    if site.stations is not None:
+        extent = " x ".join(f"{e:.2f}" for e in np.ptp(site.stations.position, axis=0))
+        return f"the {end}, {len(site.stations)} stations in a box of {extent} m: {_some(site.stations.name)}"
+    if site.static_position is None:
+        return f"the {end}, at an unknown place"
+    place = site.static_position + site.origin  # local coordinates are centred in float64
+    return f"the {end}, at ({', '.join(f'{x:.3f}' for x in place)}) m"
+
+
+def _moving(data: Measurements) -> str:
+    ends = {"the receiver": data.rx_position, "the transmitter": data.tx}
+    site = data.site
+    if site.static_end is not None:
+        ends = {f"the {ENDS[site.moving_end]}": data.moving}
+    return "; ".join(
+        f"{end}, in a box of {' x '.join(f'{e:.2f}' for e in np.ptp(places, axis=0))} m"
+        for end, places in ends.items()
+    )
+
+
+def _some(names: Sequence[str], count: int = 4) -> str:
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return ", ".join(names[:count]) + more
+
+
 def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
-    found, site = _units(np.concatenate([data.tx, data.rx_position])) or _units(data.moving), data.site
+    site, ends = data.site, np.concatenate([data.tx, data.rx_position])
+    found = []
+    if site.georeference is None:  # degrees are in no doubt
+        found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
         if reach > LONG_ARRAY * site.wavelength:
@@ -110,6 +195,12 @@ def suspicious_values(data: Measurements) -> list[str]:
         turn = np.degrees(site.grid.azimuth_step * site.grid.width)
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             found.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
+    if site.kind == "rssi" and (data.target == 0).any():
+        count = int((data.target == 0).sum())
+        found.append(
+            f"{count} powers are exactly 0, learned as -300 dB: not heard? make them NaN, or give "
+            "rssi_db and sensitivity_db"
+        )
     if site.kind == "rssi" and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         if 0 < spread < 0.1:
@@ -125,7 +216,8 @@ def _units(positions: np.ndarray) -> list[str]:
         unit, factor = ("millimetres", 1e-3) if height > 1000 or width > 1e4 else ("centimetres", 1e-2)
         size = " x ".join(f"{e * factor:.3g}" for e in extent)
         hint = f"if these are {unit}, the box is {size} m: convert to metres"
-        return [f"heights differ by {height:.4g} m; {hint}"]
+        far = f"heights differ by {height:.4g} m" if height > 100 else f"positions reach over {width:.4g} m"
+        return [f"{far}; {hint}"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []

@@ -11,7 +11,7 @@ class Field:
 
     Attributes:
         name: of the array.
-        shape: allowed shapes; S samples, K frequencies, A antennas, H x W pixels, P paths, I sources.
+        shape: allowed; S samples, K frequencies, A antennas, T stations, H x W pixels, P paths, I sources.
         unit: required value of `units` where given.
         required: `yes`, `one of`, or when.
         meaning: in words.
@@ -27,14 +27,27 @@ class Field:
 FIELDS: dict[str, Field] = {
     field.name: field
     for field in [
-        Field("rx_position", "(3,) or (S, 3)", "m", "yes", "where the receiver stood"),
-        Field("tx_position", "(3,) or (S, 3)", "m", "yes", "where the transmitter stood"),
+        Field("rx_position", "(3,), (S, 3), (2,) or (S, 2)", "m", "yes", "where the receiver stood"),
+        Field("tx_position", "(3,), (S, 3), (2,) or (S, 2)", "m", "yes", "where the transmitter stood"),
+        Field("rx_height", "() or (S,)", "m", "with 2-D", "height of receivers of two coordinates"),
+        Field("tx_height", "() or (S,)", "m", "with 2-D", "height of transmitters of two coordinates"),
+        Field("station_position", "(T, 3) or (T, 2)", "m", "no", "several static ends; instead of one end"),
+        Field("station_height", "() or (T,)", "m", "with 2-D", "height of stations of two coordinates"),
+        Field("latitude", "(S,)", "deg", "no", "of the end that moves, instead of its position"),
+        Field("longitude", "(S,)", "deg", "no", "east is positive; together with latitude"),
+        Field("station_latitude", "(T,)", "deg", "no", "of stations, instead of station_position"),
+        Field("station_longitude", "(T,)", "deg", "no", "together with station_latitude"),
+        Field("station_name", "(T,)", "1", "no", "what you call each station"),
+        Field("station_orientation", "(T, 4)", "1", "no", "quaternions (w, x, y, z) of receiving stations"),
+        Field("station", "(S,)", "1", "no", "which station each row is of, from 0; else a column for each"),
+        Field("sensitivity_db", "() or (T,)", "dB", "no", "level below which nothing is heard: NaN is that"),
+        Field("run", "(S,)", "1", "no", "name or number; channels of a run share an unknown factor"),
         Field("spectrum", "(S, H, W)", "1", "one of", "power by direction, linear; or uint8 with 255 = 1"),
-        Field("csi", "(S,), (S, K) or (S, A, K)", "1", "one of", "complex channel"),
-        Field("rssi", "(S,)", "W", "one of", "received power, linear"),
-        Field("rssi_db", "(S,)", "dB", "one of", "received power in dB or dBm"),
+        Field("csi", "(S,), (S, K) or (S, A, K)", "1", "one of", "complex channel; (S, T, ...) of stations"),
+        Field("rssi", "(S,) or (S, T)", "W", "one of", "received power, linear"),
+        Field("rssi_db", "(S,) or (S, T)", "dB", "one of", "received power in dB or dBm"),
         Field("frequency_hz", "() or (K,)", "Hz", "with csi", "frequency of each subcarrier"),
-        Field("carrier_hz", "()", "Hz", "no", "carrier; else the mean of frequency_hz"),
+        Field("carrier_hz", "(), (T,) or (S,)", "Hz", "no", "carrier; else the mean of frequency_hz"),
         Field("rx_orientation", "(4,) or (S, 4)", "1", "no", "quaternion (w, x, y, z), receiver to world"),
         Field("rx_rotation", "(3, 3) or (S, 3, 3)", "1", "no", "the same as a matrix; give one of the two"),
         Field("array_position", "(A, 3)", "m", "no", "receive antennas in the receiver's frame"),

@@ -94,7 +94,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         absent = left_out(file.leave_out, wrong, len(data))
         return without(split, absent) if len(absent) else split
     settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
-    return make_split(data.moving, settings, data.release_split, wrong)
+    return make_split(data.moving, settings, data.release_split, wrong, data.place, data.station)
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:

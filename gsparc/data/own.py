@@ -10,17 +10,18 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
+from gsparc.data.links import expand
 from gsparc.data.outliers import peaks, too_strong
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
-from gsparc.data.schema import LIGHT, Kind, Measurements
+from gsparc.data.schema import LIGHT, Kind, Links, Measurements
 
 log = logging.getLogger(__name__)
 
@@ -105,9 +106,12 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     check.names()
     measured = check.measurement()
     about = _attributes(check, Path(source).stem)
-    if measured is None:
+    links = None if measured is None else expand(check, measured)
+    if measured is None or links is None:
         check.problems.raise_if_any()
-    assert measured is not None
+    assert measured is not None and links is not None
+    raw = check.raw
+    check.unknown = "tx_position" if links.unknown_transmitter else None
     values, kind = _measured(check, measured)
     if values is None:
         for name in ("rx_position", "tx_position"):
@@ -115,10 +119,11 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         check.problems.raise_if_any()
     assert values is not None
     rows = len(values)
-    row_names = check.name_rows(rows)
+    row_names = links.named(check.name_rows(rows))
+    check.row_names = row_names
     ends = {end: check.position(f"{end}_position", rows) for end in ("rx", "tx")}
     rotation = check.rotation(rows)
-    given_mask = check.mask(raw.arrays[measured].shape)
+    given_mask = check.mask(raw.arrays[measured].shape, links.censored)
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     frequency, carrier = check.frequencies(values.shape[2] if kind == "csi" else None)
     grid = check.grid(*values.shape[1:]) if kind == "spectrum" else None
@@ -127,9 +132,10 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     offsets = check.ragged(rows)
     release_split = check.release_split(rows)
     _in_range(check, measured, values, mask)
-    static_end = _static_end(check, ends["rx"], ends["tx"], rotation)
+    _static(check, links, ends["rx"], ends["tx"], rotation)
     check.problems.raise_if_any()
-    assert static_end is not None and rotation is not None
+    assert rotation is not None
+    static_end = links.static_end
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
     if kind == "spectrum" and min(values.shape[1:]) < SSIM_WINDOW:
@@ -139,7 +145,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         )
     if kind == "csi":
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
-    target, scale = _scaled(measured, values, mask)
+    target, scale = _scaled(measured, values, mask, links.censored)
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
         check.refuse_rows(measured, ~np.isfinite(target), huge)
@@ -151,7 +157,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
         kind=kind, static_end=static_end, tx=tx, rx=rx, rx_rotation=rotation, target=target, mask=mask,
         target_scale=scale, noise_variance=noise, directions=directions, grid=grid, array=array,
         carrier_hz=carrier, subcarriers_hz=frequency if kind == "csi" else None,
-        row_names=row_names, release_split=release_split, **about,
+        row_names=row_names, release_split=release_split, links=links, **about,
     )  # fmt: skip
     return Reading(data, tuple(check.notes))
 
@@ -237,22 +243,17 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     check.refuse_rows(name, bad & measured, f"out of range; expected {wanted}")
 
 
-def _static_end(
-    check: Checker, rx: np.ndarray | None, tx: np.ndarray | None, rotation: np.ndarray | None
-) -> Literal["rx", "tx"] | None:
-    """The static end; exactly one must be static."""
+def _static(
+    check: Checker, links: Links, rx: np.ndarray | None, tx: np.ndarray | None, rotation: np.ndarray | None
+) -> None:
+    """Note ends of which neither moves, and a receiver that stands still but turns."""
     if rx is None or tx is None or rotation is None:
-        return None
-    rx_still, tx_still = (bool((p == np.atleast_2d(p)[0]).all()) for p in (rx, tx))
-    if rx_still and tx_still:
-        fault = "neither end moves; expected (S, 3) positions for one of them"
-    elif not rx_still and not tx_still:
-        fault = "both ends move; expected one of rx_position and tx_position to be the same in all rows"
-    elif rx_still and (rotation != rotation[0]).any():
+        return
+    if links.stations is None and all((p == np.atleast_2d(p)[:1]).all() for p in (rx, tx)):
+        check.problems.add(check.source, "neither end moves; expected (S, 3) positions for one of them")
+    elif links.static_end == "rx" and links.stations is None and (rotation != rotation[0]).any():
         fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
-    else:
-        return "rx" if rx_still else "tx"
-    return check.problems.add(check.source, fault)
+        check.problems.add(check.source, fault)
 
 
 def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) -> None:
@@ -291,14 +292,20 @@ def _directions(
     return np.split((vectors / length[:, None]).astype(np.float32), offsets[1:-1])
 
 
-def _scaled(name: str, values: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, float]:
-    """The target as stored and the constant it was divided by (0 for silence)."""
-    if mask is not None:
-        values = np.where(mask, values, np.zeros((), values.dtype))
+def _scaled(
+    name: str, values: np.ndarray, mask: np.ndarray | None, censored: np.ndarray | None
+) -> tuple[np.ndarray, float]:
+    """The target as stored and the constant it was divided by (0 for silence); censored rows are levels."""
+    if censored is not None:
+        mask_or_level = censored[:, None] if mask is None else mask | censored[:, None]
+    else:
+        mask_or_level = mask
+    if mask_or_level is not None:
+        values = np.where(mask_or_level, values, np.zeros((), values.dtype))
     if values.dtype == np.uint8:
         return values, 1.0 if values.any() else 0.0
     if name == "rssi_db":
-        values = 10 ** (values / 10) * (1 if mask is None else mask)
+        values = 10 ** (values / 10) * (1 if mask_or_level is None else mask_or_level)
     if name == "spectrum":
         highest = peaks(values)
         largest = float(highest[~too_strong(highest)].max(initial=0.0))

@@ -26,6 +26,7 @@ class Checker:
         self.problems = Problems(source)
         self.notes: list[str] = []
         self.row_names: list[str] = []
+        self.unknown: str | None = None  # a position that nobody gave
 
     def where(self, name: str) -> str:
         """How messages name an array of this file."""
@@ -113,7 +114,10 @@ class Checker:
             return None
         rows_named = self.row_names or [f"row {i}" for i in range(len(array))]
         names = rows_named if array.ndim == 2 else ["its value"]
-        if check_positions(self.problems, self.where(name), np.atleast_2d(array), names):
+        known = np.atleast_2d(array)
+        if name == self.unknown:
+            return array
+        if check_positions(self.problems, self.where(name), known, names):
             return None
         stored = self.raw.arrays[name]
         step = float(np.spacing(np.abs(stored).max())) if stored.dtype.kind == "f" else 0.0
@@ -124,8 +128,8 @@ class Checker:
             )
         return array
 
-    def mask(self, shape: tuple[int, ...]) -> np.ndarray | None:
-        """Bool, like the measurement; None when everything was measured."""
+    def mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
+        """Bool, like the measurement; None when all was measured. Only `censored` rows may be empty."""
         array = self.raw.arrays.get("mask")
         if array is None or not self.fits("mask", array, shape):
             return None
@@ -133,6 +137,8 @@ class Checker:
             return self.refuse("mask", f"expected True and False, found dtype {array.dtype}")
         mask = array.astype(bool)
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
+        if censored is not None:
+            empty &= ~censored
         self.refuse_rows("mask", empty, "nothing measured; expected a True, or drop the row")
         return mask
 

@@ -197,6 +197,11 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
+def numbered_rows(count: int) -> np.ndarray:
+    """What rows (count,) are called that their file does not name."""
+    return np.array([f"row {i}" for i in range(count)])
+
+
 def renamed(raw: Raw, names: Mapping[str, str]) -> Raw:
     """The same content with arrays renamed from the keys to the values of `names`."""
     return Raw({names.get(k, k): v for k, v in raw.arrays.items()}, raw.attributes, raw.units)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -11,8 +11,63 @@ from torch import Tensor
 
 from gsparc.ops import Pose, SphereGrid
 
+if TYPE_CHECKING:
+    from gsparc.data.georeference import Georeference
+
 Kind = Literal["spectrum", "csi", "rssi"]
+End = Literal["rx", "tx"]
 LIGHT = 299_792_458.0  # [m/s]
+
+
+@dataclass(frozen=True)
+class Stations:
+    """Static ends of which there are several; one place at two carriers is two stations.
+
+    Attributes:
+        position: (T, 3) float64 [m], *local*.
+        name: (T,) what a user calls them.
+        rotation: (T, 3, 3) float64, local to world; None where receivers are not turned, or transmit.
+        carrier_hz: (T,) [Hz]; None where all have the site's.
+    """
+
+    position: np.ndarray
+    name: tuple[str, ...]
+    rotation: np.ndarray | None = None
+    carrier_hz: np.ndarray | None = None
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+@dataclass(frozen=True)
+class Links:
+    """What a file says of its links beyond the plain schema.
+
+    Attributes:
+        static_end: which end the stations, or the one static end, are; None where both move.
+        stations: in world coordinates; None where there is one static end, or none.
+        station, place: (S,) int64, see `Measurements`; None without stations.
+        censored: (S,) bool; None where nothing is.
+        run: (S,) int64; None without runs.
+        unknown_transmitter: powers of a transmitter whose place nobody gave.
+        georeference: of the world's origin, where places came in degrees.
+    """
+
+    static_end: End | None
+    stations: Stations | None = None
+    station: np.ndarray | None = None
+    place: np.ndarray | None = None
+    censored: np.ndarray | None = None
+    run: np.ndarray | None = None
+    unknown_transmitter: bool = False
+    georeference: Georeference | None = None
+
+    def named(self, rows: list[str]) -> list[str]:
+        """Names (S,) of rows, with their stations."""
+        if self.stations is None or self.station is None:
+            return rows
+        names = self.stations.name
+        return [f"{row}, station {names[t]}" for row, t in zip(rows, self.station, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -23,7 +78,7 @@ class Site:
         name: dataset name as it appears in every log and summary.
         kind: what a target is: `spectrum` (H, W) in [0, 1]; `csi` (antennas, subcarriers) complex;
             `rssi` (1,) linear power.
-        static_end: which end never moves: `rx` (RFID) or `tx` (Sionna, NeWRF).
+        static_end: which end never moves: `rx` (RFID) or `tx` (Sionna, NeWRF); None when both move.
         grid: directions of a spectrum; None for CSI and RSSI.
         array: (M, 3) [m] receive element positions, receiver frame; None when unknown or one element.
         normalisation: how the published spectrum was scaled: `max`, `minmax`, `power` or `none`.
@@ -35,16 +90,21 @@ class Site:
         sha256: content hash of what was loaded.
         stand_in: for a simulated replacement, the name of the release it stands in for; else None.
         convergence_error: NMSE between two solver seeds for simulated data; else None.
-        static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown.
+        static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown, when there
+            are several, or when both ends move.
         rx_rotation: (3, 3) float64, how the first row's receiver is turned; None when unknown.
         uplink_array: (U, 3) float64 [m] antennas that receive a snapshot's uplink; None where there is none.
         uplink_hz: (L,) absolute frequencies of the uplink [Hz].
         antennas: (A,) rows of `uplink_array` that the target's antennas are.
+        stations: the static ends where there are several; `Measurements.station` says which a row is of.
+        georeference: where on Earth the world's origin lies; None when unknown.
+        moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*; (2, 6)
+            of both as in `Measurements.moving`; None in models of earlier versions.
     """
 
     name: str
     kind: Kind
-    static_end: Literal["rx", "tx"]
+    static_end: Literal["rx", "tx"] | None
     grid: SphereGrid | None
     array: np.ndarray | None
     carrier_hz: float | None
@@ -61,15 +121,21 @@ class Site:
     uplink_array: np.ndarray | None = None
     uplink_hz: np.ndarray | None = None
     antennas: np.ndarray | None = None
+    stations: Stations | None = None
+    georeference: Georeference | None = None
+    moving_box: np.ndarray | None = None
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:
-        """The end whose position is the query."""
+        """The end whose position is the query; the receiver where both move."""
         return "tx" if self.static_end == "rx" else "rx"
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Positions (B, 3) [m] of the moving end: tx (B, 3) [m], or of one or B receiver poses."""
-        return tx if self.moving_end == "tx" else rx.position.reshape(-1, 3)
+        """Positions [m] of what moves: (B, 3) of one end (or a receiver for all), or (B, 6) of both."""
+        place = rx.position.reshape(-1, 3)
+        if self.static_end is None:
+            return torch.cat([tx, place.expand(len(tx), 3)], dim=1)
+        return tx if self.static_end == "rx" else place
 
     @property
     def wavelength(self) -> float | None:
@@ -117,6 +183,8 @@ class Batch:
         mask: like target, bool, True where measured; None when everything was.
         noise_variance: (B,) float32 in target units; None when unknown.
         uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
+        station: (B,) int64, which of the site's stations each is of; None where there is one.
+        run: (B,) int64, see `Measurements`; None where all are in phase.
     """
 
     index: Tensor
@@ -126,6 +194,8 @@ class Batch:
     mask: Tensor | None = None
     noise_variance: Tensor | None = None
     uplink: Tensor | None = None
+    station: Tensor | None = None
+    run: Tensor | None = None
 
     def __len__(self) -> int:
         return self.index.shape[0]
@@ -153,6 +223,12 @@ class Measurements:
         release_split: (train, test) int64 rows that the data themselves name, or None.
         provenance: where the data came from, as their makers wrote it down.
         uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or None.
+        station: (S,) int64, which of `site.stations` a row is of; None where there is one.
+        place: (S,) int64, the number of the place that a row is of: one place, several stations, or visits;
+            None where every row is one.
+        censored: (S,) bool, True where a power was below what can be heard: the target is that level, and its
+            mask is False. None where nothing is.
+        run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
     """
 
     site: Site
@@ -167,13 +243,19 @@ class Measurements:
     release_split: tuple[np.ndarray, np.ndarray] | None = None
     provenance: dict[str, str] = field(default_factory=dict)
     uplink: np.ndarray | None = None
+    station: np.ndarray | None = None
+    place: np.ndarray | None = None
+    censored: np.ndarray | None = None
+    run: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.target)
 
     @property
     def moving(self) -> np.ndarray:
-        """Positions of the moving end (S, 3) float64 [m]: the query axis of every method."""
+        """Positions of what moves, (S, 3) or of both ends (S, 6), float64 [m]: the query of every method."""
+        if self.site.static_end is None:
+            return np.hstack([self.tx, self.rx_position])
         return self.tx if self.site.moving_end == "tx" else self.rx_position
 
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
@@ -181,10 +263,26 @@ class Measurements:
         chosen = torch.from_numpy(np.ascontiguousarray(self.target[np.asarray(index)]))
         return chosen.float() / 255 if chosen.dtype == torch.uint8 else chosen
 
+    def subset(self, rows: np.ndarray, site: Site | None = None) -> Measurements:
+        """Rows (n,) alone, seen as measurements of `site`."""
+
+        def of(value: Any) -> Any:
+            return (
+                None
+                if value is None
+                else [value[i] for i in rows]
+                if isinstance(value, list)
+                else value[rows]
+            )
+
+        whole = ("site", "provenance", "release_split")
+        parts = {name: of(value) for name, value in vars(self).items() if name not in whole}
+        return Measurements(site=site or self.site, provenance=self.provenance, **parts)
+
     def batch(self, index: np.ndarray | Tensor) -> Batch:
         """The given rows as one batch."""
         rows = np.asarray(index)
-        if self.site.static_end == "rx":
+        if self.site.static_end == "rx" and (self.site.stations is None or len(self.site.stations) == 1):
             first = rows[:1]
             rx = Pose(self._f32(self.rx_position[first])[0], self._f32(self.rx_rotation[first])[0])
         else:
@@ -197,6 +295,8 @@ class Measurements:
             mask=None if self.mask is None else torch.from_numpy(self.mask[rows]),
             noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
             uplink=None if self.uplink is None else torch.from_numpy(self.uplink[rows]),
+            station=None if self.station is None else torch.from_numpy(self.station[rows]),
+            run=None if self.run is None else torch.from_numpy(self.run[rows]),
         )
 
     @staticmethod

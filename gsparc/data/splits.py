@@ -19,7 +19,8 @@ from gsparc.data.files import whole_file
 
 log = logging.getLogger(__name__)
 
-NAMES = ("random", "grouped", "block", "sparse")
+NAMES = ("random", "grouped", "corner", "blocks", "sparse", "stations")
+OLD_NAMES = {"block": "corner"}  # in configurations of earlier runs
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
@@ -43,7 +44,7 @@ class Split:
     """One fold, or several whose test results are pooled.
 
     Attributes:
-        name: `random`, `grouped`, `block`, `sparse` or a file's name.
+        name: one of `NAMES`, or a file's.
         folds: one or more folds.
         sha256: hash of all indices.
     """
@@ -67,20 +68,23 @@ class SplitSettings:
     """How to split; one instance of the config group `split`.
 
     Attributes:
-        name: `random`, `grouped`, `block` or `sparse`.
+        name: `random`, `grouped`, `corner`, `blocks`, `sparse` or `stations`.
         seed: of every random choice below.
         val_fraction: share of each fold's training rows kept for validation.
-        test_fraction: share of the rows that `random` (without files) and `block` hold out.
+        test_fraction: share of the rows that `random` (without files) and `corner` hold out.
         redraw: `random` ignores the release's own files and draws anew.
         folds: number of folds of `grouped`.
         stretches_per_fold: `grouped` cuts the path into folds x this many stretches.
-        buffer_m: `grouped` and `block` drop training rows this close to a test row [m].
-        corner: of `block`, lower or upper end in x and y as `--`, `-+`, `+-` or `++`.
+        side_m: of the squares of floor that `blocks` holds out whole [m]; None: a tenth of the longer side.
+        share: of the places, that `blocks` holds out at least.
+        buffer_m: `grouped` and `corner` drop training rows this close to a test row [m].
+        corner: of `corner`, lower or upper end in x and y as `--`, `-+`, `+-` or `++`.
         train_fraction: share of the rows that `sparse` trains on.
         train_count: thin each fold's training rows to this many (validation included); None keeps all.
         thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
         spacing_m: keep only training rows at least this far apart, before the other two [m]; None keeps all.
-        leave_out: rows that are neither learned from nor tested on, or `outliers`.
+        leave_out: rows that are neither learned from nor tested on, or `outliers`; of `stations`, how many
+            are held out together, drawn by seed (0: each one in its turn).
     """
 
     name: str = "random"
@@ -90,15 +94,18 @@ class SplitSettings:
     redraw: bool = False
     folds: int = 5
     stretches_per_fold: int = 1
+    side_m: float | None = None
+    share: float = 0.2
     buffer_m: float = 0.03
     corner: str = "++"
     train_fraction: float = 0.1
     train_count: int | None = None
     thin: float = 1.0
     spacing_m: float | None = None
-    leave_out: Sequence[int] | Literal["outliers"] = ()
+    leave_out: Sequence[int] | Literal["outliers"] | int = ()
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "name", OLD_NAMES.get(self.name, self.name))
         if self.name not in NAMES:
             close = difflib.get_close_matches(self.name, [*NAMES, "file"], n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
@@ -111,11 +118,14 @@ class SplitSettings:
             ("thin", 0 < self.thin <= 1, "a share above 0, at most 1"),
             ("train_count", count is None or count >= 1, "at least 1 row"),
             ("spacing_m", spacing is None or 0 < spacing < np.inf, "metres, above 0"),
+            ("side_m", self.side_m is None or 0 < self.side_m < np.inf, "metres, above 0"),
+            ("share", 0 < self.share < 1, "a share between 0 and 1"),
             ("buffer_m", 0 <= self.buffer_m < np.inf, "metres, at least 0"),
         ):
             if not good:
                 raise DataError(f"split.{key}={getattr(self, key)}: expected {expected}")
-        _check_rows(self.leave_out)
+        if self.name != "stations" or type(self.leave_out) is not int or self.leave_out < 0:
+            _check_rows(self.leave_out)
         if self.folds < 2 or self.stretches_per_fold < 1:
             raise DataError("split: expected folds of at least 2 and stretches_per_fold of at least 1")
         if len(self.corner) != 2 or set(self.corner) - set("+-"):
@@ -146,35 +156,61 @@ def make_split(
     settings: SplitSettings,
     release_split: tuple[np.ndarray, np.ndarray] | None = None,
     outliers: np.ndarray | None = None,
+    place: np.ndarray | None = None,
+    station: np.ndarray | None = None,
 ) -> Split:
-    """Split rows by the positions of the moving end.
+    """Split rows by the positions of the moving end; what is held out is so for all stations.
 
     Args:
-        positions: (S, 3) [m] of the moving end.
+        positions: (S, 3) [m] of the moving end, or (S, 6) of both.
         settings: how.
         release_split: (train, test) rows that the release names; used by `random` only.
         outliers: (n,) rows that `leave_out=outliers` means.
+        place: (S,) int64; rows of one place stay together. None where every row is one.
+        station: (S,) int64, of which station a row is; needed by `stations`.
 
     Raises:
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
     """
-    rows = len(positions)
-    absent = left_out(settings.leave_out, outliers, rows)
+    rows, left = len(positions), settings.leave_out
+    absent = np.zeros(0, np.int64) if isinstance(left, int) else left_out(left, outliers, rows)
     if len(absent):
-        return _of_the_rest(np.setdiff1d(np.arange(rows), absent), positions, settings, release_split)
-    if settings.name == "grouped":
-        pairs = _grouped(positions, settings)
-    elif settings.name == "block":
-        pairs = [_block(positions, settings)]
-    elif settings.name == "random" and release_split is not None and not settings.redraw:
-        pairs = [(np.sort(release_split[0]), np.sort(release_split[1]))]
+        rest = np.setdiff1d(np.arange(rows), absent)
+        return _of_the_rest(rest, positions, settings, release_split, place, station)
+    named = settings.name == "random" and release_split is not None and not settings.redraw
+    if settings.name == "stations":
+        folds = _stations(station, settings)
+    elif place is not None and not named:
+        _, first, which = np.unique(place, return_index=True, return_inverse=True)
+        found = make_split(positions[first], settings)
+        folds = tuple(
+            Fold(*(np.flatnonzero(np.isin(which.reshape(-1), part)) for part in vars(fold).values()))
+            for fold in found.folds
+        )
     else:
-        test_share = settings.test_fraction if settings.name == "random" else 1 - settings.train_fraction
-        order = np.random.default_rng(settings.seed).permutation(rows)
-        train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
-        pairs = [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
-    folds = tuple(_finish(i, train, test, positions, settings) for i, (train, test) in enumerate(pairs))
+        pairs = _pairs(positions, settings, release_split if named else None)
+        folds = tuple(_finish(i, train, test, positions, settings) for i, (train, test) in enumerate(pairs))
     return Split(settings.name, folds, indices_hash(folds))
+
+
+def _pairs(
+    positions: np.ndarray, settings: SplitSettings, named: tuple[np.ndarray, np.ndarray] | None
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """(training, test) rows of each fold, before thinning and validation."""
+    if named is not None:
+        return [(np.sort(named[0]), np.sort(named[1]))]
+    if settings.name == "grouped":
+        return _grouped(positions, settings)
+    if settings.name == "corner":
+        return [_corner(positions, settings)]
+    rows = len(positions)
+    if settings.name == "blocks":
+        test = _blocks(positions, np.arange(rows), settings, settings.share, [settings.seed])
+        return [(np.setdiff1d(np.arange(rows), test), test)]
+    test_share = settings.test_fraction if settings.name == "random" else 1 - settings.train_fraction
+    order = np.random.default_rng(settings.seed).permutation(rows)
+    train_count = rows - min(max(round(test_share * rows), 1), max(rows - 1, 0))
+    return [(np.sort(order[:train_count]), np.sort(order[train_count:]))]
 
 
 def left_out(
@@ -303,13 +339,16 @@ def _of_the_rest(
     positions: np.ndarray,
     settings: SplitSettings,
     release_split: tuple[np.ndarray, np.ndarray] | None,
+    place: np.ndarray | None,
+    station: np.ndarray | None,
 ) -> Split:
     """The split of rows `rest` (n,) sorted, as if there were no others."""
     named = None
     if release_split is not None:
         train, test = (np.searchsorted(rest, np.intersect1d(part, rest)) for part in release_split)
         named = train, test
-    found = make_split(positions[rest], replace(settings, leave_out=()), named)
+    where, which = (None if part is None else part[rest] for part in (place, station))
+    found = make_split(positions[rest], replace(settings, leave_out=()), named, None, where, which)
     folds = tuple(Fold(*(rest[part] for part in vars(fold).values())) for fold in found.folds)
     return Split(found.name, folds, indices_hash(folds))
 
@@ -332,7 +371,50 @@ def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[tuple[np.nd
     return pairs
 
 
-def _block(positions: np.ndarray, settings: SplitSettings) -> tuple[np.ndarray, np.ndarray]:
+def _blocks(
+    positions: np.ndarray, rows: np.ndarray, settings: SplitSettings, share: float, seed: list[int]
+) -> np.ndarray:
+    """Those of `rows` in whole squares of floor, drawn until they are a `share` of `rows` at least."""
+    floor = positions[:, :2]
+    side = settings.side_m or float(np.ptp(floor, axis=0).max()) / 10
+    if not side > 0:
+        raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
+    square = np.unique(np.floor(floor[rows] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.random.default_rng(seed).permutation(square.max() + 1)
+    sizes = np.cumsum(np.bincount(square)[order])
+    count = int(np.searchsorted(sizes, share * len(rows))) + 1
+    if count >= len(order):
+        raise DataError(
+            f"split=blocks: {len(order)} squares of {side:.3g} m, too few to hold some out; lower "
+            "split.side_m or split.share"
+        )
+    return rows[np.isin(square, order[:count])]
+
+
+def _stations(station: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]:
+    """Folds that each hold out a station, or one that holds out as many as `leave_out` says."""
+    if station is None:
+        raise DataError("split=stations: these measurements have one station; take split=random or blocks")
+    count = int(station.max()) + 1
+    together = settings.leave_out if isinstance(settings.leave_out, int) else 0
+    if count < 3 or together > count - 2:
+        raise DataError(
+            f"split=stations: {count} stations; two at least must remain to learn from and to choose on"
+        )
+    draw = np.random.default_rng(settings.seed).permutation(count)
+    held = [draw[:together]] if together else [np.array([t]) for t in range(count)]
+    folds = []
+    for number, test in enumerate(held):
+        rest = np.random.default_rng([settings.seed, number, 2]).permutation(
+            np.setdiff1d(np.arange(count), test)
+        )
+        chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]
+        parts = (np.setdiff1d(rest, chosen), chosen, test)
+        folds.append(Fold(*(np.flatnonzero(np.isin(station, part)) for part in parts)))
+    return tuple(folds)
+
+
+def _corner(positions: np.ndarray, settings: SplitSettings) -> tuple[np.ndarray, np.ndarray]:
     """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
     lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
     unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)
@@ -365,6 +447,8 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
     if s.name == "grouped":
         start = int(rng.integers(len(train) - count + 1))
         chosen = np.arange(start, start + count)
+    elif s.name == "blocks" and count:
+        chosen = np.searchsorted(train, _blocks(positions, train, s, s.val_fraction, [s.seed, fold, 2]))
     else:
         chosen = rng.permutation(len(train))[:count]
     val = train[chosen]

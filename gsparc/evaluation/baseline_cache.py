@@ -16,13 +16,39 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, Method
+from gsparc.methods.per_station import for_links, taught
 from gsparc.methods.registry import method_class
 
 log = logging.getLogger(__name__)
 
 BASELINES = ("zero", "mean", "nearest", "idw", "gp")
-CACHE_VERSION = 3  # raise it when a baseline or a metric changes its results
+CACHE_VERSION = 5  # raise it when a baseline or a metric changes its results
 STORE_ABOVE_S = 3.0  # processor time; cheaper fits are repeated, so that their times are current
+
+
+def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
+    """Names of all plain methods that serve these measurements and rows."""
+    site, names = data.site, BASELINES
+    if site.kind == "rssi":
+        return (*names, "distance_law", "kriging")
+    carrier = site.carrier_hz is not None or (
+        site.stations is not None and site.stations.carrier_hz is not None
+    )
+    if (
+        site.kind == "csi"
+        and carrier
+        and site.static_end is not None
+        and _all_taught("complex_gp", data, split)
+    ):
+        return (*names, "complex_gp")
+    return names
+
+
+def _all_taught(name: str, data: Measurements, split: Split) -> bool:
+    """Whether the training rows tell of every station that is asked for."""
+    if data.station is None:
+        return True
+    return not any(taught(method_class(name)(), data, fold)[1].any() for fold in split.folds)
 
 
 @dataclass(frozen=True)
@@ -53,8 +79,10 @@ def baseline(
         cache: folder of earlier results; None keeps nothing.
     """
     unseen = eval_on == "val"
-    # The same data may be in another model's local coordinates and units.
-    frame = f"{data.site.origin.tolist()} {data.site.target_scale}"
+    # The same data may be in another model's local coordinates and units, and count its stations.
+    stations = data.site.stations
+    listed = "" if stations is None else f" {stations.name} {stations.position.tolist()}"
+    frame = f"{data.site.origin.tolist()} {data.site.target_scale}{listed}"
     key = hashlib.sha256(f"{data.site.sha256} {split.sha256} {frame}".encode()).hexdigest()[:24]
     folder = None if cache is None else Path(cache) / f"baselines-v{CACHE_VERSION}" / key
     folder = folder and folder / (f"{name}-train" if unseen else name)
@@ -62,7 +90,7 @@ def baseline(
     for number, fold in enumerate(split.folds):
         found = None if folder is None else _stored_fit(folder / f"fold{number}.ckpt")
         if found is None:
-            method = method_class(name)()
+            method = for_links(method_class(name), data)
             known = replace(fold, val=fold.val[:0]) if unseen else fold
             spent = time.process_time()
             report = method.fit(data, known, FitContext(folder or Path()))

@@ -11,8 +11,9 @@ import numpy as np
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Split
-from gsparc.evaluation.baseline_cache import BASELINES, Fitted, baseline
+from gsparc.evaluation.baseline_cache import Fitted, baseline, fitting
 from gsparc.evaluation.metrics import paired_values
+from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods import timing
 from gsparc.methods.method import Method
@@ -44,7 +45,7 @@ def evaluate(
     split: Split,
     *,
     eval_on: str = "test",
-    baselines: Sequence[str] = BASELINES,
+    baselines: Sequence[str] | None = None,
     cache: Path | None = None,
     clock: ClockSettings | None = None,
 ) -> Evaluation:
@@ -56,7 +57,7 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.methods.registry.METHODS`.
+        baselines: names in `gsparc.methods.registry.METHODS`; None: all plain ones that serve these rows.
         cache: folder where baselines are kept between runs; None keeps nothing.
         clock: how long to measure latencies.
 
@@ -70,12 +71,16 @@ def evaluate(
     methods = (methods,) if isinstance(methods, Method) else tuple(methods)
     seconds = _per_fold(train_s, len(methods))
     scores = score(methods, data, split, eval_on)
-    others = {name: baseline(name, data, split, eval_on, cache) for name in baselines}
-    facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in scores.figures().items()}
-    facts |= {f"{eval_on}/{k}": v for k, v in scores.decided_by().items()}
+    names = fitting(data, split) if baselines is None else baselines
+    others = {name: baseline(name, data, split, eval_on, cache) for name in names}
+    facts: dict[str, Any] = {f"{eval_on}/{k}": v for k, v in pooled(scores, data, split).items()}
+    decided = scores.decided_by()
+    if decided and data.row_names:
+        decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
+    facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
     facts[f"{eval_on}/skill"] = _skill(scores, others)
     for name, other in others.items():
-        own = {**other.scores.figures(), "skill": _skill(other.scores, others)}
+        own = {**pooled(other.scores, data, split), "skill": _skill(other.scores, others)}
         own["train_s"] = float(np.mean(other.train_s))
         facts |= {f"baseline/{name}/{k}": v for k, v in own.items()}
     if REFERENCE in others:

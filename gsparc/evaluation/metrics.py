@@ -179,7 +179,7 @@ class PowerMetrics(SampleMetric):
         p, t = raw["prediction"], raw["target"]
         positive = t > 0
         floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
-        error_db = np.where(positive, _db(np.maximum(p, floor), np.where(positive, t, 1.0)), np.nan)
+        error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
         error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
         return {**raw, "error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
 
@@ -196,7 +196,7 @@ class PowerMetrics(SampleMetric):
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "mse": _statistic(samples["mse"]),
             "silent_samples": silent,
-            "samples": len(samples["target"]),
+            "samples": int((~np.isnan(samples["target"])).sum()),  # those where something was heard
         }
 
 

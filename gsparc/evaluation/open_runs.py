@@ -173,18 +173,22 @@ def aligned(data: Measurements, site: Site) -> Measurements:
     """`data` in the local coordinates and target units that a model of `site` was trained in.
 
     Raises:
-        ValueError: another kind, grid, moving end or static place.
+        ValueError: another kind, grid, moving end or static place, or a station that the model does not know.
     """
     own = data.site
     for what in ("kind", "static_end", "grid"):
         here, there = getattr(own, what), getattr(site, what)
         if here != there:
             raise ValueError(f"the model was trained with {what} {there}, {own.name} has {here}")
+    data = _about(data, site)
+    own = data.site
     shift = own.origin - site.origin
     if own.static_position is not None and site.static_position is not None:
         gap = float(np.linalg.norm(own.static_position + shift - site.static_position))
         if gap > SAME_PLACE_M:
             raise ValueError(f"the static {own.static_end} of {own.name} is {gap:.3g} m from the model's")
+    data = _renumbered(data, site, shift)
+    own = data.site
     if not shift.any() and own.target_scale == site.target_scale:
         return data
     rescale = own.target_scale / site.target_scale
@@ -197,6 +201,55 @@ def aligned(data: Measurements, site: Site) -> Measurements:
         target=_times(data.target, rescale), uplink=_times(data.uplink, rescale),
         noise_variance=_times(data.noise_variance, rescale**2),
     )  # fmt: skip
+
+
+def _about(data: Measurements, site: Site) -> Measurements:
+    """`data` in metres about the place on Earth that those of `site` are about, where both say which."""
+    own, there = data.site.georeference, site.georeference
+    if own is None or there is None or own == there:
+        return data
+
+    def moved(local: np.ndarray) -> np.ndarray:
+        world = local + data.site.origin
+        known = np.isfinite(world).all(axis=1)
+        world[known, :2] = there.from_degrees(*own.to_degrees(world[known, :2]))
+        return world - data.site.origin
+
+    still, stations = data.site.static_position, data.site.stations
+    facts = replace(
+        data.site, georeference=there, box=moved(data.site.box),
+        static_position=None if still is None else moved(still[None])[0],
+        stations=None if stations is None else replace(stations, position=moved(stations.position)),
+    )  # fmt: skip
+    return replace(data, site=facts, tx=moved(data.tx), rx_position=moved(data.rx_position))
+
+
+def _renumbered(data: Measurements, site: Site, shift: np.ndarray) -> Measurements:
+    """`data` with the numbers that a model of `site` has for its stations; `shift` (3,) [m] leads there.
+
+    Another file, or part of one, may list them in another order. They are known by their places, and where
+    several stand at one, by their names.
+    """
+    ours, theirs = data.site.stations, site.stations
+    if ours is None or theirs is None:
+        if ours is theirs or (data.site.static_position is not None and site.static_position is not None):
+            return data  # one place, a table of one or not
+        if ours is None:
+            raise ValueError(f"{data.site.name} has one static end, the model has stations")
+        raise ValueError(f"{data.site.name} has {len(ours)} stations, the model has one static end")
+    number = np.empty(len(ours), np.int64)
+    for t, name in enumerate(ours.name):
+        near = np.linalg.norm(ours.position[t] + shift - theirs.position, axis=1) <= SAME_PLACE_M
+        here = np.flatnonzero(near).tolist()
+        called = [i for i in here if theirs.name[i] == name]
+        if len(here) != 1 and not called:
+            raise ValueError(f"station {name} of {data.site.name} is none of the model's; leave it out")
+        number[t] = called[0] if called else here[0]
+    if np.array_equal(number, np.arange(len(theirs))) and ours.name == theirs.name:
+        return data
+    assert data.station is not None
+    facts = replace(data.site, stations=theirs, static_position=site.static_position)
+    return replace(data, station=number[data.station], site=facts)
 
 
 def _times(values: Any, factor: float) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ class Scores:
         """Flat figures over all folds together."""
         return type(metrics_for(self.kind)).summary(self.samples)
 
-    def decided_by(self) -> dict[str, float | int]:
+    def decided_by(self) -> dict[str, Any]:
         """The row that alone makes more than half of all error or power, and a figure that no row decides.
 
         `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /
@@ -58,6 +59,19 @@ class Scores:
         median = float(np.median(error / power))
         found = {"row": int(row[worst]), "share": float(shares[worst]), "nmse_median": median}
         return {f"decided_by/{name}": value for name, value in found.items()}
+
+    def after_constant(self, station: np.ndarray) -> float | None:
+        """RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
+
+        Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
+        """
+        error, of_row = self.samples["error_db"], station[self.row]
+        known = np.isfinite(error)
+        error, of_row = error[known], np.unique(of_row[known], return_inverse=True)[1].reshape(-1)
+        if not len(error):
+            return None
+        means = np.bincount(of_row, error) / np.bincount(of_row)
+        return float(np.sqrt(np.mean((error - means[of_row]) ** 2)))
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything as arrays, for a file."""
@@ -106,14 +120,22 @@ def score(methods: Sequence[Method], data: Measurements, split: Split, eval_on: 
     samples = []
     for method, rows in zip(methods, every, strict=True):
         metric = metrics_for(data.site.kind, data.site.target_scale)
+        # One station at a time: each has a model of its own, whose matrices are read for every chunk.
+        order = (
+            np.arange(len(rows)) if data.station is None else np.argsort(data.station[rows], kind="stable")
+        )
+        said: dict[str, list[np.ndarray]] = {"confidence": [], "variance": []}
         for start in range(0, len(rows), CHUNK):
-            batch = data.batch(rows[start : start + CHUNK])
+            batch = data.batch(rows[order[start : start + CHUNK]])
             prediction = method.answer(batch)
             metric.update(prediction.mean, batch.target, batch.mask)
-            for values, given in ((confidence, prediction.confidence), (variance, prediction.variance)):
-                none = np.full(len(batch), np.nan)
+            for name, values in said.items():
+                given, none = getattr(prediction, name), np.full(len(batch), np.nan)
                 values.append(none if given is None else given.detach().cpu().double().numpy())
-        samples.append(metric.compute())
+        back = np.argsort(order)
+        samples.append({name: values[back] for name, values in metric.compute().items()})
+        confidence.append(np.concatenate(said["confidence"])[back])
+        variance.append(np.concatenate(said["variance"])[back])
     return Scores(
         kind=data.site.kind,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),

@@ -20,7 +20,7 @@ from gsparc.data.files import whole_file
 from gsparc.evaluation.figures import DECIDING, TABLES, form_of, score_of
 
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
-ORDER = ("zero", "mean", "nearest", "idw", "gp")  # of the baselines
+ORDER = ("zero", "mean", "nearest", "idw", "distance_law", "kriging", "gp", "complex_gp")  # of the baselines
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -118,13 +118,15 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
 
 def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """The row that alone decides sums over all rows, if one does, and the median beside them."""
-    row, share, median = (
-        facts.get(f"{prefix}/decided_by/{name}") for name in ("row", "share", "nmse_median")
+    row, name, share, median = (
+        facts.get(f"{prefix}/decided_by/{key}") for key in ("row", "name", "share", "nmse_median")
     )
     if row is None:
         return []
+    number = f"row {row}"  # as split.leave_out counts; the file may count otherwise
+    called = number if name in (None, number) else f"{name} ({number} of split.leave_out)"
     return [
-        f"row {row} alone makes {share:.1%} of the error or power that nmse and mse add up: is it measured "
+        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: is it measured "
         f"right? The median row's NMSE is {median:.3g}"
     ]
 

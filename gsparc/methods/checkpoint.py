@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import pickle
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -18,9 +19,10 @@ from torch import Tensor
 
 from gsparc.data.files import whole_file
 from gsparc.data.raw import is_archive
-from gsparc.data.schema import Site
+from gsparc.data.schema import Site, Stations
 from gsparc.methods.method import Method
 from gsparc.methods.old_names import OLD_NAMES, renamed
+from gsparc.methods.per_station import PerStation
 from gsparc.methods.registry import METHODS, build, method_class
 from gsparc.ops import SphereGrid
 
@@ -86,11 +88,12 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
     site = method.site
     if site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
+    kind = type(method.wrapped if isinstance(method, PerStation) else method)
     content = {
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
         "method": method.name,
-        "target": f"{type(method).__module__}.{type(method).__qualname__}",
+        "target": f"{kind.__module__}.{kind.__qualname__}",
         "config": config,
         "site": _plain(asdict(site), "site"),
         "state": _plain(method.state(), "state"),
@@ -225,9 +228,10 @@ def restore(stored: Stored) -> Method:
     model = stored.configuration.get("model")
     try:
         if isinstance(model, dict) and model.get("_target_") == stored.target:
-            method = build(model, trusted=False)
+            make: Callable[[], Method] = partial(build, model, trusted=False)
         else:
-            method = method_class(_registered(stored))()
+            make = method_class(_registered(stored))
+        method = PerStation(make) if "per_station" in stored.state else make()
         method.restore(stored.site, stored.state)
     except CheckpointError:
         raise
@@ -256,12 +260,24 @@ def _registered(stored: Stored) -> str:
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
     known = {f.name for f in fields(Site)}
-    values: dict[str, Any] = {
-        k: v.numpy() if isinstance(v, Tensor) else v for k, v in facts.items() if k in known
-    }
+    values = {k: v for k, v in _as_numpy(facts).items() if k in known}
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
+    if values.get("stations") is not None:
+        stations = values["stations"]
+        values["stations"] = Stations(**{**stations, "name": tuple(stations["name"])})
+    if values.get("georeference") is not None:
+        from gsparc.data.georeference import Georeference
+
+        values["georeference"] = Georeference(**values["georeference"])
     return Site(**values)
+
+
+def _as_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        k: v.numpy() if isinstance(v, Tensor) else _as_numpy(v) if isinstance(v, Mapping) else v
+        for k, v in facts.items()
+    }
 
 
 def non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:

@@ -16,9 +16,20 @@ from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements
 from gsparc.methods.coarse_grid import Filled
+from gsparc.methods.distance_law import Rows
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Method, Prediction, PredictsVariance
 from gsparc.methods.pareto import Settings
+from gsparc.methods.power_process import (
+    CHOSEN_ON,
+    MEANS,
+    MOST_ROWS,
+    MeanName,
+    PowerProcess,
+    draw,
+    fit_powers,
+    restored,
+)
 from gsparc.methods.reduced import View
 from gsparc.methods.target_rows import entry_variance, from_real, to_real
 from gsparc.ops import Pose
@@ -144,22 +155,41 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
 class GaussianProcess(Interpolator, PredictsVariance):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
+    Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
+    where nothing was heard too (`gsparc.methods.power_process`).
+
     Args:
         components: largest number of principal components kept; all of them when the training set is smaller.
+        mean: of powers: `constant`, `distance`, or `auto`, the one of larger leave-one-out likelihood.
     """
 
     name = "gp"
     stored = ("mean", "axes", "weights", "lost")
+    uses_censored = True
+    powers: PowerProcess | None = None  # None: not powers, or learned by an earlier version
 
-    def __init__(self, components: int = 512) -> None:
+    def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
         if components < 1:
             raise ValueError(f"gp: components must be at least 1, got {components}")
-        self.limit = components
+        if mean not in MEANS:
+            raise ValueError(f"gp: mean={mean!r} is none of {', '.join(MEANS)}")
+        self.limit, self.about = components, mean
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        if self.kind == "rssi":
+            return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
+        thinned = []
+        if len(targets) > MOST_ROWS:
+            thinned.append(f"gp: learned from {MOST_ROWS} of {len(targets)} rows, drawn evenly")
+            kept = draw(np.zeros(len(targets), bool), MOST_ROWS, 0)
+            positions, targets = positions[kept], targets[kept]
         parts = principal_components(targets, self.kind, self.limit)
         entries = len(parts.mean)
-        self.kernel = choose_kernel(positions, parts.scores, entries)
+        looked_at: np.ndarray | slice = slice(None)
+        if len(targets) > CHOSEN_ON:
+            thinned.append(f"gp: settings chosen on {CHOSEN_ON} of {len(targets)} rows, drawn evenly")
+            looked_at = draw(np.zeros(len(targets), bool), CHOSEN_ON, 0)
+        self.kernel = choose_kernel(positions[looked_at], parts.scores[looked_at], entries)
         self.lost, self.positions = parts.lost, positions
         self.factor = cho_factor(self.kernel.gram(positions), lower=True)
         self.weights = torch.from_numpy(cho_solve(self.factor, parts.scores))
@@ -168,9 +198,21 @@ class GaussianProcess(Interpolator, PredictsVariance):
         notes = [f"gp: length {found.length:.4g} m, noise {found.noise:.3g} of the signal's variance"]
         if parts.lost > 0 and len(parts.axes) == self.limit < len(targets) - 1:
             notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
-        return tuple(notes)
+        return (*notes, *thinned)
+
+    def _learn_censored(
+        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+    ) -> tuple[str, ...]:
+        assert self.site is not None
+        rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), silent)
+        self.powers, notes = fit_powers(rows, self.site, self.about)
+        return tuple(f"gp: {note}" for note in notes)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
+        if self.powers is not None:
+            decibels, spread, share = (torch.from_numpy(v) for v in self.powers.mean_and_variance(queries))
+            power = self._decode(decibels[:, None].float())
+            return Prediction(power, (1 - share).float(), entry_variance(spread.float(), power, self.kind))
         cross = self.kernel.cross(queries, self.positions)
         scores = (torch.from_numpy(cross) @ self.weights).float()
         mean = self._decode(torch.addmm(self.mean, scores, self.axes))
@@ -183,6 +225,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
+        if self.powers is not None:
+            return self._decode(self.powers.mean_at(self._queries(tx, rx))[:, None].float())
         places = torch.from_numpy(self.positions)
         squared = (self._queries(tx, rx)[:, None] - places).square().sum(-1)
         far = squared.clamp_min(1e-24).sqrt() * (math.sqrt(3) / self.kernel.length)  # finite slope at 0
@@ -191,6 +235,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
+        if self.powers is not None:
+            return ("confidence",)
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
     def contributions(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
@@ -202,6 +248,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
         assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
+        if self.powers is not None:
+            return PowerMean(self)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
         kept = self.weights.square().sum(0).topk(min(count, len(self.axes))).indices
@@ -215,14 +263,29 @@ class GaussianProcess(Interpolator, PredictsVariance):
         return Filled(lean, grid, stride) if stride > 1 and grid is not None else lean
 
     def _learned(self) -> dict[str, Any]:
+        if self.powers is not None:
+            return {"powers": self.powers.state()}
         kernel = [self.kernel.length, self.kernel.noise, self.kernel.amplitude]
         return {**super()._learned(), "positions": torch.from_numpy(self.positions), "kernel": kernel}
 
     def _relearn(self, state: dict[str, Any]) -> None:
+        self.powers = restored(state["powers"]) if "powers" in state else None
+        if self.powers is not None:
+            return
         super()._relearn(state)
         self.kernel = Kernel(*(float(v) for v in state["kernel"]))
         self.positions = state["positions"].numpy()
         self.factor = cho_factor(self.kernel.gram(self.positions), lower=True)
+
+
+class PowerMean(View):
+    """The mean of powers, without its variance."""
+
+    @torch.no_grad()
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        assert isinstance(self.inner, GaussianProcess)
+        return Prediction(self.inner.mean_at(tx, rx))
 
 
 class ReducedMean(View):

@@ -11,9 +11,19 @@ from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.methods.censored import heard, left_out_note, silent
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.target_rows import from_real, training_targets
 from gsparc.ops import Pose
+
+
+def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
+    """What a reader must know of channels of several runs that are learned as if they were of one."""
+    count = 0 if data.run is None or data.site.kind != "csi" else len(np.unique(data.run[rows]))
+    said = (
+        f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
+    )
+    return (f"{said} some, model=complex_gp learns the factors",) if count > 1 else ()
 
 
 class Interpolator(Method):
@@ -22,19 +32,25 @@ class Interpolator(Method):
     The query is the position of the moving end; orientations are not used.
     """
 
+    both_ends = True
     stored: ClassVar[tuple[str, ...]] = ()  # attributes that are learned, by their names in a checkpoint
     shape: tuple[int, ...] = ()
     seen = 0
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none."""
-        rows = np.concatenate([fold.train, fold.val])
+        known = np.concatenate([fold.train, fold.val])
+        rows = known if self.uses_censored else heard(data, known)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         start = time.perf_counter()
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
-        notes = self._learn(data.moving[rows], training_targets(data, rows))
-        return FitReport(time.perf_counter() - start, notes)
+        places, targets, unheard = data.moving[rows], training_targets(data, rows), silent(data, rows)
+        if unheard.any():
+            notes = self._learn_censored(places, targets, unheard)
+        else:
+            notes = (*self._learn(places, targets), *left_out_note(data, known))
+        return FitReport(time.perf_counter() - start, (*notes, *_runs_note(data, known)))
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
@@ -43,9 +59,9 @@ class Interpolator(Method):
         return self._look_up(self._queries(tx, rx).detach().numpy())
 
     def _queries(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Places (B, 3) float64 [m] of the moving end."""
+        """Places (B, 3) float64 [m] of the moving end, or (B, 6) of both."""
         assert self.site is not None
-        return self.site.moving(tx, rx).expand(len(tx), 3).cpu().double()
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
 
     def state(self) -> dict[str, Any]:
         """Target shape, number of rows, and what the subclass learned."""
@@ -72,6 +88,12 @@ class Interpolator(Method):
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """From positions (n, 3) float64 [m] and stored targets (n, ...); returns notes for the report."""
+
+    def _learn_censored(
+        self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
+    ) -> tuple[str, ...]:
+        """The same where nothing was heard in the rows `silent` (n,), whose targets are levels."""
+        raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
 
     @abstractmethod
     def _look_up(self, queries: np.ndarray) -> Prediction:

@@ -4,7 +4,8 @@ N. Cressie, "Statistics for Spatial Data" (1993), chapters 2 and 3; the exponent
 M. Gudmundson, "Correlation model for shadow fading in mobile radio systems", Electronics Letters 27 (1991).
 Power is kriged in decibels; spectra pixel by pixel, channels entry by entry, with one variogram for all, so
 that one set of weights serves them. A channel's phase is that of the measured ones under the same weights: a
-map of power knows no better. Left out: drift with distance (universal kriging), anisotropy, neighbourhoods.
+map of power knows no better. Of more than `WHOLE` places each query is kriged from its `NEAREST` ones alone:
+they screen those farther away. Left out: drift with distance (universal kriging), anisotropy.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 import torch
 from scipy.linalg import lu_factor, lu_solve
 from scipy.optimize import curve_fit
+from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
 from gsparc.methods.interpolation import Interpolator
@@ -27,6 +29,8 @@ SILENCE = 1e-36  # power of a channel where none was measured, in stored units: 
 BINS = 24
 PAIRS = 200_000  # looked at for the variogram
 SIDE = 2048  # pixels of an image looked at for it
+WHOLE = 3_000  # places whose system is factored as one: that costs their number cubed
+NEAREST = 100  # places that a query is kriged from, of more than these
 JITTER = 1e-9  # of the variance, only so that a system without nugget can be solved
 
 
@@ -97,7 +101,10 @@ class Kriging(Interpolator, PredictsVariance):
         self.variogram = fit_variogram(positions, decibels)
         self._solve()
         v = self.variogram
-        return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m",)
+        few = (
+            f"; of {len(self.positions)} places each query's nearest {NEAREST}" if self.system is None else ""
+        )
+        return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m{few}",)
 
     def _decibels(self, targets: np.ndarray) -> np.ndarray:
         if self.kind == "csi":
@@ -110,31 +117,60 @@ class Kriging(Interpolator, PredictsVariance):
         return 10 * np.log10(np.maximum(rows, np.float32(10 ** (FLOOR_DB / 10))))
 
     def _solve(self) -> None:
-        """Factor the system of the weights and of the multiplier that makes them sum to one."""
-        n = len(self.positions)
-        system = np.ones((n + 1, n + 1))
-        system[:n, :n] = self._covariance(cdist(self.positions, self.positions))
-        system[np.arange(n), np.arange(n)] += self.variogram.nugget + JITTER * self.variogram.total
-        system[n, n] = 0.0
-        self.system = lu_factor(system)
+        """Factor the system of all places, or prepare to find the nearest of too many for that."""
+        self.system: tuple[np.ndarray, np.ndarray] | None = None
+        self.tree: cKDTree | None = None
+        if len(self.positions) > WHOLE:
+            self.tree = cKDTree(self.positions)
+        else:
+            self.system = lu_factor(self._systems(cdist(self.positions, self.positions)))
+
+    def _systems(self, distance: np.ndarray) -> np.ndarray:
+        """Of the weights of n places and the multiplier that makes them sum to one: (..., n + 1, n + 1)."""
+        n = distance.shape[-1]
+        system = np.ones((*distance.shape[:-2], n + 1, n + 1))
+        system[..., :n, :n] = self._covariance(distance)
+        system[..., np.arange(n), np.arange(n)] += self.variogram.nugget + JITTER * self.variogram.total
+        system[..., n, n] = 0.0
+        return system
+
+    def _weights(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For queries (Q, D): their places (Q, n), weights (Q, n), and variances [dB^2] (Q,)."""
+        if self.tree is None:
+            place = np.broadcast_to(np.arange(len(self.positions)), (len(queries), len(self.positions)))
+            distance = cdist(queries, self.positions)
+        else:
+            distance, place = self.tree.query(queries, k=NEAREST)
+        right = np.ones((len(queries), distance.shape[1] + 1))
+        right[:, :-1] = self._covariance(distance)  # without the nugget: noise is not kept
+        if self.system is not None:
+            factor, pivots = self.system
+            solved = lu_solve((factor, pivots.copy()), right.T).T  # pivots are counted from 1 meanwhile
+        else:
+            near = self.positions[place]
+            apart = np.linalg.norm(near[:, :, None] - near[:, None], axis=-1)
+            solved = np.linalg.solve(self._systems(apart), right[..., None])[..., 0]
+        left = np.clip(self.variogram.total - (solved * right).sum(1), 0.0, None)
+        return place, solved[:, :-1], left
 
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        right = np.ones((len(self.positions) + 1, len(queries)))
-        right[:-1] = self._covariance(cdist(self.positions, queries))  # without the nugget: noise is not kept
-        factor, pivots = self.system
-        weights = lu_solve((factor, pivots.copy()), right)  # counted from 1 in place meanwhile
-        shares = torch.from_numpy(weights[:-1].T)
-        decibels = shares.float() @ torch.from_numpy(self.values)
-        left = np.clip(self.variogram.total - (weights * right).sum(0), 0.0, None)
-        variance = torch.from_numpy(left).float()
+        place, weights, left = self._weights(queries)
+        shares = torch.from_numpy(weights)
+
+        def weighed(values: np.ndarray, kind: torch.dtype) -> torch.Tensor:
+            if self.tree is None:
+                return shares.to(kind) @ torch.from_numpy(values)
+            return torch.einsum("qk,qkd->qd", shares.to(kind), torch.from_numpy(values[place]))
+
+        decibels, variance = weighed(self.values, torch.float32), torch.from_numpy(left).float()
         power = self.kind == "rssi"
         if self.channels is None:
             mean = self._decode(decibels if power else 10 ** (decibels / 10))
         else:
-            towards = shares.to(torch.complex64) @ torch.from_numpy(self.channels)
+            towards = weighed(self.channels, torch.complex64)
             mean = torch.polar(10 ** (decibels / 20), towards.angle()).view(-1, *self.shape)
         sure = (1 - variance / self.variogram.total).clamp(0, 1)
         return Prediction(mean, sure, entry_variance(variance, mean, "rssi") if power else None)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, get_args, runtime_checkable
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from torch import Tensor
@@ -61,6 +61,7 @@ class FitContext:
         seed: of whatever is random and has no seed of its own.
         budget_s: seconds of training; None: as the method is configured.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
+        stations: of several, whether `each` has a model or all are one's `together`.
         resume: what an interrupted run left, to go on from.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -78,6 +79,7 @@ class FitContext:
     seed: int = 0
     budget_s: float | None = None
     budget_clock: Clock = "wall"
+    stations: Literal["each", "together"] = "each"
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16
@@ -110,6 +112,8 @@ class Method(ABC):
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
+    both_ends = False  # whether both ends may move: its query is then (tx, rx)
+    uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
 

@@ -10,14 +10,16 @@ import torch
 from torch import Tensor
 
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.schema import Kind, Site
+from gsparc.data.schema import End, Kind, Site, Stations
 from gsparc.methods import checkpoint
 from gsparc.methods.confidence import Trusted, kept
-from gsparc.methods.method import Method
+from gsparc.methods.method import Method, Prediction
+from gsparc.methods.per_station import PerStation, of_station
 from gsparc.methods.timing import Call
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
+    from gsparc.data.georeference import Georeference
     from gsparc.methods.export import Paths
     from gsparc.methods.stored_front import Operating
 
@@ -60,6 +62,90 @@ class Predictor:
             f"Predictor({self.method.name} of {self.site.kind} on {self.site.name}; "
             f"the {self.site.moving_end} moves, scene from {low} to {high} m)"
         )
+
+    def at(self, station: str | int) -> Predictor:
+        """The same model asked about one station alone, by name or number.
+
+        >>> gsparc.load("model.ckpt").at("roof-3").rssi(rx=[2.0, 1.0, 1.5])
+
+        Raises:
+            ValueError: no station is called that.
+        """
+        stations = self.site.stations
+        if stations is None:
+            raise ValueError(f"at: {self.site.name} has one static end, and no stations")
+        number = station_number(stations, station)
+        if number is None:
+            raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
+        # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
+        method, whole = (
+            one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
+        )
+        site = of_station(self.site, number)
+        return Predictor(method, site, whole, self.point, self.trusted, self.kind)
+
+    def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
+        """World positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
+
+        >>> predictor.rssi(rx=predictor.metres(40.7652, -111.8348))
+
+        Args:
+            latitude, longitude: [deg], longitude to the east.
+            height: () or (B,) [m]; None for the one height at which the moving end was measured.
+
+        Raises:
+            ValueError: measured in metres about an unknown origin, degrees that are not on Earth, or no
+                height where the moving end had several.
+        """
+        origin = self._georeference()
+        if height is None:
+            height = usual_heights(self.site).get(self.site.moving_end)
+        if height is None:
+            raise ValueError(f"height= is needed: the {self.site.moving_end} had several, or none is known")
+        single = np.ndim(latitude) == 0 and np.ndim(longitude) == 0 and np.ndim(height) == 0
+        across = origin.from_degrees(latitude, longitude)
+        try:
+            above = np.broadcast_to(np.asarray(height, np.float64), len(across))
+        except (TypeError, ValueError):
+            raise ValueError(f"height= must be one number or {len(across)} [m]") from None
+        places = np.column_stack([across, above])
+        return places[0] if single else places
+
+    def degrees(self, position: Any) -> tuple[Any, Any, Any]:
+        """Latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
+
+        Raises:
+            ValueError: measured in metres about an unknown origin, or no positions.
+        """
+        origin = self._georeference()
+        places = _positions("position", position)
+        latitude, longitude = origin.to_degrees(np.atleast_2d(places)[:, :2])
+        if places.ndim == 1:
+            return float(latitude[0]), float(longitude[0]), float(places[2])
+        return latitude, longitude, places[:, 2]
+
+    def _georeference(self) -> Georeference:
+        if self.site.georeference is None:
+            raise ValueError(
+                f"{self.site.name} was measured in metres about an unknown origin, not in degrees"
+            )
+        return self.site.georeference
+
+    def predict(self, tx: Any = None, rx: Any = None) -> Prediction:
+        """Mean, variance and confidence (B, ...) at once, as tensors, in the units of the measurements.
+
+        The confidence is None where the method has none; else the one that `confidence` answers.
+        """
+        asked, pose, _, _ = self._ends(tx, rx)
+        with torch.no_grad():
+            said = self._whole.predict(asked, pose)
+        sure, scale = None, self.site.target_scale
+        if said.confidence is not None or (self.kind or self.trusted.kind) not in (None, "learned"):
+            places = self.site.moving(asked, pose).double().numpy()
+            sure = torch.from_numpy(self.trusted.confidence(said, places, self.kind))
+        # In float64: squares of powers in watts are beyond float32.
+        variance = None if said.variance is None else said.variance.double() * scale**2
+        return Prediction(said.mean * scale, sure, variance)
 
     def cycling(self, places: np.ndarray) -> Call:
         """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time."""
@@ -186,11 +272,10 @@ class Predictor:
         places = {
             end: _positions(end, value) for end, value in (("tx", tx), ("rx", given)) if value is not None
         }
-        moving, static = self.site.moving_end, self.site.static_end
-        if moving not in places:
-            raise ValueError(
-                f"{moving}= is needed: it is the end that moved when {self.site.name} was measured"
-            )
+        moving, static = self.site.moving_end, self.site.static_end or "tx"
+        for needed in (moving,) if self.site.static_end else ("rx", "tx"):
+            if needed not in places:
+                raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
         single = all(place.ndim == 1 for place in places.values())
         if self._still is not None and len(places) == 1:  # the common case, with nothing to look up
             asked = _float(np.atleast_2d(places[moving] - self.site.origin))
@@ -202,7 +287,7 @@ class Predictor:
                 raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
         ends = {moving: local[moving], static: self._static(local.get(static))}
         rotation = self._rotation(rx, count)
-        if static == "rx" and rotation.ndim == 2:
+        if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
             pose = Pose(_float(ends["rx"]), _float(rotation))
         else:
             positions = np.broadcast_to(ends["rx"], (count, 3))
@@ -218,12 +303,16 @@ class Predictor:
         return Pose(_float(site.static_position), _float(self._rotation(None, 1)))
 
     def _static(self, given: np.ndarray | None) -> np.ndarray:
-        """Local position (3,) of the static end; a given one must be where it was measured."""
+        """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
         known, end = self.site.static_position, self.site.static_end
         if known is None:
-            if given is None:
-                raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
-            return given[0]
+            if given is not None:
+                return given[0] if len(given) == 1 else given
+            if self.site.stations is not None:
+                raise ValueError(f"say which station: .at(name), one of {', '.join(self.site.stations.name)}")
+            if self.site.kind == "rssi":  # learned without its transmitter's place
+                return np.full(3, np.nan)
+            raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
         if given is not None and (np.linalg.norm(given - known, axis=-1) > SAME_PLACE_M).any():
             stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
             raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
@@ -264,6 +353,25 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
 
     chosen, point = within(method, stored, budget_ms)
     return Predictor(chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence)
+
+
+def station_number(stations: Stations, wanted: str | int) -> int | None:
+    """Which of `stations` a name or, where none is called so, a number is; None for none of them."""
+    for known in (list(stations.name), [str(number) for number in range(len(stations))]):
+        if str(wanted) in known:
+            return known.index(str(wanted))
+    return None
+
+
+def usual_heights(site: Site) -> dict[End, float]:
+    """World height [m] of each end that moved and was always at the same height."""
+    if site.moving_box is None:
+        return {}
+    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
+    low, high = site.moving_box[:, 2::3]
+    # Rounded: the origin was taken away from it.
+    above = {end: round(float(low[i] + site.origin[2]), 9) for i, end in enumerate(moving)}
+    return {end: above[end] for i, end in enumerate(moving) if low[i] == high[i]}
 
 
 def _positions(end: str, value: Any) -> np.ndarray:

@@ -16,6 +16,7 @@ METHODS = {
     "mean": "gsparc.methods.mean.Mean",
     "nearest": "gsparc.methods.nearest.Nearest",
     "idw": "gsparc.methods.idw.InverseDistance",
+    "distance_law": "gsparc.methods.distance_law.DistanceLaw",
     "gp": "gsparc.methods.gp.GaussianProcess",
     "kriging": "gsparc.methods.kriging.Kriging",
     "gsrf": "gsparc.peers.gsrf.GSRF",

@@ -16,6 +16,8 @@ TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Targets of `rows` in stored type and units; unmeasured entries get the mean over the other rows.
 
+    Rows where nothing was heard (`data.censored`) keep their level.
+
     Returns:
         (n, ...) like `data.target`; an entry measured in no row is 0.
     """
@@ -24,6 +26,8 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
         return target
     measured = data.mask[rows]
     total = np.where(measured, target, 0).sum(0) / np.maximum(measured.sum(0), 1)
+    if data.censored is not None:
+        measured = measured | data.censored[rows].reshape(-1, *(1,) * (target.ndim - 1))
     return np.where(measured, target, total.astype(target.dtype))
 
 

@@ -3,27 +3,43 @@
 Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al., "Measurement
 of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2
 envelope over distance bounds the correlation. Real and imaginary parts share one kernel: the circular complex
-process.
+process. Rows of a run (`Measurements.run`) share an unknown complex factor, estimated by likelihood;
+predictions at places are those of the largest run, those of measured rows their own run's where it is known.
 """
 
 from __future__ import annotations
 
 import time
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
+from gsparc.multipath.ridge import cholesky
+from gsparc.multipath.run_factors import run_factors
 from gsparc.multipath.visibility_kernel import matern32
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
 
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
+CHOSEN_ON = 1_000  # rows that length and noise are chosen on: each look factors a matrix
+NAMED = 6  # factors of runs that a note gives
+
+
+@dataclass(frozen=True)
+class _Solved:
+    """Negative log likelihood, Cholesky factor (m, m), weights (m, R), factors that align rows (m,)."""
+
+    nll: float
+    lower: Tensor
+    weights: Tensor
+    aligning: Tensor
 
 
 class ComplexGP(PredictsVariance):
@@ -44,27 +60,63 @@ class ComplexGP(PredictsVariance):
         self.shape = tuple(data.target.shape[1:])
         self.places = torch.from_numpy(data.moving[known])
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
-        self.power = max(float(target.abs().square().mean()), 1e-30)
+        looked_at = torch.arange(len(known))
+        if len(known) > CHOSEN_ON:
+            drawn = np.random.default_rng(0).permutation(len(known))[:CHOSEN_ON]
+            looked_at = torch.from_numpy(np.sort(drawn))
+        names, run = np.unique(
+            np.zeros(len(known)) if data.run is None else data.run[known], return_inverse=True
+        )
         lengths = [length * data.site.wavelength for length in LENGTHS]
         tried = [
-            (*self._solve(target, length, noise), length, noise) for length in lengths for noise in NOISES
+            (self._solve(target, length, noise, looked_at, run).nll, length, noise)
+            for length in lengths
+            for noise in NOISES
         ]
-        _, self.factor, self.weights, self.length, self.noise = min(tried, key=lambda t: t[0])
-        note = f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
-        return FitReport(time.monotonic() - started, (note,))
+        _, self.length, self.noise = min(tried, key=lambda t: t[0])
+        solved = self._solve(target, self.length, self.noise, torch.arange(len(known)), run)
+        self.factor, self.weights, self.turned = solved.lower, solved.weights, 1 / solved.aligning
+        self.power = max(float((target * solved.aligning[:, None]).abs().square().mean()), 1e-30)
+        notes = [f"complex_gp: envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"]
+        if len(known) > CHOSEN_ON:
+            notes.append(f"complex_gp: settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
+        self.runs, first = names.astype(np.int64), np.unique(run, return_index=True)[1]
+        self.factors = self.turned[torch.from_numpy(first)]
+        if len(names) > 1:
+            notes.append(self._said_of(names, run))
+        return FitReport(time.monotonic() - started, tuple(notes))
 
-    def _solve(self, target: Tensor, length: float, noise: float) -> tuple[float, Tensor, Tensor]:
-        """Negative log likelihood with the best power, Cholesky factor, weights; of a length [m]."""
-        gram = self._kernel(self.places, self.places, length)
+    def _said_of(self, names: np.ndarray, run: np.ndarray) -> str:
+        """A note of the factors of runs (n,), numbers into `names` (runs,)."""
+        first = [int(np.flatnonzero(run == number)[0]) for number in range(len(names))][:NAMED]
+        factors = self.turned.numpy()[first]
+        listed = ", ".join(
+            f"{name:g}: {abs(factor):.3g} at {np.degrees(np.angle(factor)):.0f} degrees"
+            for name, factor in zip(names, factors, strict=False)
+        )
+        more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
+        largest = names[np.bincount(run).argmax()]
+        return f"complex_gp: factors of runs, relative to run {largest:g}: {listed}{more}"
+
+    def _solve(self, target: Tensor, length: float, noise: float, rows: Tensor, run: np.ndarray) -> _Solved:
+        """Weights of `rows` (m,) for an envelope's length [m]; the best power and runs' factors are taken."""
+        places, target, number = self.places[rows], target[rows], run[rows.numpy()]
+        gram = self._kernel(places, places, length)
         gram.diagonal().add_(noise)
-        lower = torch.linalg.cholesky(gram)
+        lower = cholesky(gram)
+        aligning = torch.ones(len(rows), dtype=torch.complex128)
+        if len(np.unique(number)) > 1:
+            inverse = torch.cholesky_inverse(lower).numpy()
+            _, number = np.unique(number, return_inverse=True)
+            aligning = torch.from_numpy(run_factors(inverse, target.numpy(), number)[number])
+            target = target * aligning[:, None]
         parts = torch.cat([target.real, target.imag], 1)
         weights = torch.cholesky_solve(parts, lower)
         fit = float((parts * weights).sum()) / parts.numel()
         half = target.shape[1]
         determinant = float(lower.diagonal().log().sum()) / len(parts)
-        nll = 0.5 * np.log(max(fit, 1e-300)) + determinant
-        return nll, lower, torch.complex(weights[:, :half], weights[:, half:])
+        nll = 0.5 * np.log(max(fit, 1e-300)) + determinant - float(aligning.abs().log().mean())
+        return _Solved(nll, lower, torch.complex(weights[:, :half], weights[:, half:]), aligning)
 
     def _kernel(self, a: Tensor, b: Tensor, length: float) -> Tensor:
         assert self.site is not None and self.site.carrier_hz is not None
@@ -86,6 +138,17 @@ class ComplexGP(PredictsVariance):
             variance=(self.power * variance).float(),
         )
 
+    def answer(self, batch: Batch) -> Prediction:
+        """Each row in the phase and level of its run; of a run that was not learned from, of the largest."""
+        found = self.predict(batch.tx, batch.rx)
+        if batch.run is None or len(self.runs) == 1:
+            return found
+        same = batch.run.cpu()[:, None] == torch.from_numpy(self.runs)
+        factor = torch.where(same.any(1), (same * self.factors).sum(1), 1.0)
+        assert found.variance is not None
+        mean = found.mean * factor.to(found.mean.dtype)[:, None, None]
+        return replace(found, mean=mean, variance=found.variance * factor.abs().square().float())
+
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64; see `Differentiable`."""
         return self._mean(self._cross(tx, rx))
@@ -93,7 +156,7 @@ class ComplexGP(PredictsVariance):
     def leave_one_out(self) -> LeftOut:
         """See `LeaveOneOut`; rows are those of the fit, counted from 0."""
         inverse = torch.cholesky_inverse(self.factor).diagonal()
-        return LeftOut(np.arange(len(self.places)), self.weights / inverse[:, None])
+        return LeftOut(np.arange(len(self.places)), self.turned[:, None] * self.weights / inverse[:, None])
 
     def _cross(self, tx: Tensor, rx: Pose) -> Tensor:
         """Covariance (B, n) of the moving end's places with those learned from."""
@@ -109,13 +172,18 @@ class ComplexGP(PredictsVariance):
         """See `Method.state`."""
         if self.site is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
-        names = ("places", "weights", "factor", "length", "noise", "power")
-        return {**{name: getattr(self, name) for name in names}, "shape": list(self.shape)}
+        names = ("places", "weights", "factor", "length", "noise", "power", "turned")
+        runs = {"runs": torch.from_numpy(self.runs), "factors": self.factors}
+        return {**{name: getattr(self, name) for name in names}, **runs, "shape": list(self.shape)}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
         self.places, self.weights, self.factor = state["places"], state["weights"], state["factor"]
+        ones = torch.ones(len(self.places), dtype=torch.complex128)  # earlier versions knew no runs
+        self.turned = state.get("turned", ones)
+        self.runs = state["runs"].numpy() if "runs" in state else np.zeros(1, np.int64)
+        self.factors = state.get("factors", ones[:1])
         self.length, self.noise, self.power = (float(state[k]) for k in ("length", "noise", "power"))
 
     def size(self) -> int:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter, visible_share
 from gsparc.multipath.clutter.unfold import Unfolding
+from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import Word, images
@@ -121,7 +122,7 @@ class Factor:
     @staticmethod
     def of(covariance: Tensor, target: Tensor) -> Factor:
         """From a positive definite covariance, noise included."""
-        lower = torch.linalg.cholesky(covariance)
+        lower = cholesky(covariance)
         alpha = torch.cholesky_solve(target, lower)
         determinant = 2 * lower.diagonal().real.double().log().sum()
         fit = (target.conj() * alpha).real.double().sum()

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter
 from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
+from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 
@@ -120,7 +121,7 @@ class RealFactor:
     def of(covariance: Tensor, target: Tensor) -> RealFactor:
         """From a positive definite covariance (2, n, 2, n), noise included, and targets (n, R) complex."""
         size = 2 * len(target)
-        lower = torch.linalg.cholesky(covariance.reshape(size, size))
+        lower = cholesky(covariance.reshape(size, size))
         flat = stacked(target)[0]
         alpha = torch.cholesky_solve(flat, lower)
         determinant = lower.diagonal().double().log().sum()

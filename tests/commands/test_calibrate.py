@@ -184,7 +184,7 @@ def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
     path = str(objects.checkpoints[0])
     assert len(collect([path], {}, {})[0]) == len(objects.split.folds[0].test)
     with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
-        collect([path], {}, {"name": "block"})
+        collect([path], {}, {"name": "corner"})
 
 
 def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_path) -> None:
@@ -247,4 +247,4 @@ def test_a_split_file_that_is_gone_calibrates_nothing(tmp_path) -> None:
     other = split.rename(tmp_path / "kept.json")
     assert collect([path], {}, {"path": str(other)})[1]["split/foreign"] is None  # by its hash
     with pytest.raises(ValueError, match="another split; these test rows may have been TRAINED on"):
-        collect([path], {}, {"name": "block"})
+        collect([path], {}, {"name": "corner"})

@@ -90,3 +90,17 @@ def test_exit_status(tmp_path, arrays, capsys):
     assert main([str(tmp_path / "a.npz"), str(tmp_path / "absent.npz")]) == 1
     assert main([str(tmp_path)]) == 1
     assert "a folder without gateway_info.yml" in capsys.readouterr().out
+
+
+def test_a_map_only_where_it_is_asked_for(tmp_path, arrays, capsys):
+    write_own(tmp_path / "a.npz", arrays)
+    assert main([str(tmp_path / "a.npz")]) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz"]
+    assert main([str(tmp_path / "a.npz"), "--draw", str(tmp_path / "maps" / "a.png")]) == 0
+    assert (tmp_path / "maps" / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert main([str(tmp_path / "a.npz"), "--draw", str(tmp_path / "a.npz" / "b.png")]) == 1
+    assert "b.png: cannot be written" in capsys.readouterr().out
+    for wrong in (["a.npz", "b.npz", "--draw", "c.png"], ["a.npz", "--draw", "c.pdf"]):
+        with pytest.raises(SystemExit):
+            main(wrong)
+        assert "--draw takes the name of a PNG file" in capsys.readouterr().err

@@ -190,7 +190,7 @@ def interrupted(tmp_path_factory):
 @pytest.mark.parametrize(
     "change,said",
     [
-        ("split=block", r"split\.name=random \(here block\)"),
+        ("split=corner", r"split\.name=random \(here corner\)"),
         ("split.seed=3", r"split\.seed=0 \(here 3\)"),
         ("seed=3", r"seed=0 \(here 3\)"),
         ("model.field.count=41", r"model\.field\.count=\d+ \(here 41\)"),

@@ -71,7 +71,7 @@ def test_a_position_2e6_m_off_moves_nothing(kind, tmp_path, caplog):
     assert "row 7: lie far outside the region of all others" in caplog.text
 
 
-@pytest.mark.parametrize("split", ["random", "grouped", "block", "sparse"])
+@pytest.mark.parametrize("split", ["random", "grouped", "corner", "sparse"])
 def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
     clean, wrong = spoilt("csi", tmp_path, 5, csi=1e8)
     assert outliers(wrong) and not outliers(clean)

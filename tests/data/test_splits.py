@@ -6,6 +6,7 @@ import pytest
 
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
+from gsparc.data.own import from_arrays
 from gsparc.data.rfid import load_rfid
 from gsparc.data.splits import SplitSettings, make_split, path_order, read_split, write_split
 
@@ -21,7 +22,7 @@ def _disjoint(fold, rows):
     return len(np.unique(every)) == len(every) and every.min() >= 0 and every.max() < rows
 
 
-@pytest.mark.parametrize("name", ["random", "grouped", "block", "sparse"])
+@pytest.mark.parametrize("name", ["random", "grouped", "corner", "sparse"])
 def test_a_split_is_a_pure_function_of_positions_and_settings(name):
     positions = _walk()
     first = make_split(positions, SplitSettings(name))
@@ -74,7 +75,7 @@ def test_grouped_orders_scattered_rows_into_slabs():
 @pytest.mark.parametrize("corner", ["--", "-+", "+-", "++"])
 def test_block_is_a_rectangle_in_a_corner(corner):
     positions = np.random.default_rng(0).uniform(0, 2, (500, 3))
-    fold = make_split(positions, SplitSettings("block", corner=corner)).folds[0]
+    fold = make_split(positions, SplitSettings("corner", corner=corner)).folds[0]
     assert len(fold.test) == 100
     toward = np.array([1 if c == "+" else -1 for c in corner])
     centre = (positions[fold.test, :2].mean(axis=0) - 1) * toward
@@ -216,6 +217,56 @@ def test_thinning_by_distance_leaves_the_test_rows_alone():
         SplitSettings(spacing_m=0.0)
 
 
+def test_blocks_are_whole_squares_until_the_share_is_reached():
+    positions = np.random.default_rng(0).uniform(0, 3, (900, 3))
+    fold = make_split(positions, SplitSettings("blocks", side_m=0.5, share=0.2)).folds[0]
+    assert _disjoint(fold, 900) and 180 <= len(fold.test) < 180 + 60
+    square = np.floor(positions[:, :2] / 0.5) @ [1, 1000]
+    parts = [set(square[part]) for part in (fold.train, fold.val, fold.test)]
+    assert not parts[0] & parts[1] and not parts[0] & parts[2] and not parts[1] & parts[2]
+    assert len(fold.val) >= 0.1 * (len(fold.train) + len(fold.val))
+
+
+def test_blocks_without_a_side_are_a_tenth_of_the_site():
+    positions = np.random.default_rng(0).uniform(0, 1000, (900, 3))
+    fold = make_split(positions, SplitSettings("blocks")).folds[0]
+    assert len(np.unique(np.floor(positions[fold.test, :2] / 99.8), axis=0)) < 35
+    with pytest.raises(DataError, match="too few to hold some out"):
+        make_split(positions, SplitSettings("blocks", side_m=5000))
+
+
+@pytest.mark.parametrize("name", ["random", "grouped", "blocks", "corner"])
+def test_a_place_is_held_out_for_all_stations(name):
+    places = np.random.default_rng(0).uniform(0, 3, (200, 3))
+    place, station = np.repeat(np.arange(200), 4), np.tile(np.arange(4), 200)
+    found = make_split(places[place], SplitSettings(name), place=place, station=station)
+    alone = make_split(places, SplitSettings(name))
+    for fold, other in zip(found.folds, alone.folds, strict=True):
+        for part in ("train", "val", "test"):
+            np.testing.assert_array_equal(np.unique(place[getattr(fold, part)]), getattr(other, part))
+            assert len(getattr(fold, part)) == 4 * len(getattr(other, part))
+
+
+def test_stations_are_held_out_one_by_one_or_together():
+    station = np.repeat(np.arange(5), 20)
+    positions = np.random.default_rng(0).uniform(0, 3, (100, 3))
+    split = make_split(positions, SplitSettings("stations"), station=station)
+    assert [set(station[fold.test]) for fold in split.folds] == [{t} for t in range(5)]
+    for fold in split.folds:
+        assert _disjoint(fold, 100) and len(set(station[fold.val])) == 1
+        assert not set(station[fold.val]) & set(station[fold.train])
+    (fold,) = make_split(positions, SplitSettings("stations", leave_out=2), station=station).folds
+    assert len(set(station[fold.test])) == 2
+    with pytest.raises(DataError, match="have one station"):
+        make_split(positions, SplitSettings("stations"))
+    with pytest.raises(DataError, match="two at least must remain"):
+        make_split(positions, SplitSettings("stations", leave_out=4), station=station)
+
+
+def test_block_is_called_corner_now():
+    assert SplitSettings("block").name == "corner"
+
+
 @pytest.mark.parametrize("text", ["[" * 50_000, '{"folds": [{"train": [' + "1" * 5000 + "]}]}"])
 def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path, text):
     file = tmp_path / "split.json"
@@ -223,3 +274,28 @@ def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path
     with pytest.raises(DataError, match=r"split\.json: not a split file") as error:
         read_split(file, 4)
     assert len(str(error.value)) < 300 and "sys." not in str(error.value)
+
+
+def test_a_place_visited_again_was_learned_from_and_tested_on():
+    """Ten samples at each of 30 places: every test row had others of its place to learn from."""
+    places = np.repeat(np.random.default_rng(0).uniform(0, 9, (30, 3)), 10, axis=0)
+    levels_db, post = -60 - places[:, 0], np.array([[0.0, 0, 5]])
+    for arrays in (
+        {"rx_position": places, "rssi_db": levels_db},
+        {"rx_position": places, "rssi_db": levels_db, "tx_position": post[0]},
+        {
+            "rx_position": places,
+            "rssi_db": levels_db[:, None] - [0, 3],
+            "station_position": [*post, post[0] + 9],
+        },
+        {
+            "rx_position": places,
+            "tx_position": np.concatenate([places[10:], places[:10]]),
+            "rssi_db": levels_db,
+        },
+    ):
+        data = from_arrays(arrays)
+        for name in ("random", "sparse"):
+            fold = split_for({"name": name}, data).folds[0]
+            known = {tuple(row) for row in data.moving[np.concatenate([fold.train, fold.val])]}
+            assert len(fold.test) and not known & {tuple(row) for row in data.moving[fold.test]}

@@ -148,6 +148,13 @@ def test_hard_case_silent_channel(caplog):
     assert nothing["nmse"] is None and nothing["snr_db"] is None and nothing["nmse_scalar"] is None
 
 
+def test_a_prediction_below_the_weakest_power_was_no_error():
+    """Every weak prediction was lifted to the weakest power scored, not only those without any."""
+    target = torch.tensor([[1e-8], [1e-3]])
+    figures = summarise(PowerMetrics(), torch.tensor([[1e-12], [1e-3]]), target)
+    assert figures["mae_db"] == pytest.approx(20, abs=1e-3)
+
+
 def test_power_figures_in_decibels(caplog):
     target = torch.tensor([[1e-6], [1e-5], [1e-4]])
     figures = summarise(PowerMetrics(), target * torch.tensor([[10.0], [0.1], [1.0]]), target)
@@ -156,6 +163,8 @@ def test_power_figures_in_decibels(caplog):
     # Black is read as the weakest power of the set: 0, 10 and 20 dB off.
     black = summarise(PowerMetrics(), torch.zeros(3, 1), target)
     assert black["mae_db"] == pytest.approx(10, rel=1e-5) and "3 predictions" in caplog.text
+    heard = summarise(PowerMetrics(), target, target, torch.tensor([[True], [False], [True]]))
+    assert heard["samples"] == 2  # what was not heard is in no figure, and was counted
     silent = summarise(PowerMetrics(), target, torch.zeros(3, 1))
     assert silent["rmse_db"] is None and silent["silent_samples"] == 3
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
 from gsparc.methods import kriging
 from gsparc.methods.idw import InverseDistance
 from gsparc.methods.method import FitContext
@@ -123,3 +127,25 @@ def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypat
     monkeypatch.setattr(kriging, "lu_solve", lambda pair, right: seen.append(pair[1]) or solve(pair, right))
     method.answer(data.batch(np.arange(3)))
     assert len(seen) == 1 and not np.shares_memory(seen[0], method.system[1])
+
+
+def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
+    """50,000 rows were a matrix of 20 GB for a baseline that every run of powers fits."""
+    monkeypatch.setattr(kriging, "WHOLE", 30)
+    monkeypatch.setattr(kriging, "NEAREST", 20)
+    places = np.random.default_rng(0).uniform(0, 9, (80, 3))
+    data = from_arrays({"rx_position": places, "tx_position": np.zeros(3), "rssi_db": -40 - places[:, 0]})
+    method = kriging.Kriging()
+    report = method.fit(data, Fold(np.arange(60), np.arange(60, 70), np.arange(70, 80)), FitContext(tmp_path))
+    assert method.system is None and "of 70 places each query's nearest 20" in report.notes[0]
+    error = 10 * torch.log10(method.answer(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
+    assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
+
+
+def test_runs_were_taken_as_one_without_a_word(campaign, folds, tmp_path):
+    data = campaign("csi")
+    fold = folds(len(data)).folds[0]
+    several = replace(data, run=np.arange(len(data)) % 2)
+    said = [InverseDistance().fit(d, fold, FitContext(tmp_path)).notes for d in (several, data)]
+    assert any("channels of 2 runs" in note for note in said[0])
+    assert not any("runs" in note for note in said[1])

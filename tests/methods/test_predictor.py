@@ -11,10 +11,13 @@ import pytest
 import torch
 
 import gsparc
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold
 from gsparc.methods import checkpoint
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
 from gsparc.methods.method import FitContext
+from gsparc.methods.per_station import for_links
 from gsparc.methods.registry import method_class
 
 
@@ -132,3 +135,67 @@ def test_positions_that_are_none_are_refused(spectra, place, said):
     """Complex numbers lost their imaginary part, and what overflows float32 was answered with NaN."""
     with pytest.raises(ValueError, match=said):
         spectra[1].spectrum(tx=place)
+
+
+@pytest.fixture
+def abroad(tmp_path):
+    """Powers of one transmitter at a known place, in degrees, 1.5 m above ground."""
+    rng = np.random.default_rng(0)
+    data = from_arrays(
+        {
+            "latitude": 47 + rng.uniform(0, 0.01, 40),
+            "longitude": 11 + rng.uniform(0, 0.01, 40),
+            "rx_height": np.array(1.5),
+            "station_latitude": np.array([47.001, 47.001]),
+            "station_longitude": np.array([11.0, 11.0]),
+            "station_height": np.array(9.0),
+            "carrier_hz": np.array([9e8, 1.8e9]),
+            "rssi_db": rng.normal(0, 1, (40, 2)) - [50, 80],
+        }
+    )
+    method = for_links(GaussianProcess, data)
+    rows = np.arange(len(data))
+    method.fit(data, Fold(rows, rows[:0], rows[:4]), FitContext(tmp_path))
+    checkpoint.save(tmp_path / "gp.ckpt", method)
+    return gsparc.load(tmp_path / "gp.ckpt")
+
+
+def test_degrees_to_metres_and_back(abroad):
+    place = abroad.metres(47.004, 11.002)
+    assert place.shape == (3,) and place[2] == 1.5  # the height at which it was measured
+    many = abroad.metres([47.004, 47.005], [11.002, 11.003], height=[1.0, 2.0])
+    assert many.shape == (2, 3) and np.array_equal(many[0, :2], place[:2])
+    latitude, longitude, height = abroad.degrees(many)
+    assert np.allclose(latitude, [47.004, 47.005], atol=1e-10) and np.allclose(longitude, [11.002, 11.003])
+    assert height.tolist() == [1, 2] and abroad.degrees(place)[2] == 1.5
+    assert isinstance(abroad.at(0).rssi(rx=place)[0], np.float32)
+
+
+def test_degrees_that_mean_nothing_are_refused(abroad, spectra):
+    with pytest.raises(ValueError, match="latitude 95 is outside"):
+        abroad.metres(95, 11)
+    with pytest.raises(ValueError, match=r"height= must be one number or 2 \[m\]"):
+        abroad.metres([47, 47], [11, 11], [1, 2, 3])
+    with pytest.raises(ValueError, match="toy was measured in metres about an unknown origin"):
+        spectra[1].metres(47, 11)
+    with pytest.raises(ValueError, match="unknown origin"):
+        spectra[1].degrees(np.zeros(3))
+    several = dataclasses.replace(abroad.site, moving_box=None)
+    with pytest.raises(ValueError, match="height= is needed"):
+        gsparc.Predictor(abroad.method, several).metres(47, 11)
+
+
+def test_two_stations_at_one_place_have_models_of_their_own(abroad):
+    """Both carriers of a mast were answered by the model of the first."""
+    place = abroad.metres(47.004, 11.002)
+    low, high = (float(abroad.at(number).rssi(rx=place)[0]) for number in (0, 1))
+    assert 25 < 10 * np.log10(low / high) < 35
+
+
+def test_all_at_once_is_what_is_asked_one_by_one(abroad):
+    one, places = abroad.at(1), abroad.metres([47.004, 47.008], [11.002, 11.009])
+    said = one.predict(rx=places)
+    assert np.array_equal(said.mean.numpy(), one.rssi(rx=places))
+    assert np.array_equal(said.confidence.numpy(), one.confidence(rx=places))
+    spread = 10 / np.log(10) * said.variance.sqrt().numpy() / said.mean[:, 0].double().numpy()
+    assert (np.abs(spread - 1) < 0.5).all()  # a decibel, as the powers were drawn

@@ -26,7 +26,7 @@ MAKERS = {"spectrum": spectra, "csi": channels, "rssi_db": powers}
 QUICK = {  # methods by what they serve, none of which trains for a fixed time
     "spectrum": ("zero", "mean", "nearest", "idw", "gp"),
     "csi": ("zero", "mean", "nearest", "idw", "gp", "complex_gp"),
-    "rssi_db": ("zero", "mean", "nearest", "idw", "gp", "kriging"),
+    "rssi_db": ("zero", "mean", "nearest", "idw", "gp", "kriging", "distance_law"),
 }
 WRONG = {
     "power": lambda arrays, kind: arrays[kind].__setitem__(7, loudest(arrays[kind], kind)),

@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from gsparc.commands.compare.problem import Problem
 from gsparc.data.instantiate import find, targets
 
 ANY = "any"  # stands for the budget or seed of a method that has none
@@ -27,6 +28,7 @@ class Contender:
         choose: overrides of train.yaml that select it.
         budget: overrides with `{budget_s}`; empty when its time cannot be chosen.
         kinds: of data it serves; empty for all.
+        stations: takes part only where there are several stations, some rows of each being learned from.
         reserve_s: part of the budget that its own `budget_s` does not count [s].
         only_longest: too slow for any but the longest budget.
         timed_only: too slow to be scored at all: fitted for its latency.
@@ -36,15 +38,16 @@ class Contender:
     choose: tuple[str, ...]
     budget: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
+    stations: bool = False
     reserve_s: float = 0.0
     only_longest: bool = False
     timed_only: bool = False
 
-    def overrides(self, budget_s: float | None, seed: int | None) -> list[str]:
-        """Overrides of train.yaml for one cell."""
+    def overrides(self, budget_s: float | None) -> list[str]:
+        """Overrides of train.yaml, but for the seed."""
         left = None if budget_s is None else max(budget_s - self.reserve_s, 1.0)
         timed = [] if left is None else [text.format(budget_s=f"{left:g}") for text in self.budget]
-        return [*self.choose, *timed, f"seed={seed or 0}"]
+        return [*self.choose, *timed]
 
 
 @dataclass(frozen=True)
@@ -54,7 +57,7 @@ class Cell:
     Attributes:
         dataset, split, method: names.
         budget_s: seconds per model [s]; None for a method without budget.
-        seed: None for a method without one.
+        seed: of the method, and of the split where that is drawn several times; None for neither.
     """
 
     dataset: str
@@ -102,15 +105,15 @@ class Budget:
 
 
 def plan(
-    problems: Sequence[tuple[str, str, str]],
+    problems: Sequence[Problem],
     methods: Mapping[str, Contender],
     budgets: Sequence[Budget],
     only: Sequence[str] = (),
-) -> list[Cell]:
+) -> list[tuple[Problem, Cell]]:
     """All cells, the most useful first: every problem's table before further seeds and longer budgets.
 
     Args:
-        problems: (dataset, split, kind of data), the most wanted first.
+        problems: the most wanted first; one of several draws of a split gives a method its seed.
         methods: who takes part.
         budgets: the most wanted first.
         only: patterns of `str(cell)`; empty for all.
@@ -118,29 +121,42 @@ def plan(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    able = {
-        (d, s): [m for m in methods.values() if not m.kinds or kind in m.kinds] for d, s, kind in problems
-    }
-    cells = [Cell(*there, m.name, None, None) for there, those in able.items() for m in those if not m.budget]
+    able = [
+        (p, [m for m in methods.values() if (not m.kinds or p.kind in m.kinds) and p.stations >= m.stations])
+        for p in problems
+    ]
+
+    def cell(problem: Problem, method: Contender, budget_s: float | None, seed: int | None) -> Cell:
+        drawn = seed if problem.draw is None else problem.draw
+        return Cell(problem.dataset, problem.split, method.name, budget_s, drawn)
+
+    cells = [(p, cell(p, m, None, None)) for p, those in able for m in those if not m.budget]
     longest = max((b.seconds for b in budgets), default=0.0)
     turns = max((len(b.seeds) for b in budgets), default=0)
     for turn in range(turns):  # first seeds of all budgets before second ones
         for budget in (b for b in budgets if turn < len(b.seeds)):
-            for problem, those in able.items():
+            for problem, those in able:
+                if (budget.splits and problem.split not in budget.splits) or (
+                    turn and problem.draw is not None
+                ):
+                    continue
                 cells += [
-                    Cell(*problem, m.name, budget.seconds, budget.seeds[turn])
+                    (problem, cell(problem, m, budget.seconds, budget.seeds[turn]))
                     for m in those
-                    if m.budget
-                    and (not budget.splits or problem[1] in budget.splits)
-                    and not (m.only_longest and (turn > 0 or budget.seconds < longest))
+                    if m.budget and not (m.only_longest and (turn > 0 or budget.seconds < longest))
                 ]
+    names = [str(cell) for _, cell in cells]
     for pattern in only:
-        if not any(fnmatchcase(str(cell), pattern) for cell in cells):
+        if not any(fnmatchcase(name, pattern) for name in names):
             raise ValueError(
                 f"only: {pattern!r} matches no cell; they are dataset/split/method/budget/seed, "
-                f"like {cells[0] if cells else 'rfid/random/gp/any/any'}"
+                f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
-    return [c for c in cells if not only or any(fnmatchcase(str(c), pattern) for pattern in only)]
+    return [
+        one
+        for one, name in zip(cells, names, strict=True)
+        if not only or any(fnmatchcase(name, pattern) for pattern in only)
+    ]
 
 
 def key(model: Mapping[str, Any], trainer: Mapping[str, Any], data_sha: str, split_sha: str) -> str:

@@ -15,18 +15,17 @@ from typing import Any
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsparc.commands.compare import figure, table
+from gsparc.commands.compare import draws_figure, figure, table
 from gsparc.commands.compare.cells import Budget, contenders, plan
 from gsparc.commands.compare.fitting import (
     Filled,
     Prepared,
-    Problem,
     fill,
-    load_problems,
     prepare,
-    stored_problems,
 )
 from gsparc.commands.compare.latency import Latency, latencies
+from gsparc.commands.compare.overview import overview
+from gsparc.commands.compare.problem import Problem, load_problems, split_choices, stored_problems
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.files import platform_cache
@@ -49,40 +48,51 @@ def task(config: DictConfig) -> list[table.Row]:
         Budget(float(b["seconds"]), tuple(map(int, b["seeds"])), tuple(b.get("splits") or ()))
         for b in settings["budgets"]
     ]
-    wanted = plan([(r.dataset, r.split, r.kind) for r in problems], methods, budgets, settings["only"])
-    by_name = {(r.dataset, r.split): r for r in problems}
     prepared = [
-        prepare(c, methods[c.method], settings["datasets"][c.dataset], by_name[c.dataset, c.split], kept)
-        for c in wanted
+        prepare(cell, methods[cell.method], settings["datasets"][cell.dataset] or {}, problem, kept)
+        for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     filled = fill_all(prepared, bool(settings["train"]), limit_s)
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
+    by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
     timed = _timed(filled, by_name, kept, bool(settings["latency"]))
     return report(filled, timed, str(settings["ours"]), run_dir)
 
 
 def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
-    """Every dataset under every split, splits outermost: the best-known come first.
+    """Every dataset under every split that is meant for it, first draws first: the best-known come first.
 
     Without its path a dataset is there as far as results were kept, for the table alone.
     """
     wanted = [str(pattern) for pattern in settings["only"]]
+    splits = split_choices(settings["splits"])
     problems: list[Problem] = []
-    for name, paths in settings["datasets"].items():
-        splits = [s for s in settings["splits"] if not wanted or any(_may_match(p, name, s) for p in wanted)]
-        if any((paths or {}).values()):
-            problems += load_problems(name, paths, splits) if splits else []
+    absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
+    here = {
+        name: bool((of or {}).get("root") or (of or {}).get("file"))
+        for name, of in settings["datasets"].items()
+    }
+    for name, own in settings["datasets"].items():
+        meant = [
+            split
+            for split in splits.values()
+            if (not split.datasets or name in split.datasets)
+            and (not wanted or any(_may_match(p, name, split.name) for p in wanted))
+        ]
+        if here[name]:
+            problems += load_problems(name, own, meant) if meant else []
             continue
-        stored = stored_problems(kept, name, splits)
+        stored = stored_problems(kept, name, meant)
         problems += stored
-        log.warning(
-            "%s %s: say datasets.%s.root=DIR or .file=FILE",
-            name, "is here as far as results were kept" if stored else "is left out", name,
-        )  # fmt: skip
-    problems.sort(key=lambda problem: settings["splits"].index(problem.split))
-    if not problems and not any(any((paths or {}).values()) for paths in settings["datasets"].values()):
+        absent["here as far as results were kept" if stored else "left out"].append(name)
+    for how, names in absent.items():
+        if names:
+            log.warning("%s %s: say datasets.NAME.root=DIR or .file=FILE", ", ".join(names), how)
+    order = list(splits)
+    problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
+    if not problems and not any(here.values()):
         raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
     if not problems:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
@@ -167,15 +177,26 @@ def _timed(
 def report(
     filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]], ours: str, run_dir: Path
 ) -> list[table.Row]:
-    """Write `compare.csv`, `compare.md`, `compare.png` and `summary.json`, and show the page."""
+    """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
+
+    Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`.
+    """
     rows = table.rows(filled, timed)
     blocks = table.blocks(rows)
     unscored = {one.cell.method for one in filled if not one.scored()}
     only_timed = {d: {n: t for n, t in here.items() if n in unscored} for d, here in timed.items()}
-    page = table.markdown(blocks, ours, only_timed)
+    drawn = [row for row in rows if row.draws]
+    by_set = [
+        [row for row in drawn if row.dataset == name] for name in dict.fromkeys(r.dataset for r in drawn)
+    ]
+    page = "\n\n".join([*map(overview, by_set), table.markdown(blocks, ours, only_timed)])
     write_samples(run_dir / "compare.csv", columns(rows, table.Row))
+    write_samples(run_dir / "cells.csv", columns(table.results(filled), table.Result))
     (run_dir / "compare.md").write_text(page, encoding="utf-8")
-    figure.draw(rows, run_dir / "compare.png", ours)
+    for one in by_set:
+        draws_figure.draw(one, run_dir / f"{one[0].dataset}.png")
+    if len(drawn) < len(rows):
+        figure.draw([row for row in rows if not row.draws], run_dir / "compare.png", ours)
     facts: dict[str, Any] = {"cells": len(filled), **provenance()}
     for block in blocks:
         stem = f"{block.dataset}/{block.split}/{'any' if block.budget_s is None else f'{block.budget_s:g}'}"

@@ -5,24 +5,20 @@ from __future__ import annotations
 import json
 import logging
 import statistics
-from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import hydra
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.compare.cells import Cell, Contender, key
+from gsparc.commands.compare.problem import RESULT, Problem, compose
 from gsparc.commands.context import context_of
 from gsparc.commands.settings import plain
 from gsparc.commands.study.run import fit_and_score, in_folders
-from gsparc.data.load import load, split_for
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Split
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods import checkpoint
@@ -32,75 +28,8 @@ from gsparc.methods.timing import machine_facts
 
 log = logging.getLogger(__name__)
 
-RESULT = "cell.json"
 FREE_S = 5.0  # guessed for a method without a budget
 EARLIER = "measured at commit"  # among the facts of a result of earlier program text
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One dataset under one split; its measurements may be absent, then kept results say what they were.
-
-    Attributes:
-        dataset, split: names.
-        kind: of the measurements.
-        hashes: of measurements and folds.
-        data: measurements; None where they are not here.
-        folds: which rows learn and which test.
-    """
-
-    dataset: str
-    split: str
-    kind: str
-    hashes: tuple[str, str]
-    data: Measurements | None = None
-    folds: Split | None = None
-
-    @classmethod
-    def of(cls, dataset: str, split: str, data: Measurements, folds: Split) -> Problem:
-        """With its measurements."""
-        return cls(dataset, split, data.site.kind, (data.site.sha256, folds.sha256), data, folds)
-
-    def present(self) -> tuple[Measurements, Split]:
-        """Measurements and folds.
-
-        Raises:
-            ValueError: they are not here.
-        """
-        if self.data is None or self.folds is None:
-            raise ValueError(f"{self.dataset}/{self.split}: the measurements are not here")
-        return self.data, self.folds
-
-
-def stored_problems(kept: Path, dataset: str, splits: Sequence[str]) -> list[Problem]:
-    """The problems of a dataset that most kept results are of, one per split."""
-    found = []
-    for split in splits:
-        files = sorted(kept.glob(f"{dataset}-{split}-*/{RESULT}"))
-        facts = [json.loads(file.read_text(encoding="utf-8")) for file in files]
-        known = Counter((f["dataset/kind"], f["dataset/sha256"], f["split/sha256"]) for f in facts)
-        if known:
-            kind, *hashes = known.most_common(1)[0][0]
-            found.append(Problem(dataset, split, kind, (hashes[0], hashes[1])))
-    return found
-
-
-def load_problems(dataset: str, settings: dict[str, Any], splits: Sequence[str]) -> list[Problem]:
-    """Load what `conf/dataset` names, with the given paths, once for all splits of `conf/split`."""
-    configs = [compose(dataset, settings, split, []) for split in splits]
-    data = load(plain(configs[0].dataset))
-    return [
-        Problem.of(dataset, split, data, split_for(plain(config.split), data))
-        for split, config in zip(splits, configs, strict=True)
-    ]
-
-
-def compose(dataset: str, settings: dict[str, Any], split: str, overrides: list[str]) -> DictConfig:
-    """The configuration `train.py` would see."""
-    chosen = [f"dataset={dataset}", f"split={split}", "logger=none", "~callbacks.pictures", *overrides]
-    config = hydra.compose("train", overrides=[*chosen, "hydra.run.dir=."])
-    OmegaConf.update(config, "dataset", settings, merge=True)
-    return config
 
 
 @dataclass(frozen=True)
@@ -121,6 +50,11 @@ class Filled:
     def earlier(self) -> str | None:
         """Commit of an earlier program text that it was measured with; None for this one's."""
         return self.facts.get(EARLIER)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether its seed is a draw of the split."""
+        return bool(self.facts.get("problem/drawn"))
 
     def scored(self) -> bool:
         """Whether it was tested, not only timed."""
@@ -174,12 +108,16 @@ class Prepared:
 
 
 def prepare(
-    cell: Cell, contender: Contender, settings: dict[str, Any], problem: Problem, kept: Path
+    cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, kept: Path
 ) -> Prepared:
     """Compose a cell's configuration and name the folder of its result."""
-    config = compose(cell.dataset, settings, cell.split, contender.overrides(cell.budget_s, cell.seed))
+    chosen = problem.chosen or (f"dataset={settings.get('dataset', cell.dataset)}",)
+    overrides = [*chosen, *contender.overrides(cell.budget_s)]
+    config = compose(settings, overrides, problem.draw, cell.seed)
     whole = plain(config)
     trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
+    if whole["stations"] != "each":  # cells from before there was a choice keep their names
+        trainer["stations"] = whole["stations"]
     name = key(whole["model"], trainer, *problem.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, problem, config, folder, not contender.timed_only)
@@ -187,6 +125,8 @@ def prepare(
 
 def fill(prepared: Prepared) -> Filled:
     """Train on every fold, score on the test rows, write checkpoints and then the result.
+
+    Of a split that is drawn several times, the models of the first draw are kept.
 
     Raises:
         ValueError: the method does not serve these data.
@@ -196,6 +136,8 @@ def fill(prepared: Prepared) -> Filled:
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
+        if prepared.problem.draw:  # queries are timed with models of the first draw
+            return
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(folder / f"fold{number}.ckpt", method, yaml, extra)
 
@@ -213,6 +155,8 @@ def fill(prepared: Prepared) -> Filled:
         "model/num_gaussians": found.methods[0].size(),
         "model/effects": found.methods[0].effects,
         "model/notes": "; ".join(found.notes),
+        "problem/drawn": prepared.problem.draw is not None,
+        "problem/stations": prepared.problem.stations,
         "seed": prepared.cell.seed,
         "budget_s": prepared.cell.budget_s,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),

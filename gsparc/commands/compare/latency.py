@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from gsparc.commands.compare.fitting import Filled, Problem
+from gsparc.commands.compare.fitting import Filled
+from gsparc.commands.compare.problem import Problem
 from gsparc.commands.study.run import queries
 from gsparc.methods import checkpoint
 from gsparc.methods.method import Method

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from typing import Any
 
 import numpy as np
 
+from gsparc.commands.compare.cells import Cell
 from gsparc.commands.compare.fitting import Filled
 from gsparc.commands.compare.latency import Latency
 from gsparc.data.schema import Kind
@@ -17,7 +18,7 @@ from gsparc.evaluation.summary import BUSY, shown
 
 SECOND: dict[Kind, str] = {"spectrum": "ssim", "csi": "snr_db", "rssi": "mae_db"}
 SCORE = {"psnr_db": "PSNR dB", "nmse": "-10 log10 NMSE, dB", "rmse_db": "-RMSE dB"}
-SIMPLE = ("zero", "mean", "nearest", "idw", "gp", "kriging", "complex_gp")
+SIMPLE = ("zero", "mean", "distance_law", "nearest", "idw", "gp", "kriging", "complex_gp")
 CLOSE_DB = 0.5
 
 
@@ -30,9 +31,16 @@ class Row:
         budget_s: [s]; None for a method without one, which stands in the tables of all budgets.
         method: name.
         score_db: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE.
-        spread_db: standard deviation over seeds [dB]; None for a single one.
+        spread_db: standard deviation over seeds [dB]; of draws of the split, standard error of the mean; None
+            for a single one.
         seeds: how many.
+        draws: whether these are draws of the split.
         figure, value: the figure behind the score, mean over seeds.
+        value_error: standard error of `value` over draws.
+        behind_db: how much the problem's best has more, mean of the same draws [dB]; None unless drawn.
+        behind_error_db: standard error of that [dB].
+        coverage: share of measured powers within the predicted 90 % interval; None without variances.
+        after_constant: RMSE of powers after a constant of each station [dB]; where stations are held out.
         second, second_value: another figure for the reader.
         train_s, train_cpu_s: seconds of training per model, on the clock and of processor [s].
         query_ms: one query, median [ms]; None when not timed.
@@ -49,8 +57,14 @@ class Row:
     score_db: float
     spread_db: float | None
     seeds: int
+    draws: bool
     figure: str
     value: float
+    value_error: float | None
+    behind_db: float | None
+    behind_error_db: float | None
+    coverage: float | None
+    after_constant: float | None
     second: str
     second_value: float | None
     train_s: float
@@ -69,7 +83,7 @@ def score_db(kind: Kind, facts: Mapping[str, Any]) -> float:
 
 
 def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -> list[Row]:
-    """Average the scored cells over seeds.
+    """Average the scored cells over seeds, or over the draws of a split.
 
     `timed` holds latencies by dataset and method, of the dataset's first split and shown there alone: models
     of fewer measurements answer faster.
@@ -79,16 +93,47 @@ def rows(filled: Sequence[Filled], timed: Mapping[str, Mapping[str, Latency]]) -
         groups.setdefault((cell.dataset, cell.split, cell.budget_s or 0.0, cell.method), []).append(one)
     problems = list(dict.fromkeys((dataset, split) for dataset, split, *_ in groups))
     first = dict(reversed(problems))
+    best = {problem: _best([g for key, g in groups.items() if key[:2] == problem]) for problem in problems}
     return [
-        _row(groups[key], timed.get(key[0], {}).get(key[3]) if key[1] == first[key[0]] else None)
+        _row(
+            groups[key], timed.get(key[0], {}).get(key[3]) if key[1] == first[key[0]] else None, best[key[:2]]
+        )
         for key in sorted(groups, key=lambda key: (problems.index(key[:2]), *key))
     ]
 
 
-def _row(same: list[Filled], latency: Latency | None) -> Row:
+def scores_by_seed(same: Sequence[Filled]) -> dict[int | None, float]:
+    """The score [dB] of each seed or draw."""
+    return {one.cell.seed: score_db(one.facts["dataset/kind"], one.facts) for one in same}
+
+
+def _best(groups: Sequence[list[Filled]]) -> dict[int | None, float]:
+    """The scores of the best of a problem's methods that have as many draws as any."""
+    found = [scores_by_seed(same) for same in groups]
+    most = max(map(len, found))
+    return max((s for s in found if len(s) == most), key=lambda s: float(np.mean(list(s.values()))))
+
+
+def _mean_and_error(values: Sequence[float]) -> tuple[float, float | None]:
+    """Mean, and its standard error where there are two at least."""
+    error = float(np.std(values, ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None
+    return float(np.mean(values)), error
+
+
+def _row(same: list[Filled], latency: Latency | None, best: Mapping[int | None, float]) -> Row:
     cell, facts = same[0].cell, [one.facts for one in same]
     kind: Kind = facts[0]["dataset/kind"]
-    scores = [score_db(kind, f) for f in facts]
+    by_seed = scores_by_seed(same)
+    scores = list(by_seed.values())
+    drawn = any(one.drawn for one in same)
+    behind, behind_error = None, None
+    paired = [best[seed] - score for seed, score in by_seed.items() if seed in best]
+    if drawn and paired:
+        behind, behind_error = _mean_and_error(paired)
+    value, value_error = _mean_and_error([float(f[f"test/{DECIDING[kind]}"]) for f in facts])
+    spread = None
+    if len(scores) > 1:
+        spread = _mean_and_error(scores)[1] if drawn else float(np.std(scores, ddof=1))
 
     def mean(name: str) -> float | None:
         values = [f[name] for f in facts if f.get(name) is not None]
@@ -97,14 +142,52 @@ def _row(same: list[Filled], latency: Latency | None) -> Row:
     return Row(
         cell.dataset, cell.split, cell.budget_s, cell.method,
         score_db=float(np.mean(scores)),
-        spread_db=float(np.std(scores, ddof=1)) if len(scores) > 1 else None,
-        seeds=len(same),
-        figure=DECIDING[kind], value=mean(f"test/{DECIDING[kind]}") or 0.0,
+        spread_db=spread,
+        seeds=len(same), draws=drawn,
+        figure=DECIDING[kind], value=value, value_error=value_error if drawn else None,
+        behind_db=behind, behind_error_db=behind_error,
+        coverage=mean("test/interval/coverage_90"), after_constant=mean("test/rmse_db_after_constant"),
         second=SECOND[kind], second_value=mean(f"test/{SECOND[kind]}"),
         train_s=mean("time/train_s") or 0.0, train_cpu_s=mean("time/train_cpu_s") or 0.0,
         query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
         to_copy=latency.to_copy if latency else None, load=mean("machine/load"),
         earlier=" ".join(sorted({one.earlier for one in same if one.earlier})),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Result:
+    """One scored cell, so that anyone can pair what they like.
+
+    Attributes:
+        dataset, split, method, budget_s, seed: of the cell.
+        figure, value: the deciding figure.
+        train_s, train_cpu_s: of one model [s].
+        load: 1-minute load per core at the end of the training.
+    """
+
+    dataset: str
+    split: str
+    method: str
+    budget_s: float | None
+    seed: int | None
+    figure: str
+    value: float
+    train_s: float
+    train_cpu_s: float
+    load: float | None
+
+
+def results(filled: Sequence[Filled]) -> list[Result]:
+    """Of every scored cell."""
+    return [_result(one.cell, one.facts) for one in filled if one.scored()]
+
+
+def _result(cell: Cell, facts: Mapping[str, Any]) -> Result:
+    figure = DECIDING[facts["dataset/kind"]]
+    return Result(
+        **asdict(cell), figure=figure, value=facts[f"test/{figure}"], train_s=facts["time/train_s"],
+        train_cpu_s=facts["time/train_cpu_s"], load=facts.get("machine/load"),
     )  # fmt: skip
 
 
@@ -121,7 +204,9 @@ class Block:
     def title(self) -> str:
         """Names and budget."""
         budget = "" if self.budget_s is None else f", {self.budget_s:g} s of training per model"
-        return f"{self.dataset}, split {self.split}{budget}"
+        draws = max(row.seeds for row in self.rows) if any(row.draws for row in self.rows) else 0
+        drawn = f", {draws} draws (± standard error of the mean)" if draws > 1 else ", one draw" * draws
+        return f"{self.dataset}, split {self.split}{budget}{drawn}"
 
 
 def blocks(found: Sequence[Row]) -> list[Block]:
@@ -140,7 +225,7 @@ def remarks(block: Block, ours: str) -> list[str]:
     """What the table shows about simple baselines and about our own default, favourable or not."""
     first = block.rows[0]
     found = [f"first: {first.method}, {first.score_db:.2f} dB after {first.train_s:.3g} s of training"]
-    if first.method in SIMPLE:
+    if first.method in SIMPLE and any(row.method not in SIMPLE for row in block.rows):
         found.append(f"a simple baseline wins: take {first.method} for this data and split")
     own = next((r for r in block.rows if r.method == ours), None)
     if own is not None and own is not first:
@@ -184,17 +269,42 @@ def markdown(
 
 
 def _page(block: Block, ours: str) -> str:
-    some = block.rows[0]
-    plain = some.figure == "psnr_db"  # is its own score
-    head = ["method", SCORE[some.figure], *([] if plain else [some.figure]), some.second, "seeds",
-            "train s", "cpu s", "query ms p50", "p95", "x copy"]  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
+    columns = _columns(block)
+    lines = ["| " + " | ".join(columns) + " |", "|---" + "|---:" * (len(columns) - 1) + "|"]
     for row in block.rows:
-        near = "" if row.spread_db is None else f" ± {row.spread_db:.2f}"
-        raw = [] if plain else [f"{row.value:.4g}"]
-        cells = [row.method, f"{row.score_db:.2f}{near}", *raw, shown(row.second_value, ".4g"),
-                 str(row.seeds), f"{row.train_s:.3g}", f"{row.train_cpu_s:.3g}", shown(row.query_ms, ".3g"),
-                 shown(row.query_p95_ms, ".3g"), shown(row.to_copy, ".2g")]  # fmt: skip
+        cells = [write(row) for write in columns.values()]
         bold = row.method == ours
         lines.append("| " + " | ".join(f"**{c}**" if bold else c for c in cells) + " |")
     return "\n".join([f"### {block.title}", "", *lines, "", *(f"- {r}" for r in remarks(block, ours))])
+
+
+def _columns(block: Block) -> dict[str, Callable[[Row], str]]:
+    """Head of each column, and how a row fills it; columns that no row fills are left out."""
+    some, drawn = block.rows[0], any(row.draws for row in block.rows)
+    plain = some.figure == "psnr_db"  # is its own score
+
+    def near(value: float | None, error: float | None, form: str) -> str:
+        return shown(value, form) + ("" if error is None else f" ± {error:{form}}")
+
+    found: dict[str, Callable[[Row], str]] = {
+        "method": lambda r: r.method,
+        SCORE[some.figure]: lambda r: near(r.score_db, r.spread_db, ".2f"),
+    }
+    if drawn:
+        found["behind the best, dB"] = lambda r: near(r.behind_db, r.behind_error_db, ".2f")
+    if not plain and not (drawn and some.figure == "rmse_db"):  # that is the score but for its sign
+        found[some.figure] = lambda r: near(r.value, r.value_error, ".3g" if drawn else ".4g")
+    found[some.second] = lambda r: shown(r.second_value, ".4g")
+    if any(row.after_constant is not None for row in block.rows):
+        found["after a constant, dB"] = lambda r: shown(r.after_constant, ".2f")
+    if any(row.coverage is not None for row in block.rows):
+        found["in 90 % interval"] = lambda r: shown(r.coverage, ".2f")
+    if not drawn:
+        found["seeds"] = lambda r: str(r.seeds)
+    return found | {
+        "train s": lambda r: f"{r.train_s:.3g}",
+        "cpu s": lambda r: f"{r.train_cpu_s:.3g}",
+        "query ms p50": lambda r: shown(r.query_ms, ".3g"),
+        "p95": lambda r: shown(r.query_p95_ms, ".3g"),
+        "x copy": lambda r: shown(r.to_copy, ".2g"),
+    }

@@ -10,8 +10,10 @@ import numpy as np
 
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import score
 from gsparc.methods.method import FitContext, FitReport, Method
+from gsparc.methods.per_station import for_links
 from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.methods.timing import ClockSettings, cycling, interleaved
 
@@ -43,7 +45,7 @@ class Outcome:
     def scored_on(self, data: Measurements, split: Split, eval_on: str = "test") -> Outcome:
         """The same fits scored on other data, such as displaced queries."""
         started = time.perf_counter()
-        figures = score(self.methods, data, split, eval_on).figures()
+        figures = pooled(score(self.methods, data, split, eval_on), data, split)
         return replace(self, figures=figures, score_s=time.perf_counter() - started)
 
 
@@ -80,7 +82,7 @@ def fit_and_score(
     limited: Clock | None = None
     for number, fold in enumerate(split.folds):
         there, rows = (data, fold) if learned is None else learned(data, fold)
-        method, settings = make(), context(number)
+        method, settings = for_links(make, there), context(number)
         before = time.process_time()
         report = method.fit(there, rows, settings)
         processor.append(time.process_time() - before)

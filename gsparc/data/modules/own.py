@@ -3,31 +3,50 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsparc.data.datamodule import DataModule
-from gsparc.data.describe import suspicious_values
-from gsparc.data.own import load_own
-from gsparc.data.schema import Measurements
+from gsparc.data.campaigns import campaign_of
+from gsparc.data.describe import raw_of
+from gsparc.data.errors import DataError
+from gsparc.data.modules.campaign import Campaign
+from gsparc.data.raw import Raw
 
 log = logging.getLogger(__name__)
 
 
-class Own(DataModule):
-    """A file of the schema in docs/own-data.md; doubtful units are warned of.
+class Own(Campaign):
+    """A file of the schema in docs/own-data.md, or a table; doubtful units are warned of.
 
     Args:
-        file: *.npz, *.h5 or *.hdf5.
-        name, batch_size: see `DataModule`.
+        file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
+        columns: of a table, by quantity, where the guess from their heads will not do.
+        stations_file: of a table, a second one that lists the stations.
+        name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
     """
 
-    def __init__(self, file: str | Path, name: str = "own", batch_size: int = 16) -> None:
-        super().__init__(name, batch_size)
-        self.file = Path(file)
+    def __init__(
+        self,
+        file: str | Path,
+        name: str = "own",
+        batch_size: int = 16,
+        stations: Sequence[str | int] | None = None,
+        runs: Sequence[str | int] | None = None,
+        min_rssi_db: float | None = None,
+        max_rows: int | None = None,
+        level_steps: Mapping[str, Sequence[int]] | None = None,
+        columns: Mapping[str, object] | None = None,
+        stations_file: str | Path | None = None,
+    ) -> None:
+        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
+        self.columns, self.stations_file = columns or {}, stations_file
 
-    def load(self) -> Measurements:
-        """Spectra, channels or powers, as the file says."""
-        data = load_own(self.file)
-        for doubt in suspicious_values(data):
-            log.warning("%s: units? %s", self.file, doubt)
-        return data
+    def raw(self) -> Raw:
+        """The file's arrays, or the table's under the schema's names."""
+        raw, notes = raw_of(self.file, self.columns, self.stations_file)
+        campaign = campaign_of(raw)
+        if campaign is not None:
+            raise DataError(f"{self.file}: this is a file of dataset={campaign}; say dataset={campaign}")
+        for note in notes:
+            log.info("%s: %s", self.file, note)
+        return raw

@@ -10,6 +10,7 @@ from omegaconf import OmegaConf
 
 import gsparc.peers
 from gsparc.commands.compare.cells import Budget, Contender, code_version, contenders, key, plan
+from gsparc.commands.compare.problem import Problem, split_choices
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),
@@ -20,8 +21,12 @@ METHODS = {
 BUDGETS = [Budget(60.0, (0, 1)), Budget(300.0, (0,))]
 
 
+def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> Problem:
+    return Problem(dataset, split, kind, ("", ""), **others)
+
+
 def names(*only: str, kind: str = "spectrum") -> list[str]:
-    return [str(c) for c in plan([("rfid", "random", kind)], METHODS, BUDGETS, only)]
+    return [str(cell) for _, cell in plan([problem("rfid", kind=kind)], METHODS, BUDGETS, only)]
 
 
 def test_a_whole_table_comes_before_further_seeds_and_budgets():
@@ -33,14 +38,30 @@ def test_a_whole_table_comes_before_further_seeds_and_budgets():
 
 
 def test_every_room_has_its_first_table_before_any_has_a_second():
-    rooms = [("a", "random", "spectrum"), ("b", "random", "spectrum"), ("a", "grouped", "spectrum")]
+    rooms = [problem("a"), problem("b"), problem("a", "grouped")]
     budgets = [Budget(60, (0, 1), ("random",)), Budget(12, (0,), ("grouped",))]
-    found = [str(c) for c in plan(rooms, METHODS, budgets)]
+    found = [str(cell) for _, cell in plan(rooms, METHODS, budgets)]
     assert found == [
         "a/random/gp/any/any", "b/random/gp/any/any", "a/grouped/gp/any/any",
         "a/random/fast/60/0", "a/random/slow/60/0", "b/random/fast/60/0", "b/random/slow/60/0",
         "a/grouped/fast/12/0", "a/random/fast/60/1", "b/random/fast/60/1",
     ]  # fmt: skip
+
+
+def test_a_draw_of_a_split_is_the_seed_of_every_method():
+    draws = [problem("a", "blocks", draw=n) for n in range(2)]
+    found = [(p.draw, str(cell)) for p, cell in plan(draws, METHODS, [Budget(60, (5, 6))])]
+    assert found == [
+        (0, "a/blocks/gp/any/0"), (1, "a/blocks/gp/any/1"),
+        (0, "a/blocks/fast/60/0"), (0, "a/blocks/slow/60/0"),
+        (1, "a/blocks/fast/60/1"), (1, "a/blocks/slow/60/1"),
+    ]  # fmt: skip
+
+
+def test_all_stations_together_are_learned_where_there_are_several():
+    methods = {"one": Contender("one", ("model=gp",), stations=True)}
+    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", stations=True)], methods, [])]
+    assert found == ["b"]
 
 
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
@@ -51,15 +72,18 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
 
 def test_budgets_leave_room_for_what_they_do_not_count():
     contender = Contender("x", ("model=gsparc",), ("model.b={budget_s}",), reserve_s=10)
-    assert contender.overrides(60, 2) == ["model=gsparc", "model.b=50", "seed=2"]
-    assert contender.overrides(None, None) == ["model=gsparc", "seed=0"]
+    assert contender.overrides(60) == ["model=gsparc", "model.b=50"]
+    assert contender.overrides(None) == ["model=gsparc"]
 
 
 def test_every_method_of_the_default_comparison_composes():
     config = OmegaConf.to_container(compose(config="compare"), resolve=True)
     for contender in contenders(config["methods"]).values():
-        assert compose(*contender.overrides(60, 0)).model
+        assert compose(*contender.overrides(60)).model
     assert config["ours"] in config["methods"]
+    for split in split_choices(config["splits"]).values():
+        assert set(split.datasets) <= set(config["datasets"])
+        assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
     with pytest.raises(ValueError, match=r"methods\.x: .*chose"):
         contenders({"x": {"chose": ["model=gp"]}})
 

@@ -13,7 +13,8 @@ from hydra import initialize_config_module
 
 from gsparc.commands.compare.cells import Cell, Contender
 from gsparc.commands.compare.command import _may_match, _timed
-from gsparc.commands.compare.fitting import Filled, Prepared, Problem, prepare, stored_problems
+from gsparc.commands.compare.fitting import Filled, Prepared, prepare
+from gsparc.commands.compare.problem import Problem, SplitChoice, split_choices, stored_problems
 
 ROOT = Path(__file__).parents[3]
 
@@ -21,7 +22,7 @@ ROOT = Path(__file__).parents[3]
 def compare(tmp_path, *more: str) -> subprocess.CompletedProcess:
     command = [
         sys.executable, "-m", "gsparc", "compare", f"+datasets.own.file={tmp_path / 'own.npz'}",
-        "splits=[random]", "budgets=[{seconds: 0.3, seeds: [0]}]", f"cells={tmp_path / 'cells'}",
+        "splits.random.datasets=[own]", "budgets=[{seconds: 0.3, seeds: [0]}]", f"cells={tmp_path / 'cells'}",
         f"hydra.run.dir={tmp_path / 'run'}", *more,
     ]  # fmt: skip
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
@@ -59,9 +60,23 @@ def test_results_of_an_earlier_program_are_found_for_the_same_data_only(tmp_path
     assert found.earlier == "abcdefgh" and found.folder.name == "toy-random-gp-newer"
     write("toy-random-gp-today")
     assert prepared.found().earlier is None
-    assert stored_problems(tmp_path, "toy", ["random", "sparse"]) == [problem] and not stored_problems(
-        tmp_path, "t", ["random"]
-    )
+    random, sparse = SplitChoice("random"), SplitChoice("sparse")
+    assert stored_problems(tmp_path, "toy", [random, sparse]) == [problem]
+    assert not stored_problems(tmp_path, "t", [random])
+
+
+def test_kept_results_of_draws_are_a_problem_each(tmp_path):
+    for draw, folds in enumerate(("s0", "s1")):
+        facts = {"seed": draw, "dataset/kind": "rssi", "dataset/sha256": "d", "split/sha256": folds}
+        (tmp_path / f"toy-drawn-gp-{draw}").mkdir()
+        (tmp_path / f"toy-drawn-gp-{draw}" / "cell.json").write_text(json.dumps(facts))
+    found = stored_problems(tmp_path, "toy", [SplitChoice("drawn", draws=3)])
+    assert [(p.draw, p.hashes[1]) for p in found] == [(0, "s0"), (1, "s1")]
+
+
+def test_an_unknown_setting_of_a_split_is_named():
+    with pytest.raises(ValueError, match=r"splits\.far: unknown 'draw'"):
+        split_choices({"far": {"draw": 3}})
 
 
 @pytest.mark.parametrize("model", ["gsparc", "moving_array"])
@@ -93,7 +108,7 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     assert "3 cells, 3 of them are there" in again.stdout
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
     absent = compare(tmp_path, only, "datasets.own.file=null", "train=false")
-    assert absent.returncode == 0 and "as far as results were kept" in absent.stdout + absent.stderr
+    assert absent.returncode == 0 and "here as far as results were kept" in absent.stdout + absent.stderr
     assert "3 cells, 3 of them are there" in absent.stdout
     # A cell whose result is not whole does not count.
     (cell,) = (tmp_path / "cells").glob("own-random-mean-*/cell.json")

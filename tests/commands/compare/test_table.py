@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import pytest
 
+from gsparc.commands.compare import draws_figure
 from gsparc.commands.compare.cells import Cell
 from gsparc.commands.compare.figure import draw
 from gsparc.commands.compare.fitting import EARLIER, Filled
 from gsparc.commands.compare.latency import Latency
-from gsparc.commands.compare.table import blocks, markdown, remarks, rows, score_db
+from gsparc.commands.compare.overview import overview
+from gsparc.commands.compare.table import blocks, markdown, remarks, results, rows, score_db
 
 
 def filled(method, psnr, seed=None, budget=None, split="random", load=0.1):
@@ -40,6 +42,56 @@ def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
     gsparc = found[0].rows[1]
     assert gsparc.score_db == 29.5 and gsparc.spread_db == pytest.approx(0.7071, abs=1e-4)
     assert gsparc.seeds == 2 and gsparc.query_ms == 0.5 and found[0].rows[2].query_ms is None
+
+
+def test_draws_are_paired_with_the_best_and_have_standard_errors():
+    """The spread over draws is of the rows: what two methods differ by on the same rows is known better."""
+    facts = {
+        "dataset/kind": "rssi", "test/mae_db": 1.0, "problem/drawn": True, "time/train_s": 1.0,
+        "time/train_cpu_s": 1.0, "test/interval/coverage_90": 0.8,
+    }  # fmt: skip
+    found = [
+        Filled(Cell("city", "drawn", method, None, seed), None, {**facts, "test/rmse_db": error})
+        for seed, level in enumerate((5.0, 7.0, 9.0))
+        for method, error in (("gp", level), ("idw", level + 1.0 + 0.1 * seed))
+    ]
+    (block,) = blocks(rows(found, {}))
+    gp, idw = block.rows
+    assert (gp.method, gp.behind_db, idw.behind_db) == ("gp", 0.0, pytest.approx(1.1))
+    assert idw.behind_error_db == pytest.approx(0.1 / 3**0.5) and gp.spread_db == pytest.approx(2 / 3**0.5)
+    page = markdown([block], "gsparc")
+    assert (
+        "3 draws (± standard error of the mean)" in page and "| 1.10 ± 0.06 |" in page and "| 0.80 |" in page
+    )
+    assert "simple baseline wins" not in page, "there are no others"
+    lines = overview([gp, idw]).splitlines()
+    assert lines[0] == "### city: RMSE, dB, 3 draws of each split"
+    assert lines[-2:] == [
+        "| gp | **7.00 ± 1.15** | 1 | - |",
+        "| idw | 8.10 ± 1.21 (1.10 ± 0.06 dB) | 1 | - |",
+    ]
+    assert [(r.seed, r.value) for r in results(found)][:2] == [(0, 5.0), (0, 6.0)]
+
+
+def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path):
+    facts = {"dataset/kind": "rssi", "test/rmse_db": 5.0, "problem/drawn": True, "time/train_s": 1.0,
+             "time/train_cpu_s": 1.0}  # fmt: skip
+    there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
+    found = rows([Filled(Cell("city", s, m, None, 0), None, facts) for s, m in there], {})
+    said = []
+    original = draws_figure.panels
+
+    def watched(*size, **how):
+        figure, axes = original(*size, **how)
+        said.append(axes)
+        return figure, axes
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(draws_figure, "panels", watched)
+        draws_figure.draw(found, tmp_path / "city.png")
+    texts = [[text.get_text() for text in axis.texts] for axis in said[0][0]]
+    assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
+    assert (tmp_path / "city.png").stat().st_size > 5_000
 
 
 def test_losers_are_not_hidden():

@@ -1,0 +1,1 @@
+"""`gsparc predict ckpt=FILE places=FILE`: see `command.py`."""

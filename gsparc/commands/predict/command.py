@@ -1,0 +1,126 @@
+"""`gsparc predict ckpt=FILE places=FILE`: predictions at places in degrees or metres, as a table."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from gsparc.commands.output import run_directory, show
+from gsparc.commands.predict.answers import Answers, answers
+from gsparc.commands.predict.files import check_fits, decibels, target, write
+from gsparc.commands.predict.placing import far_outside, in_world, stations_of, with_heights
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.asked import Asked, read_asked
+from gsparc.data.schema import End, Site
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.methods.predictor import Predictor, load
+
+log = logging.getLogger(__name__)
+
+
+def predict(
+    predictor: Predictor,
+    places: str | Path,
+    out: str | Path | None = None,
+    *,
+    station: str | None = None,
+    columns: dict[str, object] | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Predict at the places of a file and write the answers; what was guessed is logged.
+
+    Args:
+        predictor: of the model.
+        places: see `read_asked`.
+        out: *.csv or *.npz; None: beside the places.
+        station: name or number of the only one to predict.
+        columns: of a table of places, by quantity, where a guess will not do.
+        overwrite: whether a file that is there may be replaced.
+
+    Returns:
+        Facts for `summary.json`.
+
+    Raises:
+        DataError: anything that is wrong with the places, the station or the file to write.
+    """
+    site, places = predictor.site, Path(places)
+    path = target(None if out is None else str(out), places, overwrite)
+    moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
+    asked = with_heights(read_asked(places, moving, columns or {}), site)
+    for note in _notes(asked, site):
+        log.info("%s: %s", places, note)
+    world = in_world(asked, site)
+    pairs = stations_of(asked, site, station)
+    named = station is not None or asked.station is not None
+    far, margin = far_outside(world, site)
+    found, left_out = answers(
+        predictor, asked, world, pairs, named, lambda shape: check_fits(path, site.kind, shape)
+    )
+    for line in left_out:
+        log.warning(line)
+    if far.any():
+        log.warning(
+            "%s: %d of %d places lie more than %.3g m outside the box of the training places, the first in "
+            "%s: expect little of the predictions there",
+            places, int(far.sum()), len(far), margin, asked.rows[int(np.argmax(far))],
+        )  # fmt: skip
+    write(path, asked, found, site.kind)
+    return {
+        "predict/places": len(asked),
+        "predict/predictions": len(found),
+        "predict/far_outside": int(far.sum()),
+        "predict/stations": 0 if found.station is None else len(np.unique(found.station)),
+        "dataset/name": site.name,
+        "dataset/kind": site.kind,
+        "model/name": predictor.method.name,
+        "places": str(places),
+        "out": str(path),
+        **_range(found, site),
+    }
+
+
+def _notes(asked: Asked, site: Site) -> list[str]:
+    notes, origin = list(asked.notes), site.georeference
+    if origin is not None and not any(where.degrees for where in asked.ends.values()):
+        notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
+    if asked.station is not None and site.stations is None:
+        notes.append("not used: stations; the model has none")
+    return notes
+
+
+def _range(found: Answers, site: Site) -> dict[str, float]:
+    """Lowest and highest level [dB] of powers."""
+    level = decibels(found)[0] if site.kind == "rssi" else np.zeros(0)
+    level = level[np.isfinite(level)]
+    return (
+        {"predict/lowest_db": float(level.min()), "predict/highest_db": float(level.max())}
+        if len(level)
+        else {}
+    )
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
+    RunSettings.of(config)
+    run_dir = run_directory()
+    facts = predict(
+        load(config.ckpt, confidence=config.confidence),
+        config.places,
+        config.out,
+        station=None if config.station is None else str(config.station),
+        columns=plain(config.columns),
+        overwrite=bool(config.overwrite),
+    )
+    write_summary(run_dir / "summary.json", {**facts, **provenance(), "ckpt": str(config.ckpt)})
+    stations = facts["predict/stations"]
+    said = f"{facts['predict/places']} places" + (
+        f", {stations} station{'s' * (stations > 1)}" if stations else ""
+    )
+    if "predict/lowest_db" in facts:
+        said += f": {facts['predict/lowest_db']:.1f} to {facts['predict/highest_db']:.1f} dB"
+    show(run_dir, before=f"{said}; predictions in {facts['out']}; summary ")
+    return facts

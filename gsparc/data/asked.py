@@ -1,0 +1,211 @@
+"""Places that a model is asked about, from a table or from arrays: nothing measured is needed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.data.errors import DataError, Problems
+from gsparc.data.georeference import bad_degrees
+from gsparc.data.raw import Raw, read_raw
+from gsparc.data.schema import End
+from gsparc.data.tables import is_table
+from gsparc.data.tables.columns import Chosen, choose
+from gsparc.data.tables.heads import AXES
+from gsparc.data.tables.places import Places, places
+from gsparc.data.tables.read import NOTHING, sheet_of
+from gsparc.data.tables.sheet import Sheet
+
+WORDS: dict[End, str] = {"rx": "receiver", "tx": "transmitter"}
+GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "station")
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Places in the order of their file.
+
+    Attributes:
+        source: the file, for messages.
+        ends: places (n,) of each end that moves, as they were given.
+        rows: (n,) what messages call each.
+        station: (n,) names or numbers; None where the file names none.
+        name: (n,) what a user calls each, where a column says so; else None.
+        notes: what was guessed or not used, one line each.
+    """
+
+    source: str
+    ends: dict[End, Places]
+    rows: tuple[str, ...]
+    station: np.ndarray | None = None
+    name: np.ndarray | None = None
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+
+def read_asked(path: str | Path, moving: Sequence[End], columns: Mapping[str, object] = NOTHING) -> Asked:
+    """Read places of the ends that move.
+
+    Args:
+        path: a table (*.csv, *.tsv, *.txt, *.parquet), or *.npz or HDF5 with `latitude` and `longitude`,
+            `rx_position` or `tx_position`, a height, and `station`.
+        moving: one end, or both.
+        columns: of a table, by quantity, where the guess from their heads will not do.
+
+    Raises:
+        DataError: no file, no places, or a place that is none; the first problem, with row and column.
+    """
+    try:
+        if is_table(path):
+            return _of_table(path, moving, columns)
+        told = [name for name, value in columns.items() if value is not None]
+        if told:
+            raise DataError(f"columns.{told[0]}: goes with tables (*.csv, *.parquet), not with {path}")
+        return _of_arrays(read_raw(path), str(path), moving)
+    except DataError as error:
+        # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
+        first = error.problems[0].replace("dataset.columns", "columns")
+        more = len(error.problems) - 1
+        raise DataError(first + (f" (and {more} more)" if more else "")) from None
+
+
+def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, object]) -> Asked:
+    sheet, notes = sheet_of(path)
+    problems = Problems(path)
+    chosen, guessed = choose(sheet, columns, problems, only=GUESSED)
+    problems.raise_if_any()
+    given = {end: places(sheet, chosen, end, problems) for end in ("", "rx_", "tx_")}
+    problems.raise_if_any()
+    found = {end: where for end, where in given.items() if where is not None}
+    ends: dict[End, Places] = {}
+    for end in moving:
+        named = f"{end}_" if f"{end}_" in found else ""
+        if named not in found or (len(moving) > 1 and not named and "" in ends):
+            raise DataError(_missing(sheet, end, len(moving) > 1))
+        ends[end] = found.pop(named)
+    other = [f"of the {WORDS[end]}" for end in WORDS if f"{end}_" in found] + ["without a name"] * (
+        "" in found
+    )
+    if other:
+        guessed.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
+    station = _words(sheet, chosen, "station", problems)
+    problems.raise_if_any()
+    name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
+    return _checked(Asked(str(path), ends, sheet.rows, station, name, (*notes, *guessed)))
+
+
+def _missing(sheet: Sheet, end: End, both: bool) -> str:
+    heads = ", ".join(repr(head) for head in sheet.heads[:8] if head)
+    axes = (
+        f"columns.{end}_x=COLUMN and .{end}_y"
+        if both
+        else "columns.latitude=COLUMN and .longitude, or .x and .y"
+    )
+    return f"{sheet.source}: no coordinates of the {WORDS[end]} among {heads}; say {axes}"
+
+
+def _words(sheet: Sheet, chosen: Chosen, role: str, problems: Problems) -> np.ndarray | None:
+    if role not in chosen:
+        return None
+    head = chosen[role][0].head or ""
+    words = sheet.words(head)
+    rows = (sheet.rows[i] for i in np.flatnonzero(words == ""))
+    problems.add_rows(sheet.where(head), rows, f"no {role}; expected its name")
+    return words
+
+
+def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> Asked:
+    ends: dict[End, Places] = {}
+    for end in moving:
+        alone = len(moving) == 1
+        position = [n for n in (f"{end}_position", *(("position",) if alone else ())) if n in raw.arrays]
+        pair = [n for n in ("latitude", "longitude") if n in raw.arrays and alone]
+        if position and pair:
+            raise DataError(f"{source}: {position[0]} and {pair[0]} both say where; leave one out")
+        if len(pair) == 1 or not (position or pair):
+            wanted = "latitude and longitude, or " if alone else ""
+            raise DataError(f"{source}: no places of the {WORDS[end]}; expected {wanted}{end}_position")
+        if pair:
+            across = np.column_stack([_numbers(raw, source, name, 1) for name in _same(raw, source, pair)])
+        else:
+            across = _numbers(raw, source, position[0], 2)
+            if across.shape[1] not in (2, 3):
+                raise DataError(
+                    f"{source}, {position[0]}: expected shape (n, 3) or (n, 2), found {across.shape}"
+                )
+        height = across[:, 2] if across.shape[1] == 3 else None
+        for name in (f"{end}_height", *(("height",) if alone else ())):
+            if name in raw.arrays and height is None:
+                height = _height(raw, source, name, len(across))
+        ends[end] = Places(across[:, :2], height, bool(pair))
+    count = {end: len(where.across) for end, where in ends.items()}
+    if len(set(count.values())) > 1:
+        raise DataError(f"{source}: {count['tx']} places of the transmitter, {count['rx']} of the receiver")
+    rows = tuple(f"row {i}" for i in range(next(iter(count.values()))))
+    if not rows:
+        raise DataError(f"{source}: no rows; expected a place or more")
+    return _checked(Asked(source, ends, rows, _stations(raw, source, len(rows))))
+
+
+def _same(raw: Raw, source: str, pair: Sequence[str]) -> Sequence[str]:
+    if raw.arrays[pair[0]].shape != raw.arrays[pair[1]].shape:
+        shapes = " and ".join(str(raw.arrays[name].shape) for name in pair)
+        raise DataError(f"{source}: latitude and longitude have shapes {shapes}; expected one shape")
+    return pair
+
+
+def _numbers(raw: Raw, source: str, name: str, axes: int) -> np.ndarray:
+    array = raw.arrays[name]
+    if array.dtype.kind not in "iuf":
+        raise DataError(f"{source}, {name}: expected real numbers, found dtype {array.dtype}")
+    if array.ndim == axes - 1:  # one place
+        array = array[None]
+    if array.ndim != axes:
+        raise DataError(f"{source}, {name}: expected {axes} axes, found shape {array.shape}")
+    return array.astype(np.float64)
+
+
+def _height(raw: Raw, source: str, name: str, count: int) -> np.ndarray:
+    height = _numbers(raw, source, name, 1)
+    if len(height) not in (1, count):
+        raise DataError(f"{source}, {name}: {len(height)} heights for {count} places")
+    return np.broadcast_to(height, (count,))
+
+
+def _stations(raw: Raw, source: str, count: int) -> np.ndarray | None:
+    station = raw.arrays.get("station")
+    if station is None:
+        return None
+    station = station.reshape(-1)
+    if len(station) != count or station.dtype.kind not in "iuUS":
+        fault = f"found {station.dtype} of shape {raw.arrays['station'].shape}"
+        raise DataError(f"{source}, station: expected {count} names or numbers, {fault}")
+    names = raw.arrays.get("station_name")
+    if station.dtype.kind in "iu" and names is not None:
+        wrong = np.flatnonzero((station < 0) | (station >= names.size))
+        if len(wrong):
+            fault = f"{station[wrong[0]]} is none of the {names.size} of station_name"
+            raise DataError(f"{source}, station, row {wrong[0]}: {fault}")
+        station = names.reshape(-1)[station]
+    return station.astype(str)
+
+
+def _checked(asked: Asked) -> Asked:
+    """Refuse places with a coordinate that is not finite, and degrees that are not on Earth."""
+    for end, where in asked.ends.items():
+        names = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
+        values = where.all()
+        wrong = np.argwhere(~np.isfinite(values))
+        if len(wrong):
+            row, axis = wrong[0]
+            fault = f"{names[axis]} of the {WORDS[end]} is {values[row, axis]}; expected a finite number"
+            raise DataError(f"{asked.source}, {asked.rows[row]}: {fault}")
+        if where.degrees and bad_degrees(*where.across.T) is not None:
+            faults = (bad_degrees(latitude, longitude) for latitude, longitude in where.across)
+            row, fault = next((i, fault) for i, fault in enumerate(faults) if fault is not None)
+            raise DataError(f"{asked.source}, {asked.rows[row]}: {fault}")
+    return asked

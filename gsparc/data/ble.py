@@ -1,0 +1,37 @@
+"""Received powers of a Bluetooth beacon at the sensors of a hall, as an npz.
+
+mobile_position (S, 3), station_position (T, 3) [m]; rssi_db (S, T) [dBm]; station (T,) names;
+frequency_hz () [Hz]
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gsparc.data.layout import TEXT, Expected, check_layout
+from gsparc.data.raw import Raw, read_raw, renamed
+
+LAYOUT = {
+    "mobile_position": Expected(("S", 3), place=True),
+    "station_position": Expected(("T", 3), place=True),
+    "rssi_db": Expected(("S", "T")),
+    "station": Expected(("T",), TEXT, optional=True),
+    "frequency_hz": Expected((), optional=True),
+}
+NAMES = {"mobile_position": "tx_position", "station": "station_name", "frequency_hz": "carrier_hz"}
+
+
+def raw_of_ble(path: str | Path) -> Raw:
+    """Read such a file; NaN is no value.
+
+    Returns:
+        `tx_position` (S, 3), `station_position` (T, 3) [m], `rssi_db` (S, T) [dBm], `station_name` (T,)
+        and `carrier_hz` () where the file has them.
+
+    Raises:
+        DataError: no such file, or an array is missing or wrong; all problems with array and row.
+    """
+    raw = read_raw(path)
+    check_layout(raw, path, LAYOUT)
+    known = Raw({name: raw.arrays[name] for name in LAYOUT if name in raw.arrays})
+    return Raw(renamed(known, NAMES).arrays, {**raw.attributes, "layout": "ble"})

@@ -1,0 +1,368 @@
+"""Doubts about readable measurements: units, columns, copies, outliers, stations that changed or fell silent.
+
+Pure functions of arrays; each returns lines for a person, none where there is no doubt. Rows are links: what
+one station measured at one place, in the order of measuring; levels are in dB or dBm, NaN for no value.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from gsparc.data.level_steps import MOST_BLOCKS, LevelStep, level_steps
+from gsparc.data.outliers import too_far
+
+NAMED = 5  # rows or stations in a line
+HIGHEST_DBM = 60.0  # a kilowatt received
+OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
+SPREADS = 10.0  # scaled median absolute deviations of that difference
+NEIGHBOURS = 5  # rows on each side
+LONG_GAP = 20  # rows without a value in one piece
+EDGE = 10  # rows beside it
+FEW = 0.005  # of a station's rows: fewer are no sign of a limit
+WEAK_DB = 6.0  # above the weakest value: heard only just
+TINY_DEGREES = 1.0  # a campaign's extent in degrees
+
+
+def doubts(
+    position: np.ndarray,
+    station: np.ndarray | None,
+    level_db: np.ndarray,
+    names: Sequence[str],
+    rows: Sequence[str],
+    station_position: np.ndarray | None = None,
+    steps: list[tuple[int, LevelStep]] | None = None,
+) -> list[str]:
+    """All doubts about levels at places.
+
+    Args:
+        position: (n, 2) or (n, 3) of the moving end [m].
+        station: (n,) which station each row is of; None where there is one only.
+        level_db: (n,) [dB], NaN where there is no value.
+        names: of the stations.
+        rows: what messages call each row.
+        station_position: (T, 2) or (T, 3) [m]; None where it is not known.
+        steps: `steps_of` them, where they are known already.
+    """
+    station = np.zeros(len(level_db), np.int64) if station is None else station
+    found = position_doubts(position, rows) + level_doubts(level_db)
+    found += direction_doubts(position, station, level_db, station_position)
+    found += copies(position, station, level_db, names, rows)
+    found += wild_rows(station, level_db, names, rows)
+    found += changed_levels(position, station, level_db, names, rows, station_position, steps)
+    return found + gaps(station, level_db, names, rows)
+
+
+def position_doubts(position: np.ndarray, rows: Sequence[str]) -> list[str]:
+    """Positions (n, 2) or (n, 3) that may be degrees or millimetres, do not differ, or lie far off."""
+    if not np.ptp(position, axis=0).any():
+        return ["all positions are the same, a box of 0 m: is it the moving end's column?"]
+    lost = too_far(position)
+    found = []
+    if lost.any():
+        which = _some(rows, np.flatnonzero(lost))
+        found.append(f"{which}: far outside the region of all others; a lost fix of the receiver?")
+    return found + _units(position[~lost])
+
+
+def _units(position: np.ndarray) -> list[str]:
+    extent = np.ptp(position, axis=0)
+    middle = np.abs(np.median(position[:, :2], axis=0))
+    across = float(extent[:2].max())
+    on_earth = (np.abs(position[:, :2]) <= 180).all() and (np.abs(position[:, :2]).max(axis=0) <= 90).any()
+    if on_earth and across < TINY_DEGREES and middle.min() > 5 * across and middle.max() > 10:
+        return [
+            f"positions near ({position[0, 0]:.6g}, {position[0, 1]:.6g}) within {across:.2g}: degrees? "
+            "then give them as latitude and longitude"
+        ]
+    if across > 1000 and (position % 1 == 0).all():
+        size = " x ".join(f"{e / 1000:.4g}" for e in extent)
+        return [
+            f"positions are whole numbers up to {across:.0f} apart: millimetres? the box is {size} m then"
+        ]
+    if position.shape[1] > 2 and extent[2] > 1000:
+        return [f"heights differ by {extent[2]:.4g} m: millimetres, or feet?"]
+    return []
+
+
+def degree_doubts(latitude: np.ndarray, longitude: np.ndarray, rows: Sequence[str]) -> list[str]:
+    """Latitudes and longitudes (n,) [deg] that may be swapped, or are no fix at all."""
+    beyond = np.flatnonzero(np.abs(latitude) > 90)
+    if len(beyond):
+        swapped = (np.abs(longitude) <= 90).all()
+        hint = "latitude and longitude are swapped?" if swapped else "expected -90 to 90"
+        return [f"{_some(rows, beyond)}: latitude {latitude[beyond[0]]:.6g} is beyond 90 degrees; {hint}"]
+    found = []
+    none = np.flatnonzero((latitude == 0) & (longitude == 0))
+    if len(none):
+        found.append(f"{_some(rows, none)}: latitude and longitude are 0: no fix; leave them out")
+    if np.median(latitude) < -60:
+        where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
+        found.append(f"the places lie in the Antarctic ({where}): latitude and longitude swapped?")
+    elif np.median(latitude) > 75:
+        found.append(f"the places lie in the Arctic (latitude {np.median(latitude):.6g}): swapped?")
+    return found
+
+
+def level_doubts(level_db: np.ndarray) -> list[str]:
+    """Levels (n,) [dB] that may be linear, percent or indices, or hold marks instead of values."""
+    values = level_db[np.isfinite(level_db)]
+    if len(values) < 2:
+        return []
+    if not np.ptp(values):
+        return [f"all levels are {values[0]:g} dB: is it the column of levels?"]
+    found = marks(values)
+    for mark, _ in _marks(values):
+        values = values[values != mark]
+    low, high = float(values.min()), float(values.max())
+    if low >= 0 and high <= 1:
+        found.append(f"all levels lie between {low:g} and {high:g}: linear power? then give it as rssi, in W")
+    elif high > HIGHEST_DBM and low >= 0:
+        found.append(
+            f"levels from {low:g} to {high:g} are all positive: losses, percent, or linear? expected dBm"
+        )
+    elif high > HIGHEST_DBM:
+        count = int((values > HIGHEST_DBM).sum())
+        found.append(f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: a kilowatt received?")
+    elif low >= 0 and (values % 1 == 0).all():
+        found.append(f"levels are whole numbers from {low:g} to {high:g}: an index or percent, not dBm?")
+    return found
+
+
+def marks(values: np.ndarray) -> list[str]:
+    """A value (n,) that many rows have and that lies apart from all others, or at the lower end."""
+    said = []
+    for mark, apart in _marks(values):
+        count = int((values == mark).sum())
+        share = f"{count} of {len(values)} levels are exactly {mark:g}"
+        if apart:
+            said.append(f"{share}, far from all others: a mark for 'not heard'? leave these cells empty")
+        else:
+            said.append(f"{share}, the least: not heard? leave them empty and give sensitivity_db={mark:g}")
+    return said
+
+
+def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
+    different, counts = np.unique(values, return_counts=True)
+    if len(different) < 4:
+        return []
+    found = []
+    for i, inner in ((0, 1), (len(different) - 1, len(different) - 2)):
+        distance = abs(different[i] - different[inner])
+        apart = distance > 20 and distance > 0.3 * abs(different[-2] - different[1]) and counts[i] >= 3
+        pile = i == 0 and counts[0] > max(0.05 * len(values), 5 * float(np.median(counts)), 10)
+        if apart or pile:
+            found.append((float(different[i]), bool(apart)))
+    return found
+
+
+def direction_doubts(
+    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
+) -> list[str]:
+    """Levels that rise with the distance from their station: losses, or stations in wrong places."""
+    if station_position is None:
+        return []
+    axes = min(position.shape[1], station_position.shape[1])
+    distance = np.linalg.norm(position[:, :axes] - station_position[station, :axes], axis=1)
+    slopes = []
+    for t in np.unique(station):
+        used = (station == t) & np.isfinite(level_db)
+        spread = np.log10(np.maximum(distance[used], 1e-3))
+        if used.sum() >= 20 and np.ptp(spread) > 0.3 and np.ptp(level_db[used]) > 0:
+            slopes.append(np.corrcoef(spread, level_db[used])[0, 1])
+    if slopes and np.median(slopes) > 0.3:
+        return [
+            f"levels rise with distance (correlation {np.median(slopes):.2f}): losses instead of levels, "
+            "or are the stations, or x and y, elsewhere?"
+        ]
+    return []
+
+
+def copies(
+    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: Sequence[str]
+) -> list[str]:
+    """Rows of one place and station: copies where the value is the same, repeated measurements where not."""
+    known = np.flatnonzero(np.isfinite(level_db))
+    if len(known) < 2:
+        return []
+    place = np.unique(position[known], axis=0, return_inverse=True)[1].reshape(-1)
+    link = np.unique(np.stack([place, station[known]], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    order = np.argsort(link, kind="stable")
+    groups = np.split(known[order], np.flatnonzero(np.diff(link[order])) + 1)
+    same: list[tuple[int, int]] = []
+    repeated, spreads = 0, []
+    for group in groups:
+        if len(group) < 2:
+            continue
+        values = level_db[group]
+        first: dict[float, int] = {}
+        for row, value in zip(group.tolist(), values.tolist(), strict=True):
+            if value in first:
+                same.append((first[value], row))
+            first.setdefault(value, row)
+        if len(first) > 1:
+            repeated += 1
+            spreads.append(float(np.std(list(first), ddof=1)))
+    found = []
+    if same:
+        pairs = [f"{rows[b]} of {rows[a]}" for a, b in same[:NAMED]]
+        more = f" and {len(same) - NAMED} more" if len(same) > NAMED else ""
+        found.append(f"copies (same place, station and level): {', '.join(pairs)}{more}; leave them out")
+    if repeated:
+        found.append(
+            f"{repeated} places were measured more than once by one station, with different levels "
+            f"(standard deviation {np.median(spreads):.2g} dB, median)"
+        )
+    return found
+
+
+def wild_rows(
+    station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: Sequence[str]
+) -> list[str]:
+    """Single rows whose level is far from those of the rows before and after them at the same station."""
+    found = []
+    for t, bad, most in wild_of(station, level_db):
+        where = f"station {names[t]}: " if len(names) > 1 else ""
+        found.append(f"{where}{_some(rows, bad)}: up to {most:.0f} dB from the rows around; wrong?")
+    return found
+
+
+def wild_of(station: np.ndarray, level_db: np.ndarray) -> list[tuple[int, np.ndarray, float]]:
+    """(station, rows (k,), largest difference [dB]) of the rows that `wild_rows` speaks of."""
+    found = []
+    for t in np.unique(station):
+        used = np.flatnonzero((station == t) & np.isfinite(level_db))
+        if len(used) < 4 * NEIGHBOURS:
+            continue
+        level = level_db[used]
+        padded = np.pad(level, NEIGHBOURS, mode="reflect")
+        around = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
+        difference = np.abs(level - np.median(around, axis=1))
+        wild = difference > max(OUTLIER_DB, SPREADS * 1.4826 * float(np.median(difference)))
+        # A single row: where the neighbour differs as much it is a place, not a fault.
+        alone = wild & ~np.roll(wild, 1) & ~np.roll(wild, -1)
+        bad = np.flatnonzero(alone)
+        if 0 < len(bad) <= max(NAMED, len(used) // 100):
+            found.append((int(t), used[bad], float(difference[bad].max())))
+    return found
+
+
+def changed_levels(
+    position: np.ndarray,
+    station: np.ndarray,
+    level_db: np.ndarray,
+    names: Sequence[str],
+    rows: Sequence[str],
+    station_position: np.ndarray | None = None,
+    steps: list[tuple[int, LevelStep]] | None = None,
+) -> list[str]:
+    """Stations whose level changes at a row though the places do not explain it (`level_steps`)."""
+    found = []
+    for t, step in steps_of(position, station, level_db, station_position) if steps is None else steps:
+        who = f"station {names[t]}" if len(names) > 1 else "the level"
+        verb = "rises" if step.change_db > 0 else "falls"
+        before, after = rows[step.last], rows[step.first]
+        what, _, number = after.partition(" ")
+        named = what == "row" and number.isdigit() and len(names) > 1
+        setting = f"{{{names[t]}:[{number}]}}" if named else "{STATION:[ROW]}"
+        found.append(
+            f"{who} {verb} by {abs(step.change_db):.0f} dB between {before} and {after}, which the places do "
+            f"not explain: another gain or antenna? dataset.level_steps={setting} makes it another station "
+            "from there on"
+        )
+    return found
+
+
+def steps_of(
+    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
+) -> list[tuple[int, LevelStep]]:
+    """Stations and their steps, which name rows of these arrays."""
+    found = []
+    stations = np.unique(station)
+    blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
+    for t in stations:
+        used = np.flatnonzero(station == t)
+        where = None if station_position is None else station_position[t]
+        for step in level_steps(position[used], level_db[used], where, blocks):
+            found.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
+    return found
+
+
+def gaps(station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: Sequence[str]) -> list[str]:
+    """Missing levels: long runs of rows (a station was off) and scattered ones (perhaps not heard).
+
+    A long run is no outage but out of reach where the values beside it are near the station's weakest, and
+    where fading makes its edges ragged.
+    """
+    long: dict[tuple[str, str], list[str]] = defaultdict(list)
+    lengths: dict[tuple[str, str], int] = {}
+    faint: list[tuple[str, int, float]] = []
+    plain: list[tuple[str, int]] = []
+    silent: list[str] = []
+    for t in np.unique(station):
+        used = np.flatnonzero(station == t)
+        level = level_db[used]
+        missing = ~np.isfinite(level)
+        if missing.all():
+            silent.append(str(names[t]))
+        if not missing.any() or missing.all():
+            continue
+        floor = float(np.percentile(level[~missing], 1))
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(np.int8), [0]])))
+        scattered, around = 0, []
+        for start, stop in pairwise(edges):
+            if not missing[start]:
+                continue
+            beside = np.concatenate([level[max(0, start - 3) : start], level[stop : stop + 3]])
+            beside = beside[np.isfinite(beside)]
+            weak = bool(len(beside)) and float(np.median(beside)) < floor + WEAK_DB
+            ragged = missing[max(0, start - EDGE) : start].any() or missing[stop : stop + EDGE].any()
+            if stop - start >= LONG_GAP and not (weak and ragged):
+                key = (rows[used[start]], rows[used[stop - 1]])
+                long[key].append(str(names[t]))
+                lengths[key] = int(stop - start)
+            else:
+                scattered += int(stop - start)
+                around += beside.tolist()
+        often = scattered >= FEW * len(used)
+        if often and around and np.median(around) < floor + WEAK_DB:
+            faint.append((str(names[t]), scattered, float(level[~missing].min())))
+        elif scattered:
+            plain.append((str(names[t]), scattered))
+    found = [
+        f"no level in the {lengths[key]} rows from {key[0]} to {key[1]}{_of(who, len(names))}: an outage; "
+        "these rows are not used"
+        for key, who in sorted(long.items(), key=lambda item: -lengths[item[0]])
+    ]
+    if silent:
+        found.append(f"no level in any row{_of(silent, len(names))}")
+    if faint:
+        count, least = sum(n for _, n, _ in faint), min(v for _, _, v in faint)
+        who = _of([name for name, _, _ in faint], len(names))
+        found.append(
+            f"{count} levels missing{who}, beside the weakest ones: not heard? then give sensitivity_db "
+            f"(the least level is {least:.4g} dB), and they count as below it"
+        )
+    if plain:
+        count = sum(n for _, n in plain)
+        found.append(
+            f"{count} single levels missing{_of([n for n, _ in plain], len(names))}, few or beside strong "
+            "ones: lost rather than not heard; they are not used"
+        )
+    return found
+
+
+def _some(rows: Sequence[str], which: np.ndarray) -> str:
+    more = f" and {len(which) - NAMED} more" if len(which) > NAMED else ""
+    return ", ".join(str(rows[i]) for i in which[:NAMED]) + more
+
+
+def _of(who: list[str], total: int) -> str:
+    if total == 1:
+        return ""
+    more = f" and {len(who) - NAMED} more" if len(who) > NAMED else ""
+    return f" of station{'s' * (len(who) > 1)} {', '.join(who[:NAMED])}{more}"

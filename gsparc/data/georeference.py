@@ -1,0 +1,98 @@
+"""Degrees to metres about an origin on the WGS 84 ellipsoid, and back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from pyproj import Geod
+
+from gsparc.data.errors import DataError
+
+DIGITS = 4  # of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
+_WGS84 = Geod(ellps="WGS84")
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """The origin of local coordinates: x points east there, y north.
+
+    The projection is azimuthal equidistant about the origin (Snyder, Map Projections, 1987, chapter 25),
+    computed from geodesics (Karney, J. Geodesy 87, 2013), so that poles and the antimeridian are places like
+    any other. Distances from the origin are exact, across them they are stretched by (r / 6371 km)^2 / 6:
+    0.4 millionths at 10 km, 41 millionths at 100 km.
+
+    Attributes:
+        latitude: of the origin [deg], -90 to 90.
+        longitude: of the origin [deg], -180 to 180, counted to the east.
+    """
+
+    latitude: float
+    longitude: float
+
+    def __post_init__(self) -> None:
+        fault = bad_degrees(self.latitude, self.longitude)
+        if fault is not None:
+            raise DataError(f"origin: {fault}")
+
+    @classmethod
+    def about(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
+        """The origin for places (n,) [deg]: their median, rounded to 1e-4 degrees.
+
+        Raises:
+            DataError: no places, or a value is not in range.
+        """
+        latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
+        fault = bad_degrees(latitude, longitude) if latitude.size else "no places"
+        if fault is not None:
+            raise DataError(f"origin: {fault}")
+        # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
+        turned = np.median((longitude - longitude[0] + 180) % 360 - 180) + longitude[0]
+        east = (round(float(turned), DIGITS) + 180) % 360 - 180
+        return cls(round(float(np.median(latitude)), DIGITS), round(east, DIGITS))
+
+    def from_degrees(self, latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
+        """Local coordinates (n, 2) [m], east and north, of places (n,) [deg].
+
+        Raises:
+            DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
+        """
+        latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
+        fault = bad_degrees(latitude, longitude)
+        if fault is not None:
+            raise DataError(fault)
+        there = np.broadcast_arrays(longitude, latitude)
+        east, north = (np.full(there[0].shape, v) for v in (self.longitude, self.latitude))
+        azimuth, _, distance = _WGS84.inv(east, north, there[0], there[1])
+        angle = np.radians(azimuth)
+        return np.stack([distance * np.sin(angle), distance * np.cos(angle)], axis=-1)
+
+    def to_degrees(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Latitude and longitude (n,) [deg] of local coordinates (n, 2) [m]; the inverse of `from_degrees`.
+
+        Raises:
+            DataError: not finite, of another shape, or farther than half the way round the Earth.
+        """
+        xy = np.asarray(xy, np.float64)
+        if xy.ndim != 2 or xy.shape[1] != 2:
+            raise DataError(f"local coordinates: expected shape (n, 2), found {xy.shape}")
+        distance = np.hypot(xy[:, 0], xy[:, 1])
+        if not (distance < 2.0e7).all():
+            raise DataError("local coordinates: not finite, or not on Earth; expected metres from the origin")
+        azimuth = np.degrees(np.arctan2(xy[:, 0], xy[:, 1]))
+        east, north = (np.full(len(xy), v) for v in (self.longitude, self.latitude))
+        longitude, latitude, _ = _WGS84.fwd(east, north, azimuth, distance)
+        return np.asarray(latitude), np.asarray(longitude)
+
+
+def bad_degrees(latitude: np.ndarray | float, longitude: np.ndarray | float) -> str | None:
+    """What is wrong with the first bad one of places (n,) [deg], in words; None when all are on Earth."""
+    latitude, longitude = np.atleast_1d(latitude, longitude)
+    for name, values, low, high in (("latitude", latitude, -90, 90), ("longitude", longitude, -180, 360)):
+        wrong = np.flatnonzero(~((values >= low) & (values <= high)))
+        if len(wrong):
+            swapped = name == "latitude" and (np.abs(longitude) <= 90).all()
+            hint = "; are latitude and longitude swapped?" if swapped else ""
+            return f"{name} {values[wrong[0]]:g} is outside {low} to {high} degrees{hint}"
+    return None

@@ -1,0 +1,166 @@
+"""Steps in the level of a station over the rows: a gain was changed, a cable came loose, another antenna."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+
+from gsparc.data.errors import DataError
+
+MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
+LIKELIHOOD_BLOCKS = 300  # that choose the length of correlation
+REACHES = (1 / 3, 1 / 10, 1 / 30, 1 / 100)  # lengths of correlation, parts of the region
+NUGGETS = (0.05, 0.2, 0.5)  # variance of fading and noise, parts of that of shadowing
+MOST_STEPS = 3
+LEAST_ROWS = 60
+SHORTEST = 1 / 20  # part of a station's rows between two steps
+LEAST_DB = 10.0  # smaller ones are common between campaigns, and cost a model little
+LEAST_SIGMAS = 6.0  # of the estimate; shadowing is not Gaussian, and every row is tried
+
+
+@dataclass(frozen=True)
+class LevelStep:
+    """A change of level between two rows.
+
+    Attributes:
+        last: the last row before it.
+        first: the first row after it.
+        change_db: level after minus level before, at equal places.
+        sigmas: the same in standard deviations of the estimate.
+    """
+
+    last: int
+    first: int
+    change_db: float
+    sigmas: float
+
+
+def level_steps(
+    position: np.ndarray,
+    level_db: np.ndarray,
+    station_position: np.ndarray | None = None,
+    most_blocks: int = MOST_BLOCKS,
+) -> tuple[LevelStep, ...]:
+    """Where the level of one station changes though the places do not explain it.
+
+    The level is a line in the logarithm of the distance, plus shadowing that is correlated over places
+    (exponentially: Gudmundson, Electronics Letters 27, 1991), plus noise, plus a step at an unknown row. For
+    every row the step's generalised least-squares estimate and its variance follow from two cumulative sums
+    of the inverse covariance; the largest is kept, and the search repeated with it, like binary segmentation
+    (Scott and Knott, Biometrics 30, 1974). Places seen before and after a step count most, as they should.
+
+    Args:
+        position: (n, 2) or (n, 3) [m], in the order of measuring.
+        level_db: (n,) [dB], NaN where there is none.
+        station_position: (2,) or (3,) [m]; None: the level is not tied to a distance.
+        most_blocks: rows are averaged to at most so many (median), against outliers and for speed.
+
+    Raises:
+        DataError: shapes that do not fit, or positions that are not finite.
+    """
+    position, level_db = np.asarray(position, np.float64), np.asarray(level_db, np.float64)
+    if position.ndim != 2 or level_db.shape != position.shape[:1] or not np.isfinite(position).all():
+        raise DataError("level_steps: expected finite positions (n, 2) or (n, 3) and as many levels")
+    rows = np.flatnonzero(np.isfinite(level_db))
+    if len(rows) < LEAST_ROWS or not np.ptp(position[rows], axis=0).any():
+        return ()
+    blocks = _blocks(rows, most_blocks)
+    places = np.array([np.median(position[b], axis=0) for b in blocks])
+    level = np.array([np.median(level_db[b]) for b in blocks])
+    if not np.ptp(level):
+        return ()
+    mean = [np.ones(len(level))]
+    if station_position is not None:
+        distance = np.linalg.norm(places - np.asarray(station_position)[: places.shape[1]], axis=1)
+        mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
+    regressors = np.stack(mean, axis=1)
+    precision = _precision(places, level, regressors)
+    after, change, sigmas = _search(precision, level, regressors)
+    found = [
+        LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(d), float(s))
+        for k, d, s in zip(after, change, sigmas, strict=True)
+        if abs(d) >= LEAST_DB and s >= LEAST_SIGMAS
+    ]
+    return tuple(sorted(found, key=lambda step: step.first))
+
+
+def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
+    """Consecutive rows in at most about `most` groups, none across a gap."""
+    size = max(3, math.ceil(len(rows) / most))  # a median of three does not see a single wrong row
+    pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 10 * size) + 1)
+    return [block for piece in pieces for block in np.array_split(piece, math.ceil(len(piece) / size))]
+
+
+def _precision(places: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> np.ndarray:
+    """Inverse covariance (n, n) [1/dB^2] of levels, its parameters of most likelihood on a grid."""
+    distance = cdist(places, places)
+    extent = float(np.ptp(places, axis=0).max())
+    some = np.unique(np.linspace(0, len(level) - 1, LIKELIHOOD_BLOCKS).astype(int))
+    best = (-math.inf, 0.0, 0.0, 0.0)
+    for reach in REACHES:
+        for nugget in NUGGETS:
+            shape = _covariance(distance[np.ix_(some, some)], reach * extent, nugget)
+            factor = cho_factor(shape, lower=True)
+            weighed = cho_solve(factor, regressors[some])
+            mean = np.linalg.lstsq(regressors[some].T @ weighed, weighed.T @ level[some], rcond=None)[0]
+            rest = level[some] - regressors[some] @ mean
+            variance = float(rest @ cho_solve(factor, rest)) / len(some)
+            likelihood = -0.5 * len(some) * math.log(variance) - np.log(np.diag(factor[0])).sum()
+            best = max(best, (float(likelihood), reach, nugget, variance))
+    _, reach, nugget, variance = best
+    return np.linalg.inv(_covariance(distance, reach * extent, nugget)) / variance
+
+
+def _covariance(distance: np.ndarray, reach: float, nugget: float) -> np.ndarray:
+    return np.exp(-distance / reach) + nugget * np.eye(len(distance))
+
+
+def _search(
+    precision: np.ndarray, level: np.ndarray, regressors: np.ndarray
+) -> tuple[list[int], np.ndarray, np.ndarray]:
+    """First blocks after steps, estimates [dB] of all steps together, and how many deviations each is."""
+    count = len(level)
+    margin = max(3, int(SHORTEST * count))
+    after: list[int] = []
+    for _ in range(MOST_STEPS):
+        after.append(_best(precision, level, regressors, after, margin))
+        for i in range(len(after)) if len(after) > 1 else ():  # the first was found without the others
+            others = after[:i] + after[i + 1 :]
+            after[i] = _best(precision, level, regressors, others, margin)
+    while True:
+        design = np.column_stack([regressors, *(_step(count, k) for k in after)])
+        covariance = np.linalg.pinv(design.T @ precision @ design)
+        change = (covariance @ (design.T @ (precision @ level)))[regressors.shape[1] :]
+        deviation = np.sqrt(np.diag(covariance)[regressors.shape[1] :].clip(1e-300))
+        # A step that is none takes from its neighbours: without it the others are estimated again.
+        weak = np.argmin(np.abs(change) / deviation) if after else 0
+        if not after or abs(change[weak]) / deviation[weak] >= LEAST_SIGMAS:
+            return after, change, np.abs(change) / deviation
+        after.pop(int(weak))
+
+
+def _best(
+    precision: np.ndarray, level: np.ndarray, regressors: np.ndarray, steps: list[int], margin: int
+) -> int:
+    """The block after the most significant step, besides `steps`."""
+    count = len(level)
+    design = np.column_stack([regressors, *(_step(count, k) for k in steps)])
+    weighed = precision @ design
+    projected = precision - weighed @ np.linalg.pinv(design.T @ weighed) @ weighed.T
+    # For a step h_k = [row >= k]: h_k' P y and h_k' P h_k are sums over the rows from k on.
+    slope = np.cumsum((projected @ level)[::-1])[::-1]
+    weight = np.diag(np.cumsum(np.cumsum(projected[::-1, ::-1], axis=0), axis=1))[::-1]
+    allowed = np.zeros(count, bool)
+    allowed[margin : count - margin] = True
+    for k in steps:
+        allowed[max(0, k - margin) : k + margin] = False
+    score = np.where(allowed & (weight > 1e-9), slope**2 / np.maximum(weight, 1e-9), -1.0)
+    return int(np.argmax(score))
+
+
+def _step(count: int, first: int) -> np.ndarray:
+    return (np.arange(count) >= first).astype(np.float64)

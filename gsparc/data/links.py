@@ -1,0 +1,251 @@
+"""From files with stations, missing or censored values, or an unknown transmitter to one row per link.
+
+A file may hold one row per place and a column per station (wide), or one row per link that names its station
+(long). In memory every row is a link: tx, rx, what was measured between them, and which station it is of.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.degrees import in_metres
+from gsparc.data.own_checks import Checker
+from gsparc.data.raw import Raw, numbered_rows
+from gsparc.data.schema import End, Links
+from gsparc.data.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
+
+POWERS = ("rssi", "rssi_db")
+PER_ROW = ("noise_variance", "rx_orientation", "rx_rotation", "run", "row_name", "received_power")
+STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", "sensitivity_db")
+
+
+def expand(check: Checker, measured: str) -> Links | None:
+    """Replace `check.raw` by one row per link of the plain schema; None where something is wrong (noted).
+
+    Args:
+        check: of the file; notes say what was left out.
+        measured: name of the measurement.
+    """
+    check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
+    if check.raw.arrays[measured].ndim:  # numbers of the file: rows are repeated and left out below
+        check.raw.arrays.setdefault("row_name", numbered_rows(len(check.raw.arrays[measured])))
+    before = len(check.problems)  # what is already noted does not keep from noting more
+    origin = in_metres(check)
+    if len(check.problems) > before or not _heights(check):
+        return None
+    read = _with_table if "station_position" in check.raw.arrays else _without_table
+    links = read(check, measured)
+    return None if links is None else replace(links, georeference=origin)
+
+
+def _without_table(check: Checker, measured: str) -> Links | None:
+    """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
+    arrays = check.raw.arrays
+    for name in check.given(*STATION_FIELDS[:-1]):
+        return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
+    rows = len(arrays[measured]) if arrays[measured].ndim else 0
+    run = _run(check, rows)
+    if measured in POWERS and not check.given("tx_position") and "rx_position" in arrays:
+        check.notes.append("no tx_position: the transmitter's place is unknown")
+        arrays["tx_position"] = np.full(3, np.nan)
+        links = Links("tx", run=run, unknown_transmitter=True)
+        moving = arrays["rx_position"]
+    else:
+        ends = [check.real(f"{end}_position", (3,), (rows, 3)) for end in ("rx", "tx")]
+        if any(end is None for end in ends):
+            return Links("tx", run=run)  # what is missing is said where positions are read
+        rx, tx = (np.broadcast_to(np.asarray(end), (rows, 3)) for end in ends)
+        links, moving = ends_of(check, rx, tx, run), np.hstack([rx, tx])
+    if links.place is None and moving.ndim == 2 and len(moving) == rows:
+        place = numbered(moving)
+        if len(np.unique(place)) < rows:  # a place visited twice is not learned from and tested on
+            links = replace(links, place=place)
+    return _heard(check, measured, links, np.zeros(rows, np.int64))
+
+
+def _with_table(check: Checker, measured: str) -> Links | None:
+    """A file with a table of stations, wide or long, as one row per link."""
+    before = len(check.problems)
+    stations = station_table(check)
+    given = check.given("rx_position", "tx_position")
+    if len(given) != 1:
+        found = " and ".join(given) or "neither"
+        wanted = "expected rx_position or tx_position, of the end that moves"
+        return check.refuse("station_position", f"{wanted}; found {found}")
+    if stations is None:
+        return None
+    moving: End = "rx" if given == ["rx_position"] else "tx"
+    values = check.raw.arrays[measured]
+    long = "station" in check.raw.arrays
+    count = len(stations)
+    if not long and (values.ndim < 2 or values.shape[1] != count):
+        return check.refuse(
+            measured, f"expected shape (S, {count}, ...), a column for each station, found {values.shape}; "
+            "or say which station each row is of with `station` (S,)",
+        )  # fmt: skip
+    rows = len(values)
+    run = _run(check, rows)
+    which = station_of_row(check, rows, count) if long else None
+    carriers = check.real("carrier_hz", (), (count,), (rows,)) if "carrier_hz" in check.raw.arrays else None
+    if len(check.problems) > before:
+        return None
+    positions = check.real(f"{moving}_position", (rows, 3))
+    place = np.arange(rows) if positions is None else numbered(positions)
+    if long:
+        assert which is not None
+        links = Links(OTHER[moving], stations, which, place, run=run)
+    else:
+        check.raw = _unrolled(check.raw, measured, moving, count)
+        links = Links(
+            OTHER[moving], stations, np.tile(np.arange(count), rows), np.repeat(place, count),
+            run=None if run is None else np.repeat(run, count),
+        )  # fmt: skip
+    of_level = links.station  # a station at two carriers has one level
+    links = by_carrier(check, links, carriers, rows)
+    check.raw.arrays[f"{OTHER[moving]}_position"] = links.stations.position[links.station]  # type: ignore[union-attr, index]
+    if links.stations is not None and links.stations.rotation is not None:
+        if OTHER[moving] == "tx":
+            return check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
+        check.raw.arrays["rx_rotation"] = links.stations.rotation[links.station]  # type: ignore[index]
+    for name in STATION_FIELDS[:-1]:
+        check.raw.arrays.pop(name, None)
+    return _heard(check, measured, links, of_level, count)  # type: ignore[arg-type]
+
+
+def _unrolled(raw: Raw, measured: str, moving: End, count: int) -> Raw:
+    """Rows of a wide file, one for each station."""
+    arrays = dict(raw.arrays)
+    rows = len(arrays[measured])
+    for name in (measured, "mask"):
+        if name in arrays and arrays[name].shape[:2] == (rows, count):
+            arrays[name] = arrays[name].reshape(rows * count, *arrays[name].shape[2:])
+    for name in (f"{moving}_position", *PER_ROW):
+        if name in arrays and arrays[name].ndim and len(arrays[name]) == rows:
+            arrays[name] = np.repeat(arrays[name], count, axis=0)
+    for name in ("split_train", "split_test"):
+        if name in arrays and arrays[name].ndim == 1 and arrays[name].dtype.kind in "iu":
+            arrays[name] = (arrays[name][:, None] * count + np.arange(count)).reshape(-1)
+    return replace(raw, arrays=arrays)
+
+
+def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray, count: int = 1) -> Links | None:
+    """Rows without a missing value; censored ones hold the level below which nothing is heard, masked."""
+    values, arrays = check.raw.arrays[measured], check.raw.arrays
+    level = check.real("sensitivity_db", (), (count,))
+    if "sensitivity_db" in arrays and level is None:
+        return None
+    if level is not None and measured != "rssi_db":
+        return check.refuse("sensitivity_db", f"goes with rssi_db, not with {measured}")
+    if level is not None and not (np.isfinite(level) & (np.abs(level) <= 400)).all():
+        return check.refuse("sensitivity_db", "expected dB between -400 and 400")
+    arrays.pop("sensitivity_db", None)
+    mask = arrays.get("mask")
+    if mask is not None and mask.shape != values.shape:
+        return links  # said where the mask is read
+    may_miss = measured in POWERS or links.stations is not None
+    if values.dtype.kind not in "iufc" or values.ndim == 0 or not may_miss:
+        return links
+    axes = tuple(range(1, values.ndim))
+    unknown = np.isnan(values)
+    told = np.ones(len(values), bool) if mask is None else mask.astype(bool).any(axis=axes)
+    censored = np.zeros(len(values), bool)
+    if level is not None:
+        censored = unknown & told
+        floor = np.broadcast_to(np.atleast_1d(level)[of_level if level.size > 1 else 0], (len(values),))
+        below = ~unknown & told & (values < floor)
+        if below.any():
+            row = int(np.flatnonzero(below)[0])
+            named = links.named([str(name) for name in arrays["row_name"]])[row]
+            wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
+            return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
+        arrays[measured] = np.where(censored, floor, values)
+    lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
+    if mask is not None and lost.any():
+        return links  # marked as measured, and is not: refused where values are read
+    keep = told & ~lost
+    if not keep.any():
+        return check.refuse(measured, "nothing was measured; expected numbers")
+    if not keep.all() or censored.any():
+        _say_missing(check, measured, links, keep, censored)
+        _keep(check.raw, measured, keep)
+        parts = {name: getattr(links, name) for name in ("station", "place", "run")}
+        pick = {name: value[keep] for name, value in parts.items() if value is not None}
+        links = replace(links, **pick)
+        censored = censored[keep]
+    if censored.any():
+        arrays["mask"] = ~censored if "mask" not in arrays else arrays["mask"].astype(bool) & ~censored
+        return replace(links, censored=censored)
+    return links
+
+
+def _keep(raw: Raw, measured: str, keep: np.ndarray) -> None:
+    """Drop rows, and renumber those that a split names."""
+    arrays, rows = raw.arrays, len(keep)
+    number = np.cumsum(keep) - 1
+    for name in ("split_train", "split_test"):
+        if name in arrays and arrays[name].dtype.kind in "iu" and arrays[name].ndim == 1:
+            index = arrays[name]
+            index = index[(index >= 0) & (index < rows)]
+            arrays[name] = number[index[keep[index]]]
+    for name in (measured, "mask", "rx_position", "tx_position", *PER_ROW):
+        array = arrays.get(name)
+        if array is None or array.ndim == 0 or len(array) != rows:
+            continue
+        if array.ndim > 1 or not name.endswith("_position"):
+            arrays[name] = array[keep]
+
+
+def _say_missing(check: Checker, measured: str, links: Links, keep: np.ndarray, censored: np.ndarray) -> None:
+    """How many links have no value, and how many were not heard, by station."""
+    if not keep.all():
+        text = f"{int((~keep).sum())} of {len(keep)} values are missing"
+        if links.stations is not None and links.station is not None:
+            lost = np.bincount(links.station[~keep], minlength=len(links.stations))
+            told = ", ".join(f"{links.stations.name[i]} {lost[i]}" for i in np.argsort(-lost)[:5] if lost[i])
+            text += f" (most: {told})"
+        weak = "; if they were too weak to be heard, give sensitivity_db" if measured == "rssi_db" else ""
+        check.notes.append(text + weak)
+    if censored.any():
+        check.notes.append(
+            f"{int(censored.sum())} of {len(keep)} powers were not heard: below sensitivity_db"
+        )
+
+
+def _heights(check: Checker) -> bool:
+    """2-D positions get their stated height; False where it is missing (noted)."""
+    arrays = check.raw.arrays
+    good = True
+    for end in ("rx", "tx", "station"):
+        name, height = f"{end}_position", f"{end}_height"
+        flat = name in arrays and arrays[name].ndim in (1, 2) and arrays[name].shape[-1] == 2
+        if not flat:
+            if height in arrays:
+                check.refuse(height, f"given, but {name} has three coordinates or is missing")
+                good = False
+            continue
+        if height not in arrays:
+            check.refuse(name, f"two coordinates; expected three, or the height above ground as {height} [m]")
+            good = False
+            continue
+        above = check.real(height, (), (len(arrays[name]),) if arrays[name].ndim == 2 else ())
+        if above is None:
+            good = False
+            continue
+        place = arrays[name].astype(np.float64)
+        column = np.broadcast_to(above, place.shape[:-1])[..., None]
+        arrays[name] = np.concatenate([place, column], axis=-1)
+        arrays.pop(height)
+    return good
+
+
+def _run(check: Checker, rows: int) -> np.ndarray | None:
+    """(S,) int64, the number of each row's run; runs may have names."""
+    given = check.raw.arrays.get("run")
+    if given is None or not check.fits("run", given, (rows,)):
+        return None
+    if given.dtype.kind not in "iuUS":
+        return check.refuse("run", f"expected names or numbers of runs, found dtype {given.dtype}")
+    check.raw.arrays.pop("run")
+    return np.unique(given, return_inverse=True)[1].reshape(-1).astype(np.int64)

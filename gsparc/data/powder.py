@@ -1,0 +1,276 @@
+"""Received powers of a walking transmitter at fixed stations of a campus (POWDER, University of Utah).
+
+The release is a table, `single_tx.csv`: a row per place with `timestamp`, one column per station [dB],
+columns `bus-*` of stations that drive (left out), and the transmitter's `tx_x_coord` (latitude!) and
+`tx_y_coord` (longitude) [deg]; -101 stands for no value. `location_coordinates.json` beside it has the
+stations' places. The carrier is 462.7 MHz.
+
+The same as an npz: mobile_position (S, 2), station_position (T, 2) [m, east and north], rssi_db (S, T) [dB],
+station (T,) names, latitude, longitude (S,) [deg], frequency_hz () [Hz].
+"""
+
+from __future__ import annotations
+
+import ast
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.errors import DataError, Problems, shortened
+from gsparc.data.layout import TEXT, Expected, check_layout
+from gsparc.data.raw import Raw, read_raw
+
+CARRIER_HZ = 462.7e6
+NO_VALUE_DB = -101.0
+WALKER_M, STATION_M = (
+    1.5,
+    10.0,
+)  # above ground: a radio in a hand; a wall or mast, which the release does not say
+STATIONS = "location_coordinates.json"
+LATITUDES = ("tx_x_coord", "tx_lat", "tx_latitude", "latitude", "lat")
+LONGITUDES = ("tx_y_coord", "tx_lon", "tx_lng", "tx_long", "tx_longitude", "longitude", "lon", "lng", "long")
+TIMES = ("timestamp", "time", "date", "datetime")
+EMPTY = ("", "nan", "none", "null", "na", "n/a")
+SLACK_M = 1.0  # an affine map from degrees to metres is good to centimetres over a campus
+LAYOUT = {
+    "mobile_position": Expected(("S", 2), place=True),
+    "station_position": Expected(("T", 2), place=True),
+    "rssi_db": Expected(("S", "T")),
+    "station": Expected(("T",), TEXT, optional=True),
+    "latitude": Expected(("S",), optional=True),
+    "longitude": Expected(("S",), optional=True),
+    "frequency_hz": Expected((), optional=True),
+}
+
+
+def raw_of_powder(
+    path: str | Path,
+    station_table: str | Path | None = None,
+    tx_height: float = WALKER_M,
+    station_height: float = STATION_M,
+) -> Raw:
+    """Read an npz, or the release's CSV; NaN is no value.
+
+    Args:
+        path: *.npz or *.csv.
+        station_table: coordinates of the stations of a CSV; None takes `location_coordinates.json` beside it.
+        tx_height, station_height: above ground [m], the same for all; the ground is taken as flat.
+
+    Returns:
+        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg] (of an npz without
+        degrees `tx_position` (S, 2), `station_position` (T, 2) [m]), `tx_height`, `station_height` () [m],
+        `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name` (T,), `carrier_hz` (); of a
+        CSV also `row_name` (S,). The attribute `left_out` says which columns are no stations.
+
+    Raises:
+        DataError: no such file, or something in it is missing or wrong; all problems with line and column.
+    """
+    path = Path(path)
+    for name, height in (("tx_height", tx_height), ("station_height", station_height)):
+        if isinstance(height, bool) or not isinstance(height, int | float) or not np.isfinite(height):
+            raise DataError(f"dataset.{name}={height}: expected metres above ground")
+    if path.suffix.lower() == ".csv":
+        raw = _of_csv(path, path.with_name(STATIONS) if station_table is None else Path(station_table))
+    else:
+        raw = _of_npz(read_raw(path), path)
+    heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
+    return Raw({**raw.arrays, **heights}, {"name": "powder", **raw.attributes, "layout": "powder"})
+
+
+def _of_npz(raw: Raw, path: Path) -> Raw:
+    check_layout(raw, path, LAYOUT)
+    held = raw.arrays
+    arrays = {"rssi_db": held["rssi_db"], "carrier_hz": held.get("frequency_hz", np.array(CARRIER_HZ))}
+    if "station" in held:
+        arrays["station_name"] = held["station"]
+    if "latitude" in held and "longitude" in held:
+        degrees = np.stack([held["latitude"], held["longitude"]], axis=1).astype(np.float64)
+        stations = _degrees_of(held["station_position"], held["mobile_position"], degrees, path)
+        geographic = {"latitude": degrees[:, 0], "longitude": degrees[:, 1]}
+        geographic |= {"station_latitude": stations[:, 0], "station_longitude": stations[:, 1]}
+        return Raw({**arrays, **geographic}, raw.attributes)
+    metric = {"tx_position": held["mobile_position"], "station_position": held["station_position"]}
+    return Raw({**arrays, **metric}, raw.attributes)
+
+
+def _degrees_of(
+    stations: np.ndarray, places: np.ndarray, degrees: np.ndarray, path: str | Path
+) -> np.ndarray:
+    """Latitude and longitude (T, 2) of `stations` (T, 2) [m] by the affine map of rows known in both.
+
+    Args:
+        places, degrees: (S, 2), the same rows in metres and in degrees.
+    """
+    problems = Problems(path)
+    for name, column, most in (("latitude", 0, 90), ("longitude", 1, 180)):
+        with np.errstate(invalid="ignore"):
+            bad = np.flatnonzero(~(np.abs(degrees[:, column]) <= most))
+        rows = (f"row {i} = {degrees[i, column]}" for i in bad)
+        problems.add_rows(f"{path}, {name}", rows, f"expected degrees, at most {most}")
+    problems.raise_if_any()
+    middle, mean = places.mean(axis=0), degrees.mean(axis=0)
+    turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
+    error = 111e3 * np.abs((places - middle) @ turn + mean - degrees).max(axis=1)  # a degree is 111 km
+    if error.max() > SLACK_M:
+        row = int(error.argmax())
+        raise DataError(
+            f"{path}, mobile_position, row {row}: {error[row]:.3g} m from where latitude and longitude say; "
+            "expected metres east and north"
+        )
+    return (stations - middle) @ turn + mean
+
+
+def _of_csv(path: Path, table: Path) -> Raw:
+    header, rows = _read_csv(path)
+    places = station_places(table)
+    names = [name.strip() for name in header]
+    plain = [name.lower().replace(" ", "_") for name in names]
+    if sum(name.startswith("tx") and name.endswith(("_x_coord", "_lat", "_latitude")) for name in plain) > 1:
+        raise DataError(f"{path}, line 1: two transmitters in a row; expected one, as in single_tx.csv")
+    found = [next((plain.index(n) for n in wanted if n in plain), None) for wanted in (LATITUDES, LONGITUDES)]
+    for column, wanted in zip(found, (LATITUDES, LONGITUDES), strict=True):
+        if column is None:
+            raise DataError(f"{path}, line 1: no column {wanted[0]} (or {', '.join(wanted[1:])})")
+    columns = {name: i for i, name in enumerate(names) if name in places}
+    if len(columns) < sum(name in places for name in names):
+        twice = next(name for name in columns if names.count(name) > 1)
+        raise DataError(f"{path}, line 1: column {twice} twice")
+    if not columns:
+        raise DataError(
+            f"{path}, line 1: no column is a station of {table}, e.g. {next(iter(places), 'none')}"
+        )
+    numbers = _numbers(path, names, rows, [*(i for i in found if i is not None), *columns.values()])
+    degrees, rssi = numbers[:, :2], numbers[:, 2:]
+    lines = [f"line {number}" for number, _ in rows]
+    _check_degrees(path, [names[i] for i in found if i is not None], degrees, lines)
+    where = np.array(list(places[name] for name in columns))
+    rest = [n for n, p in zip(names, plain, strict=True) if n not in columns and p not in TIMES]
+    rest = [n for n in rest if names.index(n) not in found]
+    attributes = {}
+    if rest:
+        attributes["left_out"] = shortened(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}")
+    arrays = {
+        "latitude": degrees[:, 0], "longitude": degrees[:, 1],
+        "station_latitude": where[:, 0], "station_longitude": where[:, 1],
+        "station_name": np.array(list(columns)), "carrier_hz": np.array(CARRIER_HZ),
+        "rssi_db": np.where(rssi == NO_VALUE_DB, np.nan, rssi),
+        "row_name": np.array(lines),
+    }  # fmt: skip
+    return Raw(arrays, attributes)
+
+
+def _read_csv(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """The header, and the other lines with their numbers; blank ones are none."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = [
+                (i, cells) for i, cells in enumerate(csv.reader(file), 1) if any(c.strip() for c in cells)
+            ]
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such file; expected single_tx.csv of the POWDER release") from None
+    except (UnicodeDecodeError, csv.Error, OSError) as error:
+        raise DataError(f"{path}: not readable as CSV text ({error})") from None
+    if len(lines) < 2:
+        raise DataError(f"{path}: no rows; expected a header and a line per place")
+    return lines[0][1], lines[1:]
+
+
+def _numbers(
+    path: Path, names: Sequence[str], rows: Sequence[tuple[int, list[str]]], columns: Sequence[int]
+) -> np.ndarray:
+    """Cells (S, len(columns)) float64, NaN where a cell is empty."""
+    problems = Problems(path)
+    values = np.full((len(rows), len(columns)), np.nan)
+    for row, (line, cells) in enumerate(rows):
+        if len(cells) != len(names):
+            problems.add(f"{path}, line {line}", f"expected {len(names)} cells, found {len(cells)}")
+            continue
+        for k, column in enumerate(columns):
+            text = cells[column].strip()
+            if text.lower() in EMPTY:
+                continue
+            try:
+                values[row, k] = float(text)
+            except ValueError:
+                problems.add(f"{path}, line {line}, {names[column]}", f"expected a number, found {text!r}")
+        if len(problems) > Problems.LIMIT:
+            break
+    problems.raise_if_any()
+    return values
+
+
+def _check_degrees(path: Path, names: Sequence[str], degrees: np.ndarray, lines: Sequence[str]) -> None:
+    problems = Problems(path)
+    for column, most in ((0, 90), (1, 180)):
+        bad = np.flatnonzero(~(np.abs(degrees[:, column]) <= most)).tolist()
+        rows = (f"{lines[i]} = {degrees[i, column]}" for i in bad)
+        hint = f"expected degrees, at most {most}; are {names[0]} and {names[1]} swapped?"
+        problems.add_rows(f"{path}, {names[column]}", rows, hint)
+    problems.raise_if_any()
+
+
+def station_places(path: Path) -> dict[str, tuple[float, float]]:
+    """Latitude and longitude [deg] of the stations that stay put, by name.
+
+    Args:
+        path: JSON, or (as in the release) Python's notation, of a table from names to pairs; None stands for
+            a station that drives. Or a CSV with columns name, latitude, longitude.
+
+    Raises:
+        DataError: missing, not readable, or no pair of degrees.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise DataError(
+            f"{path}: missing; expected the stations' coordinates, name the file with dataset.station_table"
+        ) from None
+    except (UnicodeDecodeError, OSError) as error:
+        raise DataError(f"{path}: not readable as text ({error})") from None
+    content = _rows_by_name(path, text) if path.suffix.lower() == ".csv" else _literal(path, text)
+    problems, places = Problems(path), {}
+    for name, value in content.items():
+        if value is None:
+            continue
+        try:
+            latitude, longitude = (float(x) for x in value)
+        except (TypeError, ValueError):
+            problems.add(f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}")
+            continue
+        if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+            problems.add(f"{path}, {name}", f"({latitude}, {longitude}) is no latitude and longitude [deg]")
+        places[str(name).strip()] = (latitude, longitude)
+    problems.raise_if_any()
+    if not places:
+        raise DataError(f"{path}: no station with coordinates in it")
+    return places
+
+
+def _literal(path: Path, text: str) -> Mapping[str, Any]:
+    try:
+        try:
+            content = json.loads(text)
+        except json.JSONDecodeError:
+            content = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
+        content = None
+    if not isinstance(content, Mapping):
+        raise DataError(f"{path}: not readable; expected a table from names to (latitude, longitude)")
+    return content
+
+
+def _rows_by_name(path: Path, text: str) -> Mapping[str, Any]:
+    lines = list(csv.DictReader(text.splitlines(), skipinitialspace=True))
+    given = {str(key).strip().lower(): key for key in (lines[0] if lines else {})}
+    keys = [
+        next((given[n] for n in names if n in given), None)
+        for names in (("name", "station"), ("latitude", "lat"), ("longitude", "lon", "lng"))
+    ]
+    if None in keys:
+        raise DataError(f"{path}, line 1: expected the columns name, latitude, longitude")
+    name, *degrees = keys
+    return {str(line[name]): tuple(line[key] for key in degrees) for line in lines}

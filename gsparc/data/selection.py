@@ -1,0 +1,351 @@
+"""Parts of a campaign: some stations, some runs, powers above a level, fewer rows; what goes is counted.
+
+All work on the arrays of a file (`Raw`, named as in docs/own-data.md) before they are interpreted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.errors import DataError
+from gsparc.data.fields import MEASUREMENTS
+from gsparc.data.instantiate import suggest
+from gsparc.data.raw import Raw, numbered_rows
+
+FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
+FEWEST = 2  # rows of a dataset
+SEED = 0  # of the rows that `max_rows` keeps: the same in every run
+# Arrays with a row per sample, and the number of their axes where they have one.
+ALWAYS = (
+    *MEASUREMENTS,
+    *("mask", "station", "run", "latitude", "longitude", "row_name"),
+    *("line_of_sight", "received_power", "delay_spread", "spectrum_peak", "source_visible"),
+)
+AXES = {
+    **{"rx_position": 2, "tx_position": 2, "rx_orientation": 2, "rx_rotation": 3},
+    **{"noise_variance": 1, "carrier_hz": 1, "rx_height": 1, "tx_height": 1},
+}
+PATHS = ("path_direction", "path_last_point", "path_gain", "path_delay", "path_mechanisms", "path_order")
+SPLIT = ("split_train", "split_test")
+# Arrays with a row per station, and the number of their axes where they have one.
+STATION_AXES = {
+    **{"station_position": 2, "station_latitude": 1, "station_longitude": 1, "station_height": 1},
+    **{"station_name": 1, "station_orientation": 2, "sensitivity_db": 1, "carrier_hz": 1},
+}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The settings `dataset.stations`, `runs`, `min_rssi_db` and `max_rows`; None leaves everything in.
+
+    Attributes:
+        stations: names, or numbers from 0, of the stations to keep.
+        runs: names of the runs to keep.
+        min_rssi_db: level [dB] below which powers are left out, as faults of the receiver.
+        max_rows: largest number of rows (places of a wide file, links of a long one).
+
+    Raises:
+        DataError: a setting that cannot be.
+    """
+
+    stations: Sequence[str | int] | None = None
+    runs: Sequence[str | int] | None = None
+    min_rssi_db: float | None = None
+    max_rows: int | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("stations", "runs"):
+            given = getattr(self, name)
+            if given is not None:
+                object.__setattr__(self, name, _listed(name, given))
+        level, rows = self.min_rssi_db, self.max_rows
+        if level is not None and not (_is_number(level) and math.isfinite(level)):
+            raise DataError(f"dataset.min_rssi_db={level}: expected a level in dB, e.g. -75")
+        if rows is not None and not (isinstance(rows, int) and _is_number(rows) and rows >= FEWEST):
+            raise DataError(f"dataset.max_rows={rows}: expected a whole number, at least {FEWEST}")
+
+
+@dataclass(frozen=True)
+class Selected:
+    """What is left, and what was left out.
+
+    Attributes:
+        raw: the arrays that are kept.
+        notes: what was left out, one line each.
+    """
+
+    raw: Raw
+    notes: tuple[str, ...] = ()
+
+
+def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
+    """Apply all settings: stations, runs, level, then number of rows.
+
+    Raises:
+        DataError: a setting that the file cannot follow, or nothing is left.
+    """
+    notes: list[str] = []
+    for apply in (
+        None if selection.stations is None else partial(keep_stations, stations=selection.stations),
+        None if selection.runs is None else partial(keep_runs, runs=selection.runs),
+        None if selection.min_rssi_db is None else partial(keep_loud, min_rssi_db=selection.min_rssi_db),
+        None if selection.max_rows is None else partial(keep_rows, max_rows=selection.max_rows),
+    ):
+        if apply is not None:
+            part = apply(raw, source=source)
+            raw = part.raw
+            notes += part.notes
+    return Selected(raw, tuple(notes))
+
+
+def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -> Selected:
+    """The links of some stations only; the others' columns, or rows of a long file, are left out.
+
+    Args:
+        stations: names of `station_name`, or numbers from 0.
+
+    Raises:
+        DataError: the file has no stations, or not these.
+    """
+    count = station_count(raw)
+    if count is None:
+        raise DataError(f"dataset.stations: {source} has no stations; expected station_position")
+    names = [str(name) for name in raw.arrays.get("station_name", np.zeros(0, str)).ravel()]
+    numbers = [station_number(w, names, count, f"dataset.stations={w}", source) for w in stations]
+    chosen = np.unique([part for number in numbers for part in parts_of(number, names)])
+    note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
+    arrays = {
+        name: array[chosen] if per_station(name, array, count) else array
+        for name, array in raw.arrays.items()
+    }
+    if "station" in arrays:
+        rows = np.flatnonzero(np.isin(raw.arrays["station"], chosen))
+        _left(rows, "dataset.stations", source)
+        kept = take_rows(replace(raw, arrays=arrays), rows, source)
+        renumbered = np.searchsorted(chosen, kept.arrays["station"])
+        total = len(raw.arrays["station"])
+        note += f", with them {total - len(rows)} of {total} rows"
+        return Selected(replace(kept, arrays={**kept.arrays, "station": renumbered}), (note,))
+    for name in (*MEASUREMENTS, "mask"):
+        if name in arrays:
+            refuse_columns(arrays[name], name, count, source)
+            arrays[name] = arrays[name][:, chosen]
+    return Selected(replace(raw, arrays=arrays), (note,))
+
+
+def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Selected:
+    """The rows of some runs only.
+
+    Raises:
+        DataError: the file names no runs, or not these.
+    """
+    if "run" not in raw.arrays:
+        raise DataError(f"dataset.runs: {source} names no runs; expected an array run")
+    of_row = raw.arrays["run"].astype(str)
+    known, wanted = np.unique(of_row).tolist(), [str(run) for run in runs]
+    for name in wanted:
+        if name not in known:
+            raise DataError(f"dataset.runs={name}: no such run in {source}{suggest(name, known)}")
+    return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
+
+
+def keep_loud(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
+    """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
+
+    Raises:
+        DataError: the file holds no powers, or none is left.
+    """
+    name, said = _measurement(raw, source), f"dataset.min_rssi_db={min_rssi_db:g}"
+    if name not in ("rssi", "rssi_db"):
+        raise DataError(f"{said}: {source} holds {name}; expected powers, rssi or rssi_db")
+    values = raw.arrays[name]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        low = (10 * np.log10(values) if name == "rssi" else values) < min_rssi_db
+    given = raw.arrays.get("mask")
+    if given is not None and given.shape != low.shape:
+        raise DataError(f"{source}, mask: expected shape {low.shape} as {name}, found {given.shape}")
+    low &= True if given is None else given.astype(bool)
+    if low.ndim == 1:
+        return _kept(raw, ~low, said, source)
+    measured = ~low & measured_links(raw, source)
+    marked = replace(raw, arrays={**raw.arrays, "mask": measured})
+    links = (f"{said}: {int(low.sum())} links left out",) if low.any() else ()
+    rest = _kept(marked, measured.reshape(len(measured), -1).any(axis=1), said, source)
+    return Selected(rest.raw, (*links, *rest.notes))
+
+
+def keep_rows(raw: Raw, max_rows: int, source: str | Path) -> Selected:
+    """At most `max_rows` rows that cover the campaign as all rows do.
+
+    The file's order is cut into `max_rows` stretches of equal length, and of each one row is drawn, with a
+    fixed seed: every stretch of a walk stays, and rows of a raster are not hit in step with its lines, as
+    every n-th would be.
+    """
+    count = row_count(raw, source)
+    keep = np.ones(count, bool)
+    if count > max_rows:
+        edges = np.linspace(0, count, max_rows + 1)
+        first, last = np.ceil(edges[:-1]).astype(int), np.ceil(edges[1:]).astype(int)
+        keep = np.zeros(count, bool)
+        keep[np.random.default_rng(SEED).integers(first, last)] = True
+    return _kept(raw, keep, f"dataset.max_rows={max_rows}", source)
+
+
+def take_rows(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
+    """The same file with the rows (n,) only, in their order; the file's own split and paths follow them.
+
+    Raises:
+        DataError: an array has another number of rows than the measurement.
+    """
+    count, stations = row_count(raw, source), station_count(raw)
+    raw = replace(raw, arrays={"row_name": numbered_rows(count), **raw.arrays})  # numbers stay the file's
+    arrays = {}
+    for name, array in raw.arrays.items():
+        arrays[name] = array[rows] if _per_row(name, array, count, stations, source) else array
+    if "path_offsets" in arrays:
+        arrays |= _paths(raw, rows, count, source)
+    for name in SPLIT:
+        if name in arrays:
+            # Names of rows that are not there are left for whoever reads the split to refuse.
+            inside = np.isin(arrays[name], np.arange(count))
+            kept = np.flatnonzero(np.isin(rows, arrays[name]))
+            arrays[name] = np.concatenate([kept, arrays[name][~inside]])
+    if any(name in arrays and not len(arrays[name]) for name in SPLIT):
+        arrays = {name: array for name, array in arrays.items() if name not in SPLIT}
+    return replace(raw, arrays=arrays)
+
+
+def row_count(raw: Raw, source: str | Path) -> int:
+    """Number of rows S of the measurement.
+
+    Raises:
+        DataError: the file holds no measurement, or a single number.
+    """
+    name = _measurement(raw, source)
+    if raw.arrays[name].ndim == 0:
+        raise DataError(f"{source}, {name}: expected a row per sample, found a single value")
+    return len(raw.arrays[name])
+
+
+def station_count(raw: Raw) -> int | None:
+    """Number of stations T; None where the file has none."""
+    for name in ("station_position", "station_latitude"):
+        if name in raw.arrays and raw.arrays[name].ndim:
+            return len(raw.arrays[name])
+    return None
+
+
+def _listed(name: str, given: Any) -> tuple[str | int, ...]:
+    """One name, or several, as a tuple."""
+    listed = (given,) if isinstance(given, str | int) else tuple(given)
+    if not listed or not all(isinstance(x, str | int) and not isinstance(x, bool) for x in listed):
+        raise DataError(f"dataset.{name}={given}: expected names, e.g. dataset.{name}=[A,B]")
+    return listed
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def parts_of(number: int, names: Sequence[str]) -> list[int]:
+    """Numbers of a station and of what its level steps made of it (`station_parts`), in the order of rows."""
+    if number >= len(names):
+        return [number]
+    return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
+
+
+def station_number(wanted: str | int, names: Sequence[str], count: int, said: str, source: str | Path) -> int:
+    """Number of the station of a name, or number from 0; the setting `said` is named in errors.
+
+    Raises:
+        DataError: there is none.
+    """
+    if str(wanted) in names:
+        return list(names).index(str(wanted))
+    if isinstance(wanted, int) and 0 <= wanted < count:
+        return wanted
+    if isinstance(wanted, int) or not names:
+        raise DataError(f"{said}: {source} has stations 0 to {count - 1}")
+    raise DataError(f"{said}: no station {wanted} in {source}{suggest(wanted, names)}")
+
+
+def _measurement(raw: Raw, source: str | Path) -> str:
+    held, named = [n for n in MEASUREMENTS if n in raw.arrays], raw.attributes.get("measurement")
+    if not held:
+        raise DataError(f"{source}: expected one of {', '.join(MEASUREMENTS)}; found none of them")
+    return str(named) if named in held else held[0]
+
+
+def measured_links(raw: Raw, source: str | Path) -> np.ndarray:
+    """Where the measurement says something, of its shape: NaN is missing, or, with a sensitivity, not heard.
+
+    Raises:
+        DataError: the file holds no measurement.
+    """
+    values, given = raw.arrays[_measurement(raw, source)], raw.arrays.get("mask")
+    if given is not None:
+        return given.astype(bool)
+    return np.ones(values.shape, bool) if "sensitivity_db" in raw.arrays else ~np.isnan(values)
+
+
+def per_station(name: str, array: np.ndarray, count: int) -> bool:
+    """Whether an array of a file has an entry for each of `count` stations."""
+    return STATION_AXES.get(name) == array.ndim and len(array) == count
+
+
+def _per_row(name: str, array: np.ndarray, count: int, stations: int | None, source: str | Path) -> bool:
+    if name not in ALWAYS and AXES.get(name) != array.ndim:
+        return False
+    if name == "carrier_hz" and len(array) == stations:
+        return False
+    found = len(array) if array.ndim else 0
+    if found != count:
+        raise DataError(f"{source}, {name}: expected {count} rows as the measurement has, found {found}")
+    return True
+
+
+def _paths(raw: Raw, rows: np.ndarray, count: int, source: str | Path) -> dict[str, np.ndarray]:
+    offsets = raw.arrays["path_offsets"]
+    if offsets.shape != (count + 1,) or offsets.dtype.kind not in "iu":
+        raise DataError(f"{source}, path_offsets: expected {count + 1} whole numbers, found {offsets.shape}")
+    lengths = np.diff(offsets.astype(np.int64))
+    owner = np.repeat(np.arange(count), lengths.clip(0))
+    place = np.full(count, -1)
+    place[rows] = np.arange(len(rows))
+    kept = np.flatnonzero(place[owner] >= 0)
+    kept = kept[np.argsort(place[owner[kept]], kind="stable")]
+    found = {"path_offsets": np.concatenate([[0], np.cumsum(lengths[rows])])}
+    for name in PATHS:
+        if name in raw.arrays:
+            if len(raw.arrays[name]) != len(owner):
+                raise DataError(f"{source}, {name}: expected {len(owner)} paths as path_offsets says")
+            found[name] = raw.arrays[name][kept]
+    return found
+
+
+def refuse_columns(array: np.ndarray, name: str, count: int, source: str | Path) -> None:
+    """Refuse (DataError) what has no column for each of `count` stations."""
+    if array.ndim < 2 or array.shape[1] != count:
+        wanted = f"expected a column for each of the {count} stations, or an array station"
+        raise DataError(f"{source}, {name}: {wanted}; found shape {array.shape}")
+
+
+def _kept(raw: Raw, keep: np.ndarray, said: str, source: str | Path) -> Selected:
+    rows = np.flatnonzero(keep)
+    _left(rows, said, source)
+    if len(rows) == len(keep):
+        return Selected(raw)
+    note = f"{said}: {len(keep) - len(rows)} of {len(keep)} rows left out"
+    return Selected(take_rows(raw, rows, source), (note,))
+
+
+def _left(rows: np.ndarray, said: str, source: str | Path) -> None:
+    if len(rows) < FEWEST:
+        raise DataError(f"{said}: {len(rows)} rows of {source} are left; expected {FEWEST} or more")

@@ -1,0 +1,110 @@
+"""The ends of the links of a file: which stands still, at which places, named how, at which carriers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
+from gsparc.data.rotation import is_unit, quaternion_to_matrix
+from gsparc.data.schema import End, Links, Stations
+
+OTHER: dict[End, End] = {"rx": "tx", "tx": "rx"}
+LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
+
+
+def numbered(places: np.ndarray) -> np.ndarray:
+    """The number (n,) int64 of each of `places` (n, 3), counted in the order in which they first appear."""
+    _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[which.reshape(-1)]
+
+
+def ends_of(check: Checker, rx: np.ndarray, tx: np.ndarray, run: np.ndarray | None) -> Links:
+    """Which end stands still, at one place or at few; None for both moving."""
+    still: dict[End, bool] = {"rx": bool((rx == rx[:1]).all()), "tx": bool((tx == tx[:1]).all())}
+    if still["rx"] or still["tx"]:
+        return Links("rx" if still["rx"] else "tx", run=run)
+    places = {
+        "rx": np.unique(rx, axis=0, return_inverse=True),
+        "tx": np.unique(tx, axis=0, return_inverse=True),
+    }
+    few: End = min(("tx", "rx"), key=lambda end: len(places[end][0]))  # type: ignore[assignment]
+    table, which = places[few]
+    if len(table) * LINKS_PER_STATION > len(rx) or len(table) * 2 > len(places[OTHER[few]][0]):
+        return Links(None, run=run)
+    end = "transmitter" if few == "tx" else "receiver"
+    check.notes.append(f"the {end} stands at {len(table)} places: taken as {len(table)} stations")
+    stations = Stations(table, tuple(str(i) for i in range(len(table))))
+    moving = rx if few == "tx" else tx
+    return Links(few, stations, which.reshape(-1).astype(np.int64), numbered(moving), run=run)
+
+
+def station_table(check: Checker) -> Stations | None:
+    """The table that a file gives; None where something is wrong with it (noted)."""
+    places = check.position("station_position", None)
+    if places is None or places.ndim != 2:
+        return None if places is None else check.refuse("station_position", "expected shape (T, 3)")
+    count = len(places)
+    names = check.raw.arrays.get("station_name")
+    if names is not None and not check.fits("station_name", names, (count,)):
+        return None
+    called = tuple(map(str, range(count) if names is None else names))
+    for name in sorted({name for name in called if called.count(name) > 1}):
+        return check.refuse("station_name", f"{name!r} twice; expected a name for each station")
+    turned = check.real("station_orientation", (count, 4))
+    if turned is not None and not is_unit(turned).all():
+        row = int(np.flatnonzero(~is_unit(turned))[0])
+        return check.refuse(
+            "station_orientation", f"row {row}: expected a quaternion (w, x, y, z) of length 1"
+        )
+    return Stations(
+        places, called, None if turned is None else quaternion_to_matrix(turned, scalar_first=True)
+    )
+
+
+def station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
+    """(S,) int64, the station of every row."""
+    index = check.raw.arrays["station"]
+    if not check.fits("station", index, (rows,)):
+        return None
+    if index.dtype.kind not in "iu":
+        return check.refuse("station", f"expected numbers of stations (integers), found dtype {index.dtype}")
+    out = np.flatnonzero((index < 0) | (index >= count))
+    if len(out):
+        return check.refuse(
+            "station", f"row {out[0]} is of station {index[out[0]]}; there are 0 to {count - 1}"
+        )
+    return index.astype(np.int64)
+
+
+def by_carrier(check: Checker, links: Links, carriers: np.ndarray | None, rows: int) -> Links:
+    """Stations at several carriers as one station for each."""
+    assert links.stations is not None and links.station is not None
+    if carriers is None or carriers.ndim == 0:
+        return links
+    if not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
+        worst = carriers[np.argmax(~((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)))]
+        check.refuse("carrier_hz", f"{worst:g}; expected Hz (not MHz or GHz)")
+        check.problems.raise_if_any()
+    stations, station = links.stations, links.station
+    if len(carriers) == len(stations) and len(stations) != rows:
+        of_link = carriers[station]
+    else:
+        if len(carriers) == len(stations) and len(np.unique(carriers)) > 1:
+            check.notes.append(
+                "carrier_hz: as many values as rows and as stations; taken as one for each row"
+            )
+        of_link = carriers if len(carriers) == len(station) else np.repeat(carriers, len(stations))
+    pairs, which = np.unique(np.stack([station, of_link], 1), axis=0, return_inverse=True)
+    first, carrier = pairs[:, 0].astype(np.int64), pairs[:, 1]
+    check.raw.arrays.pop("carrier_hz")
+    if len(np.unique(carrier)) == 1:
+        check.raw.arrays["carrier_hz"] = np.array(carrier[0])
+        return links
+    names = tuple(f"{stations.name[i]} at {c / 1e6:g} MHz" for i, c in zip(first, carrier, strict=True))
+    turned = None if stations.rotation is None else stations.rotation[first]
+    table = Stations(stations.position[first], names, turned, carrier)
+    return replace(links, stations=table, station=which.reshape(-1).astype(np.int64))

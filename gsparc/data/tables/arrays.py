@@ -1,0 +1,324 @@
+"""From a table whose columns are known to the named arrays of the schema."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.data.errors import Problems
+from gsparc.data.tables.columns import CHANNELS, LEVELS, Chosen
+from gsparc.data.tables.places import UNKNOWN_HEIGHT, Places, one_each, places
+from gsparc.data.tables.sheet import Sheet
+from gsparc.data.tables.stations import PER_STATION, StationList
+
+ENDS = {"rx": "receiver", "tx": "transmitter"}
+HEARING = ("sensor", "gateway", "gw")  # stations called so listen; all others are taken to transmit
+
+
+@dataclass(frozen=True)
+class _Stations:
+    """Names (T,), station of each row (S,) or None in the wide layout, and places (T,)."""
+
+    names: tuple[str, ...]
+    index: np.ndarray | None
+    places: Places
+
+
+class Builder:
+    """Takes arrays out of a table, noting what is wrong."""
+
+    def __init__(self, sheet: Sheet, chosen: Chosen, listed: StationList | None, problems: Problems) -> None:
+        self.sheet, self.chosen, self.listed, self.problems = sheet, chosen, listed, problems
+        self.notes: list[str] = []
+        self.arrays: dict[str, np.ndarray] = {}
+
+    def build(self) -> dict[str, np.ndarray]:
+        """All arrays; what is wrong is in `problems`."""
+        measured = self._measurement()
+        self._ends(measured)
+        self._frequency(channels="csi" in self.arrays)
+        if "sensitivity_db" in self.chosen:
+            self._one("sensitivity_db")
+        for role in ("run", "row_name"):
+            if role in self.chosen:
+                self.arrays[role] = self.sheet.words(self.chosen[role][0].head or "")
+        self.arrays.setdefault("row_name", np.array(self.sheet.rows))
+        return self.arrays
+
+    def _measurement(self) -> str | None:
+        """Add the measurement; its quantity."""
+        role = next((name for name in (*LEVELS, *CHANNELS) if name in self.chosen), None)
+        if role is None:
+            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
+            fault = (
+                f"no column of levels, powers or channels among {heads}; say dataset.columns.rssi_db=COLUMN"
+            )
+            return self.problems.add(self.sheet.source, fault)
+        if role in CHANNELS:
+            self._channels()
+            return role
+        columns = self.chosen[role]
+        found = [column.numbers(self.sheet, self.problems) for column in columns]
+        if any(values is None for values in found):
+            return role
+        values = np.stack([v for v in found if v is not None], axis=1)
+        if np.isnan(values).all():
+            self.problems.add(self.sheet.where(columns[0].head or ""), "no value in any row")
+        first = columns[0]
+        guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
+        if guessed and not (values < 0).any():  # the head says neither decibels nor watts
+            said = " or ".join(f"dataset.columns.{name}={first.head}" for name in LEVELS)
+            self.problems.add(self.sheet.where(first.head or ""), f"no value below 0: dBm or W? say {said}")
+        self.arrays[role] = values[:, 0] if len(columns) == 1 else values
+        return role
+
+    def _channels(self) -> None:
+        pairs = [{c.label: c for c in self.chosen.get(part, ())} for part in CHANNELS]
+        labels = sorted(set(pairs[0]) | set(pairs[1]), key=lambda label: (len(label), label))
+        parts: list[list[np.ndarray]] = [[], []]
+        for label in labels:
+            for part, columns, other in zip(CHANNELS, pairs, pairs[::-1], strict=True):
+                if label not in columns:
+                    fault = (
+                        f"{other[label].head!r} has no {part} beside it; say dataset.columns.{part}=COLUMN"
+                    )
+                    self.problems.add(self.sheet.source, fault)
+                    continue
+                values = columns[label].numbers(self.sheet, self.problems)
+                if values is not None:
+                    parts[CHANNELS.index(part)].append(values)
+        if self.problems:
+            return
+        csi = np.stack(parts[0], axis=1) + 1j * np.stack(parts[1], axis=1)
+        csi = csi[:, 0] if csi.shape[1] == 1 else csi
+        self.arrays["csi"] = csi
+        if np.isnan(csi).any():
+            self.arrays["mask"] = ~np.isnan(csi)
+
+    def _ends(self, measured: str | None) -> None:
+        """Add positions and stations."""
+        given = {end: places(self.sheet, self.chosen, end, self.problems) for end in ("", "rx_", "tx_")}
+        found = {end: where for end, where in given.items() if where is not None}
+        if self.problems:
+            return
+        if not found:
+            heads = ", ".join(repr(h) for h in self.sheet.heads[:8] if h)
+            fault = (
+                f"no coordinates among {heads}; say dataset.columns.x=COLUMN and .y, or .latitude, .longitude"
+            )
+            return self.problems.add(self.sheet.source, fault)
+        if len(found) == 3:
+            fault = "coordinates of rx, of tx and of an end without a name; expected two ends, rename one"
+            return self.problems.add(self.sheet.source, fault)
+        stations = self._stations(measured, found)
+        if self.problems:
+            return
+        stay = next((end for end, where in given.items() if where is not None and end not in found), "")
+        moving, where = self._moving(found, stay)
+        if stations is not None:
+            self._add_stations(stations, where.degrees)
+        self._add_places(moving, where)
+        for other in found.values():  # the end that is left, where there are no stations
+            self._add_other("tx" if moving == "rx" else "rx", other, where)
+
+    def _moving(self, found: dict[str, Places], stay: str) -> tuple[str, Places]:
+        """Which end the rows are places of, where `stay` are stations; it is taken out of `found`."""
+        named: list[str] = [end for end in ("rx_", "tx_") if end in found]
+        if "" in found:
+            named = named or [stay] * bool(stay)
+            moving = "tx" if named == ["rx_"] else "rx"
+            station = self.chosen.get("station") or self.chosen.get("station_x") or ()
+            if not named and station and station[0].word in HEARING:
+                moving = "tx"
+            if not named:
+                other = "tx" if moving == "rx" else "rx"
+                axis = "latitude" if found[""].degrees else "x"
+                rename = f"if not, name them {other}_{axis}, ..., or say dataset.columns.{other}_{axis}=..."
+                self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; {rename}")
+            return moving, found.pop("")
+        if len(named) == 2 and len(np.unique(found["rx_"].all(), axis=0)) == 1:
+            named = ["tx_"]
+        return named[0][:2], found.pop(named[0])
+
+    def _stations(self, measured: str | None, found: dict[str, Places]) -> _Stations | None:
+        """The stations, where there are; an end that is their place is taken out of `found`."""
+        where = places(self.sheet, self.chosen, "station_", self.problems)
+        labels = tuple(c.label for c in self.chosen[measured]) if measured in LEVELS else ()
+        if len(labels) > 1:
+            return self._wide(labels, where)
+        column = self.chosen.get("station", (None,))[0]
+        if column is None:
+            if self.listed is not None:
+                fault = "no column says which station a row is of; say dataset.columns.station=COLUMN"
+                return self.problems.add(self.sheet.source, fault)
+            if where is None:
+                where = self._second_in_degrees(found)
+            return None if where is None else self._unnamed(where)
+        words = self.sheet.words(column.head or "")
+        rows = (self.sheet.rows[i] for i in np.flatnonzero(words == ""))
+        self.problems.add_rows(self.sheet.where(column.head or ""), rows, "no station; expected its name")
+        if self.listed is not None:
+            self._all_listed(words, column.head or "")
+            return None if self.problems else self._by_list(words)
+        names, index = _in_order(words)
+        if where is not None:
+            each = one_each(self.sheet, where, index, names, self.problems)
+            return None if each is None else _Stations(names, index, each)
+        if self.problems:
+            return None
+        ends = [end for end in ("tx_", "rx_") if end in found] if len(found) > 1 else []
+        for end in ends:
+            each = one_each(self.sheet, found[end], index, names, None)
+            if each is not None:
+                found.pop(end)
+                return _Stations(names, index, each)
+        if ends:
+            one_each(self.sheet, found[ends[0]], index, names, self.problems)
+            return None
+        fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
+        return self.problems.add(self.sheet.source, fault + "station_lon), or say dataset.stations_file=FILE")
+
+    def _wide(self, labels: tuple[str, ...], where: Places | None) -> _Stations | None:
+        if self.listed is None:
+            hint = "in one place for all columns" if where is not None else "without places"
+            fault = (
+                f"{len(labels)} columns of stations {hint}; say dataset.stations_file=FILE (name, x, y, z)"
+            )
+            return self.problems.add(self.sheet.source, fault)
+        self._all_listed(np.array(labels), None)
+        if self.problems:
+            return None
+        order = np.array([self.listed.names.index(label) for label in labels])
+        for role in PER_STATION:
+            if role in self.listed.extra:
+                self.arrays[role] = self.listed.extra[role][order]
+        return _Stations(labels, None, self.listed.places.take(order))
+
+    def _all_listed(self, words: np.ndarray, head: str | None) -> None:
+        """Refuse names that the list of stations does not have."""
+        assert self.listed is not None
+        for word in dict.fromkeys(words[words != ""].tolist()):
+            if word in self.listed.names:
+                continue
+            close = difflib.get_close_matches(word, self.listed.names, 1, 0.5)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            place = (
+                "the heads" if head is None else f"column {head!r}, {self.sheet.rows[_first(words, word)]}"
+            )
+            self.problems.add(f"{self.sheet.source}, {place}", f"{word!r} is no listed station{hint}")
+
+    def _by_list(self, words: np.ndarray) -> _Stations:
+        assert self.listed is not None
+        number = {name: i for i, name in enumerate(self.listed.names)}
+        index = np.array([number[word] for word in words.tolist()], np.int64)
+        self.arrays |= self.listed.extra
+        silent = [name for i, name in enumerate(self.listed.names) if i not in set(index.tolist())]
+        if silent:
+            self.notes.append(f"listed, but in no row: {', '.join(silent[:8])}{', ...' * (len(silent) > 8)}")
+        return _Stations(self.listed.names, index, self.listed.places)
+
+    def _second_in_degrees(self, found: dict[str, Places]) -> Places | None:
+        """Of two ends in degrees, the one with fewer places, which are then stations."""
+        if len(found) < 2 or not all(where.degrees for where in found.values()):
+            return None
+        few = min(found, key=lambda end: len(np.unique(found[end].all(), axis=0)))
+        return found.pop(few)
+
+    def _unnamed(self, where: Places) -> _Stations | None:
+        """Stations told apart by their places alone."""
+        values, index = np.unique(where.all(), axis=0, return_inverse=True)
+        if len(values) > max(1, len(self.sheet) // 2):
+            fault = (
+                f"{len(values)} places of stations in {len(self.sheet)} rows; stations stay where they are"
+            )
+            return self.problems.add(self.sheet.source, fault)
+        each = Places(values[:, :2], values[:, 2] if values.shape[1] > 2 else None, where.degrees)
+        return _Stations(tuple(f"station {i}" for i in range(len(values))), index.reshape(-1), each)
+
+    def _add_stations(self, stations: _Stations, degrees: bool) -> None:
+        if stations.places.degrees != degrees:
+            words = ("degrees", "metres") if degrees else ("metres", "degrees")
+            fault = (
+                f"the places of rows are in {words[0]}, those of stations in {words[1]}; expected one of them"
+            )
+            return self.problems.add(self.sheet.source, fault)
+        self.arrays["station_name"] = np.array(stations.names)
+        if stations.index is not None:
+            self.arrays["station"] = stations.index.astype(np.int64)
+        self._add_places("station", stations.places)
+        return None
+
+    def _add_other(self, name: str, other: Places, moving: Places) -> None:
+        if other.degrees != moving.degrees:
+            fault = "one end is in degrees, the other in metres; expected one of them for both"
+            self.problems.add(self.sheet.source, fault)
+        else:
+            still = len(np.unique(other.all(), axis=0)) == 1
+            self._add_places(name, other.take(np.array([0])) if still else other, still=still)
+
+    def _add_places(self, name: str, where: Places, still: bool = False) -> None:
+        """Add positions [m], or degrees and heights."""
+        height = where.height
+        if height is None:
+            self.notes.append(f"no height of the {ENDS.get(name, 'stations')}: taken as {UNKNOWN_HEIGHT:g} m")
+        elif len(np.unique(height)) == 1:
+            height = height[:1]
+        flat = np.array(UNKNOWN_HEIGHT) if height is None else height[0] if len(height) == 1 else height
+        if where.degrees:
+            before = "station_" if name == "station" else ""
+            self.arrays[f"{before}latitude"] = where.across[:, 0]
+            self.arrays[f"{before}longitude"] = where.across[:, 1]
+            self.arrays[f"{name}_height"] = np.asarray(flat)
+            return
+        values = where.all()
+        self.arrays[f"{name}_position"] = values[0] if still else values
+        if where.height is None:
+            self.arrays[f"{name}_height"] = np.asarray(flat)
+
+    def _one(self, role: str) -> None:
+        """Add a number for all rows."""
+        column = self.chosen[role][0]
+        values = column.numbers(self.sheet, self.problems)
+        if values is None:
+            return
+        different = np.unique(values[~np.isnan(values)])
+        if len(different) == 1:
+            self.arrays[role] = different[0]
+        else:
+            fault = f"{len(different)} values; expected one {role} for all rows"
+            self.problems.add(self.sheet.where(column.head or ""), fault)
+
+    def _frequency(self, channels: bool) -> None:
+        if "frequency_hz" in self.chosen:
+            column = self.chosen["frequency_hz"][0]
+            if len(column.value) == 2:
+                shape = self.arrays["csi"].shape if channels else ()
+                self.arrays["frequency_hz"] = np.linspace(*column.value, shape[1] if len(shape) > 1 else 1)
+            else:
+                self._one("frequency_hz")
+        if "carrier_hz" not in self.chosen:
+            return
+        column = self.chosen["carrier_hz"][0]
+        values = column.numbers(self.sheet, self.problems)
+        if values is None:
+            return
+        rows = (self.sheet.rows[i] for i in np.flatnonzero(np.isnan(values)))
+        self.problems.add_rows(self.sheet.where(column.head or ""), rows, "no value; expected a frequency")
+        same = len(np.unique(values)) == 1
+        self.arrays["carrier_hz"] = values[0] if same else values
+        if channels and same and "frequency_hz" not in self.arrays and self.arrays["csi"].ndim == 1:
+            self.arrays["frequency_hz"] = values[0]
+
+
+def _in_order(words: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
+    """Different words in the order of their first rows, and the number of each row's."""
+    names: Sequence[str] = list(dict.fromkeys(words.tolist()))
+    number = {name: i for i, name in enumerate(names)}
+    return tuple(names), np.array([number[word] for word in words.tolist()], np.int64)
+
+
+def _first(words: np.ndarray, word: str) -> int:
+    return int(np.argmax(words == word))

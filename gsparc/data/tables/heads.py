@@ -1,0 +1,177 @@
+"""What the head of a column says: which quantity, of which end or station, in which unit."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from gsparc.data.tables.units import UNITS, Unit
+
+# Quantities a column can hold: of an end (the moving one when it is not named), and of a row.
+ENDS = ("", "rx_", "tx_", "station_")
+AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longitude": "angle"}
+KINDS: dict[str, str] = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | {
+    "rssi_db": "level",
+    "rssi": "power",
+    "sensitivity_db": "level",
+    "csi_re": "number",
+    "csi_im": "number",
+    "carrier_hz": "frequency",
+    "frequency_hz": "frequency",
+    "station": "text",
+    "run": "text",
+    "row_name": "text",
+}
+MANY = ("rssi_db", "rssi", "csi_re", "csi_im")  # may be several columns: stations, or frequencies
+OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
+OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
+
+END_WORDS = {"rx": "rx_", "receiver": "rx_", "tx": "tx_", "transmitter": "tx_", "mobile": "", "ue": ""}
+_STATION = (
+    *("station", "site", "tower", "mast", "sensor", "gateway", "gw", "bs", "cell", "enb", "gnb", "ap"),
+    *("anchor", "pci", "bssid"),
+)
+_AXIS = {"x": "x", "easting": "x", "y": "y", "northing": "y", "z": "z"}
+_AXIS |= dict.fromkeys(("height", "alt", "altitude", "elevation", "elev"), "z")
+_AXIS |= dict.fromkeys(("lat", "latitude"), "latitude")
+_AXIS |= dict.fromkeys(("lon", "lng", "long", "longitude"), "longitude")
+_PLACE = ("position", "pos", "coordinate", "coord", "location", "loc", "gps", "local", "wgs84")
+_LEVEL = ("rssi", "rsrp", "rss", "rxlev", "power", "level", "signal", "prx")
+_ABOUT_LEVEL = ("rx", "received", "receive", "strength", "signal", "mean", "avg", "average", "median")
+_NO_LEVEL: tuple[str, ...] = (
+    "tx",
+    "transmit",
+    "transmitted",
+    "eirp",
+    "noise",
+    "std",
+    "stdev",
+    "var",
+    "min",
+    "max",
+    "count",
+)
+_NO_LEVEL += ("loss", "delay", "angle", "interference", "quality", "headroom", "class", "control")
+_LABEL = ("name", "id", "nr", "no", "number", "index", "mac", "address", "label")
+_CHANNEL = ("csi", "h", "channel", "cfr")
+_PART = {"re": "csi_re", "real": "csi_re", "i": "csi_re", "im": "csi_im", "imag": "csi_im", "q": "csi_im"}
+
+
+@dataclass(frozen=True)
+class Head:
+    """What a head says.
+
+    Attributes:
+        role: one of `KINDS`; None where it says nothing that is known.
+        label: the rest, where the role may be several columns: name of a station, or number of a frequency.
+        unit: where it says one.
+        word: what named the role, in small letters.
+        strange: text in brackets that is no known unit.
+    """
+
+    role: str | None = None
+    label: str = ""
+    unit: Unit | None = None
+    word: str = ""
+    strange: str = ""
+
+
+def understand(text: str) -> Head:
+    """Read a head such as `RSRP [dBm]`, `tx_x_mm`, `Latitude (deg)`, `rssi_gateway7` or `csi_re_3`."""
+    plain, unit, strange = unit_of(text)
+    words = words_of(plain)
+    if not words:
+        return Head(unit=unit, strange=strange)
+    if unit is None and len(words) > 1 and words[-1] in UNITS:
+        # A last word may be a unit or a name (`tx_m`): it is a unit where it suits the rest.
+        last = UNITS[words[-1]]
+        cut = re.sub(rf"[\W_]*{re.escape(words[-1])}\W*$", "", plain, flags=re.IGNORECASE)
+        found = _role(words[:-1], last, cut)
+        if found.role is not None and suits(found.role, last):
+            return found
+    found = _role(words, unit, plain)
+    return Head(found.role, found.label, unit, found.word, strange)
+
+
+def suits(role: str, unit: Unit) -> bool:
+    """Whether a column of `role` can be in `unit`."""
+    return KINDS[role] == unit.kind
+
+
+def unit_of(text: str) -> tuple[str, Unit | None, str]:
+    """A head without its unit, the unit, and text in square brackets that is no known unit."""
+    match = re.search(r"\s*(?:\[([^\]]*)\]|\(([^)]*)\)|/\s*([^\s/]+))\s*$", text)
+    if match is None:
+        return text, None, ""
+    inside = next(part for part in match.groups() if part is not None).strip()
+    if inside.lower() in UNITS:
+        return text[: match.start()], UNITS[inside.lower()], ""
+    if match[1] is None:  # round brackets and what follows a slash may be words: RSRP (serving)
+        return text, None, ""
+    return text[: match.start()], None, inside
+
+
+def words_of(text: str) -> list[str]:
+    """Small words of a head: `RxPower_mean` is rx, power, mean."""
+    apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
+    apart = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", apart, flags=re.IGNORECASE)
+    return [word for word in re.split(r"[^0-9a-zµμ°]+", apart.lower()) if word]
+
+
+def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
+    rest = [word for word in words if word not in _PLACE]
+    joined = "_".join(rest)
+    if joined in KINDS and joined != "rssi":  # which is watts in the schema, but dBm in most logs
+        return Head(joined, unit=unit, word=joined)
+    if joined in OTHER_NAMES:
+        return Head(OTHER_NAMES[joined], unit=unit, word=joined)
+    return _axis(rest, unit) or _level(words, unit, plain) or _channel(words) or _text(words, unit)
+
+
+def _axis(rest: list[str], unit: Unit | None) -> Head | None:
+    axes = [word for word in rest if word in _AXIS]
+    ends = [word for word in rest if word not in _AXIS]
+    if len(axes) != 1 or len(ends) > 1:
+        return None
+    if not ends:
+        return Head(_AXIS[axes[0]], unit=unit, word=axes[0])
+    end = "station_" if ends[0] in _STATION else END_WORDS.get(ends[0])
+    return None if end is None else Head(end + _AXIS[axes[0]], unit=unit, word=axes[0])
+
+
+def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
+    named = [word for word in words if word in _LEVEL]
+    if not named or any(word in _NO_LEVEL for word in words):
+        return None
+    # 'signal strength' and 'signal power' are one thing said twice.
+    word = next((w for w in named if w != "signal"), "signal")
+    rest = [w for w in words if w != word and w not in _ABOUT_LEVEL and w not in ("db", "dbm")]
+    label = ""
+    if rest:
+        label = re.sub(
+            rf"[\W_]*(?<![a-z]){word}(?:[\W_]*dbm?(?![a-z]))?[\W_]*", " ", plain, flags=re.IGNORECASE
+        )
+        label = label.strip().strip("()[]").strip()
+    role = "rssi" if unit is not None and unit.kind == "power" else "rssi_db"
+    return Head(role, label, unit, word)
+
+
+def _channel(words: list[str]) -> Head | None:
+    numbers = [word for word in words if word.isdigit()]
+    parts = [word for word in words if word in _PART]
+    others = [word for word in words if word not in _PART and not word.isdigit() and word not in _CHANNEL]
+    said = any(word in _CHANNEL for word in words) or parts[:1] in (["re"], ["im"], ["real"], ["imag"])
+    if len(parts) != 1 or len(numbers) > 1 or others or not said:
+        return None
+    return Head(_PART[parts[0]], numbers[0] if numbers else "", word=parts[0])
+
+
+def _text(words: list[str], unit: Unit | None) -> Head:
+    rest = [word for word in words if word not in _LABEL]
+    if len(rest) == 1 and rest[0] in _STATION:
+        return Head("station", word=rest[0])
+    if rest == ["run"]:
+        return Head("run", word="run")
+    if rest and all(word in ("frequency", "freq", "carrier", "fc", "center", "centre") for word in rest):
+        return Head("carrier_hz", unit=unit, word=rest[-1])
+    return Head()

@@ -1,0 +1,108 @@
+"""Coordinates out of a table, and the one place of each station."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.data.errors import Problems
+from gsparc.data.tables.columns import Chosen
+from gsparc.data.tables.sheet import Sheet
+
+UNKNOWN_HEIGHT = 0.0
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where something was.
+
+    Attributes:
+        across: (n, 2) float64, x and y [m], or latitude and longitude [deg].
+        height: (n,) [m]; None where the table has none.
+        degrees: which of the two `across` is.
+    """
+
+    across: np.ndarray
+    height: np.ndarray | None
+    degrees: bool
+
+    def all(self) -> np.ndarray:
+        """(n, 2) or (n, 3)."""
+        return self.across if self.height is None else np.column_stack([self.across, self.height])
+
+    def take(self, rows: np.ndarray) -> Places:
+        """Those of some rows."""
+        return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
+
+
+def places(sheet: Sheet, chosen: Chosen, end: str, problems: Problems) -> Places | None:
+    """Coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none of it."""
+    for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
+        roles = [f"{end}{axis}" for axis in axes]
+        given = [role for role in roles if role in chosen]
+        if not given:
+            continue
+        if len(given) == 1:
+            missing = next(role for role in roles if role not in chosen)
+            fault = f"{given[0]} is there but no {missing}; say dataset.columns.{missing}=COLUMN"
+            return problems.add(sheet.source, fault)
+        found = [_complete(sheet, chosen, role, problems) for role in roles]
+        height = _complete(sheet, chosen, f"{end}z", problems) if f"{end}z" in chosen else None
+        if found[0] is None or found[1] is None:
+            return None
+        across = np.stack([found[0], found[1]], axis=1)
+        if degrees:
+            _on_earth(sheet, chosen, roles, across, problems)
+        return Places(across, height, degrees)
+    return None
+
+
+def _complete(sheet: Sheet, chosen: Chosen, role: str, problems: Problems) -> np.ndarray | None:
+    column = chosen[role][0]
+    values = column.numbers(sheet, problems)
+    if values is not None and np.isnan(values).any():
+        rows = (sheet.rows[i] for i in np.flatnonzero(np.isnan(values)))
+        problems.add_rows(
+            sheet.where(column.head or ""), rows, f"no value; {role} is needed, or take the row out"
+        )
+        return None
+    return values
+
+
+def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, problems: Problems) -> None:
+    for i, (role, low, high) in enumerate(zip(roles, (-90, -180), (90, 360), strict=True)):
+        bad = np.flatnonzero(~((across[:, i] >= low) & (across[:, i] <= high)))
+        swapped = i == 0 and len(bad) and (np.abs(across[:, 1]) <= 90).all()
+        hint = "; are latitude and longitude swapped?" if swapped else ""
+        rows = (f"{sheet.rows[k]}: {across[k, i]:g}" for k in bad)
+        problems.add_rows(
+            sheet.where(chosen[role][0].head or ""), rows, f"{role} is outside {low} to {high} degrees{hint}"
+        )
+
+
+def one_each(
+    sheet: Sheet, found: Places, station: np.ndarray, names: Sequence[str], problems: Problems | None
+) -> Places | None:
+    """The place of each station, which must be the same in all its rows; None, and noted, when it is not.
+
+    Args:
+        sheet: for the names of rows.
+        found: (S,) places, one for each row.
+        station: (S,) which station each row is of.
+        names: of the stations.
+        problems: takes what is wrong; None to ask only.
+    """
+    values = found.all()
+    first = np.array([int(np.argmax(station == t)) for t in range(len(names))])
+    moved = np.flatnonzero((values != values[first[station]]).any(axis=1))
+    if len(moved) == 0:
+        return found.take(first)
+    if problems is not None:
+        row = moved[0]
+        here, there = first[station[row]], row
+        at = [f"({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in (here, there)]
+        fault = f"station {names[station[row]]!r} is at {at[0]} and at {at[1]}; expected one place for each"
+        problems.add(sheet.source, fault)
+    return None

@@ -1,0 +1,209 @@
+"""CSV and its relatives: encoding, comments, delimiter and decimal mark are recognised, ragged lines not."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from gsparc.data.errors import DataError, Problems
+from gsparc.data.tables.sheet import DECIMAL_COMMA, DECIMAL_POINT, Sheet
+
+DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousands, or three decimals
+LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
+COMMENTS = ("#", "%", "//")
+# What files of other kinds begin with: the name may say .csv all the same.
+OTHERS = {
+    b"PK\x03\x04": "an Excel workbook or another zip archive; save it as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook; save it as CSV",
+    b"PAR1": "a Parquet file; name it *.parquet",
+    b"\x1f\x8b": "compressed by gzip; unpack it first",
+    b"\x89HDF": "an HDF5 file; name it *.h5",
+    b"%PDF": "a PDF document; save the table as CSV",
+    b"<": "HTML or XML; save the table as CSV",
+    b"{": "JSON; save the table as CSV",
+    b"[{": "JSON; save the table as CSV",
+}
+
+
+@dataclass(frozen=True)
+class _Lines:
+    """Lines with something in them, and their numbers from 1."""
+
+    text: list[str]
+    number: list[int]
+    comment_before: str  # the last comment before the first of them
+
+
+def read_text(path: Path) -> tuple[Sheet, list[str]]:
+    """The cells of a text file, and notes on what was recognised.
+
+    Raises:
+        DataError: empty, not text, no heads, ragged lines or two columns of one name.
+    """
+    source, notes = str(path), []
+    text, encoding = _decoded(path)
+    if encoding != "UTF-8":
+        notes.append(f"read as {encoding}")
+    lines = _lines(text)
+    if not lines.text:
+        raise DataError(f"{source}: empty; expected a line of heads and rows below it")
+    said = re.fullmatch(r"sep=(.)", lines.text[0].strip())
+    if said:  # Excel's own hint
+        lines = _Lines(lines.text[1:], lines.number[1:], "")
+    delimiter = said[1] if said else _delimiter(lines)
+    if delimiter is None or not lines.text:
+        fault = f"line 1 ({lines.text[0][:40]!r}) is a single column" if lines.text else "no heads"
+        raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
+    lines = _with_heads(lines, delimiter, source)
+    _rectangular(lines, delimiter, source)
+    heads = tuple(cell.strip() for cell in _cells(lines.text[0], delimiter))
+    _distinct(heads, source)
+    if len(lines.text) == 1:
+        raise DataError(f"{source}: line {lines.number[0]} names columns, but there are no rows below it")
+    frame = _parsed(lines.text[1:], delimiter)
+    decimal = "." if delimiter == "," and not _quoted_decimals(text, frame) else _decimal(frame)
+    if delimiter != ",":
+        notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
+    if decimal == ",":
+        notes.append("decimal commas")
+    columns = tuple(frame[i] for i in range(len(heads)))
+    return Sheet(source, heads, columns, tuple(f"line {n}" for n in lines.number[1:]), decimal), notes
+
+
+def _decoded(path: Path) -> tuple[str, str]:
+    """The text of a file and the name of its encoding."""
+    content = path.read_bytes()
+    for start, what in OTHERS.items():
+        if content.lstrip().startswith(start):
+            raise DataError(f"{path}: not a table of text but {what}")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        try:
+            return content.decode("utf-16"), "UTF-16"
+        except UnicodeDecodeError as error:
+            raise DataError(f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8") from None
+    if b"\0" in content:
+        raise DataError(
+            f"{path}: not text (byte {content.index(0)} is zero; UTF-16 without its mark?); save it as UTF-8"
+        )
+    try:
+        return content.decode("utf-8-sig"), "UTF-8"
+    except UnicodeDecodeError:
+        # Every byte means something in Latin-1; Windows-1252 is what spreadsheets write.
+        return content.decode("cp1252", errors="replace"), "Windows-1252, as it is not UTF-8"
+
+
+def _lines(text: str) -> _Lines:
+    found: list[str] = []
+    numbers: list[int] = []
+    comment = ""
+    # Not str.splitlines, which also ends lines at characters that may stand in a cell.
+    for number, line in enumerate(re.split(r"\r\n|\n|\r", text), 1):
+        stripped = line.strip()
+        if stripped.startswith(COMMENTS):
+            comment = comment if found else stripped.lstrip("#%/ ")
+        elif stripped.strip(",;\t |"):  # spreadsheets write empty lines as delimiters alone
+            found.append(line)
+            numbers.append(number)
+    return _Lines(found, numbers, comment)
+
+
+def _cells(line: str, delimiter: str) -> list[str]:
+    if delimiter == " ":
+        return line.split()
+    if '"' not in line:
+        return line.split(delimiter)
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True))
+
+
+def _delimiter(lines: _Lines) -> str | None:
+    """The one by which most of the first lines have as many cells as the first, and that is not one."""
+    best: tuple[float, int, str] | None = None
+    sample = lines.text[:LOOKED_AT]
+    for delimiter in DELIMITERS:
+        count = len(_cells(sample[0], delimiter))
+        if count < 2 or (delimiter == " " and best is not None):
+            continue
+        agree = sum(len(_cells(line, delimiter)) == count for line in sample) / len(sample)
+        if best is None or (agree, count) > best[:2]:
+            best = (agree, count, delimiter)
+    return None if best is None else best[2]
+
+
+def _with_heads(lines: _Lines, delimiter: str, source: str) -> _Lines:
+    """The lines, the first of them heads; a comment before numbers is taken for them where it fits."""
+    first = _cells(lines.text[0], delimiter)
+    if not all(_is_number(cell) for cell in first):
+        return lines
+    heads = _cells(lines.comment_before, delimiter) if lines.comment_before else []
+    if len(heads) == len(first) and not all(_is_number(cell) for cell in heads):
+        return _Lines([lines.comment_before, *lines.text], [lines.number[0] - 1, *lines.number], "")
+    fault = f"line {lines.number[0]} holds numbers; expected the names of the columns above them"
+    raise DataError(f"{source}: {fault}")
+
+
+def _is_number(cell: str) -> bool:
+    return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
+
+
+def _rectangular(lines: _Lines, delimiter: str, source: str) -> None:
+    """Refuse quotes that stay open, and lines with more or fewer cells than there are heads."""
+    problems = Problems(source)
+    for line, number in zip(lines.text, lines.number, strict=True):
+        if line.count('"') % 2 and delimiter != " ":
+            fault = (
+                "a quotation mark is not closed on this line; close it, or remove the line break in the cell"
+            )
+            raise DataError(f"{source}, line {number}: {fault}")
+    counts = [len(_cells(line, delimiter)) for line in lines.text]
+    wrong = [i for i, count in enumerate(counts) if count != counts[0]]
+    if wrong and len(wrong) == len(counts) - 1 and len(set(counts[1:])) == 1:
+        hint = "; decimal commas need semicolons or tabs between columns" if delimiter == "," else ""
+        fault = f"{counts[0]} heads, but every line below has {counts[1]} cells{hint}"
+        raise DataError(f"{source}, line {lines.number[0]}: {fault}")
+    names = (f"line {lines.number[i]} ({counts[i]} cells)" for i in wrong)
+    mark = DELIMITERS.get(delimiter, delimiter)
+    problems.add_rows(source, names, f"expected {counts[0]} cells between {mark}, as there are heads")
+    problems.raise_if_any()
+
+
+def _distinct(heads: tuple[str, ...], source: str) -> None:
+    for i, head in enumerate(heads):
+        if head and head in heads[:i]:
+            where = f"columns {heads.index(head) + 1} and {i + 1}"
+            raise DataError(f"{source}: {where} are both named {head!r}; rename one")
+
+
+def _parsed(lines: list[str], delimiter: str) -> pd.DataFrame:
+    """Cells as text, columns numbered from 0; the lines are rectangular already."""
+    spaces = delimiter == " "
+    return pd.read_csv(
+        io.StringIO("\n".join(line.strip() if spaces else line for line in lines)),
+        sep=r"\s+" if spaces else delimiter,
+        header=None, index_col=False, dtype=str, na_filter=False, skipinitialspace=True, encoding="utf-8",
+        quoting=csv.QUOTE_NONE if spaces else csv.QUOTE_MINIMAL,
+    )  # fmt: skip
+
+
+def _quoted_decimals(text: str, frame: pd.DataFrame) -> bool:
+    """Whether cells in quotes hold decimal commas between commas, not marks between thousands alone."""
+    if '"' not in text:
+        return False
+    cells = pd.concat([frame[i] for i in frame.columns])
+    return bool((cells.str.fullmatch(DECIMAL_COMMA) & ~cells.str.fullmatch(THOUSANDS)).any())
+
+
+def _decimal(frame: pd.DataFrame) -> str:
+    """The mark that most numbers have that have one."""
+    counts = dict.fromkeys(",.", 0)
+    for i in frame.columns:
+        sample = frame[i].iloc[:: max(1, len(frame) // LOOKED_AT)]
+        counts[","] += int(sample.str.fullmatch(DECIMAL_COMMA).sum())
+        counts["."] += int(sample.str.fullmatch(DECIMAL_POINT).sum())
+    return "," if counts[","] > counts["."] else "."

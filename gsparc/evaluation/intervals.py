@@ -1,0 +1,72 @@
+"""How honest predicted variances of powers are: intervals that hold the truth, outages that come true."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.stats import norm
+
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.scores import Scores
+
+SHARE = 0.9  # of the truth that an interval is to hold
+DB = 10 / math.log(10)
+
+
+def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
+    """Figures of predicted normal distributions of decibels; empty where the method has no variance.
+
+    `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
+    `interval/width_db` its mean width. Where powers may be too weak to be heard, `outage/rate` is the share
+    of rows that were, `outage/brier` the mean square of (predicted probability - what happened), 0 when
+    perfect, and `outage/brier_rate` what always saying the rate gives.
+
+    Args:
+        scores: of powers (kind rssi).
+        data: whose rows they are.
+    """
+    mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
+    known = np.isfinite(variance) & (variance > 0) & (mean > 0)
+    if not known.any():
+        return {}
+    mean_db, spread_db = in_decibels(mean[known], variance[known])
+    row = scores.row[known]
+    power = data.target[row, 0].astype(np.float64) * data.site.target_scale
+    silent = np.zeros(len(row), bool) if data.censored is None else data.censored[row]
+    heard = ~silent & (power > 0)
+    found: dict[str, float | None] = {}
+    if heard.any():
+        half = norm.ppf((1 + SHARE) / 2) * spread_db[heard]
+        inside = np.abs(10 * np.log10(power[heard]) - mean_db[heard]) <= half
+        found |= {"interval/coverage_90": float(inside.mean()), "interval/width_db": float(2 * half.mean())}
+    level_db = levels(data)
+    if level_db is None:
+        return found
+    of_row = level_db[0 if data.station is None else data.station[row]]
+    told = np.isfinite(of_row)
+    if not told.any():  # all of them are of stations that heard everything
+        return found
+    chance = norm.cdf((of_row[told] - mean_db[told]) / spread_db[told])
+    rate = float(silent[told].mean())
+    return found | {
+        "outage/rate": rate,
+        "outage/brier": float(np.mean((chance - silent[told]) ** 2)),
+        "outage/brier_rate": rate * (1 - rate),
+    }
+
+
+def in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
+    return 10 * np.log10(mean), DB * np.sqrt(variance) / mean
+
+
+def levels(data: Measurements) -> np.ndarray | None:
+    """Level (T,) [dB] below which each station hears nothing, NaN where it heard all; None without any."""
+    if data.censored is None or not data.censored.any():
+        return None
+    station = np.zeros(len(data), np.int64) if data.station is None else data.station
+    found = np.full(1 if data.site.stations is None else len(data.site.stations), np.nan)
+    rows = np.flatnonzero(data.censored)
+    found[station[rows]] = 10 * np.log10(data.target[rows, 0].astype(np.float64) * data.site.target_scale)
+    return found

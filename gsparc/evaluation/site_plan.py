@@ -1,0 +1,287 @@
+"""Where measurements were taken, from above, and what is doubtful about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.patheffects import withStroke
+from scipy.spatial import cKDTree
+
+from gsparc.data.doubts import wild_of
+from gsparc.data.level_steps import LevelStep
+from gsparc.data.link_levels import LinkLevels
+from gsparc.data.outliers import outliers, too_far
+from gsparc.data.schema import Measurements
+from gsparc.evaluation.drawing import panels, save
+
+NAMED = 15  # stations; of more only their number is said
+MOST_JUMPS = 4  # stations in the second column: those that change most
+MOST_MARKS = 8  # doubtful places that are named
+INCHES = 6.5  # longer side of the map
+PLAIN = ("receiver", "transmitter")  # in the legend
+OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
+
+
+@dataclass(frozen=True)
+class Spots:
+    """Distinct places of the moving end.
+
+    Attributes:
+        place: (n, 2) world x and y [m].
+        level_db: (n,) [dB], NaN where nothing was heard; None of spectra.
+        label: what the level is.
+        rows: (n,) what messages call the first row at each.
+        far: (n,) bool, too far from all others to be drawn among them.
+        doubtful: (n,) bool, rows of outliers and of levels far from those around.
+    """
+
+    place: np.ndarray
+    level_db: np.ndarray | None
+    label: str
+    rows: list[str]
+    far: np.ndarray
+    doubtful: np.ndarray
+
+
+def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
+    """Places of the moving end (of the receiver where both move), the levels there and what is doubtful."""
+    site = data.site
+    of_row = data.moving[:, -3:]
+    place, first, which = np.unique(of_row, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)  # as measured: later ones are drawn above
+    which = np.argsort(order)[which.reshape(-1)]
+    place, count = place[order], len(place)
+    far, doubtful = np.zeros((2, count), bool)
+    far[which[too_far(data.moving)]] = True
+    for rows in outliers(data).values():
+        doubtful[which[rows]] = True
+    if levels is not None:
+        lost = [rows for _, rows, _ in wild_of(levels.station, levels.level_db)]
+        wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
+        doubtful[cKDTree(place).query(wild)[1]] = True
+    level, label = _levels(data, which, count)
+    names = [data.row_names[i].partition(", station")[0] for i in first[order]]
+    return Spots(place[:, :2] + site.origin[:2], level, label, names, far, doubtful)
+
+
+def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
+    """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
+    several = data.site.stations is not None and len(data.site.stations) > 1
+    if data.site.kind == "spectrum":
+        return None, ""
+    power = np.abs(data.target.reshape(len(data), -1)).astype(np.float64)
+    power = (
+        power * data.site.target_scale if data.site.kind == "rssi" else (power * data.site.target_scale) ** 2
+    )
+    heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
+    row, entry = np.nonzero(heard & (power > 0))
+    value = power[row, entry]
+    if data.site.kind == "rssi":
+        value = 10 * np.log10(value)
+    total, number = (np.bincount(which[row], w, minlength=count) for w in (value, None))
+    mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
+    if data.site.kind == "rssi":
+        return mean, "received power" + (", mean of the stations heard" if several else "") + " [dB]"
+    with np.errstate(divide="ignore"):
+        return 10 * np.log10(mean), "mean channel power" + (" of all stations" if several else "") + " [dB]"
+
+
+def draw_site(
+    data: Measurements,
+    path: Path,
+    levels: LinkLevels | None = None,
+    steps: Sequence[tuple[int, LevelStep]] = (),
+) -> None:
+    """Save a map of places and stations and, beside it, the levels of stations that jump.
+
+    Args:
+        data: measurements of any kind.
+        path: PNG file.
+        levels: `link_levels` of powers.
+        steps: `doubts.steps_of` the levels.
+    """
+    found = spots(data, levels)
+    low, high = _view(data, found)
+    width, height = (high - low) / (high - low).max() * INCHES
+    width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
+    jumping = sorted({t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t))
+    jumping = jumping[:MOST_JUMPS]
+    if not jumping or levels is None:
+        figure, axes = panels(width, height)
+        axis = axes[0, 0]
+    else:
+        how: dict[str, Any] = {"width_ratios": [width, 6.0]}
+        figure, axes = panels(width + 6.0, max(height, 2.2 * len(jumping)), len(jumping), 2, **how)
+        place = axes[0, 0].get_gridspec()[:, 0]
+        for one in axes[:, 0]:
+            one.remove()
+        axis = figure.add_subplot(place)
+        axis.grid(alpha=0.3)
+        for one, t in zip(axes[:, 1], jumping, strict=True):
+            _draw_level(one, levels, t, [step for u, step in steps if u == t])
+    _draw_map(axis, data, found, low, high, jumping)
+    legend = figure.legend(loc="outside lower left", ncols=4, fontsize="small", frameon=False)
+    mark: Any
+    for mark, text in zip(legend.legend_handles, legend.get_texts(), strict=True):
+        if text.get_text() in PLAIN:  # whose colours and sizes are those of the first place
+            mark.set_array(None)
+            mark.set_color("0.4")
+            mark.set_sizes([25])
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=0.12, h_pad=0.08)  # axes of equal scales take more than their share
+    figure.suptitle(_title(data, found))
+    save(figure, path)
+
+
+def _title(data: Measurements, found: Spots) -> str:
+    kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
+    stations = data.site.stations
+    at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
+    return f"{data.site.name}: {len(data)} {kind} at {len(found.place)} places{at}"
+
+
+def _still(data: Measurements) -> np.ndarray:
+    """World x and y (T, 2) of the ends that stand still, where that is known."""
+    site = data.site
+    if site.stations is not None:
+        place = site.stations.position
+    else:
+        place = np.zeros((0, 3)) if site.static_position is None else site.static_position[None]
+    return place[:, :2] + site.origin[:2]
+
+
+def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,) of the map: all places but those far outside, all stations, and a margin."""
+    shown = [found.place[~found.far], _still(data)]
+    if data.site.static_end is None:
+        shown.append(data.tx[:, :2] + data.site.origin[:2])
+    every = np.concatenate(shown)
+    low, high = every.min(axis=0), every.max(axis=0)
+    margin = 0.06 * max(float((high - low).max()), 1e-3)
+    return low - margin, high + margin
+
+
+def _draw_map(
+    axis: Any, data: Measurements, found: Spots, low: np.ndarray, high: np.ndarray, jumping: Sequence[int]
+) -> None:
+    site, inside = data.site, ~found.far
+    size = _size(found.place[inside], float((high - low).max()))
+    if site.static_end is None:
+        tx = np.unique(data.tx[:, :2], axis=0) + site.origin[:2]
+        axis.scatter(*tx.T, s=10, c="0.55", marker="s", linewidths=0, label="transmitter")
+    name = "receiver" if site.moving_end == "rx" else "transmitter"
+    if found.level_db is None or not np.isfinite(found.level_db[inside]).any():
+        axis.scatter(*found.place[inside].T, s=size, c="tab:blue", linewidths=0, label=name)
+    else:
+        known = inside & np.isfinite(found.level_db)
+        if (inside & ~known).any():
+            silent = found.place[inside & ~known]
+            axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
+        limits = dict(zip(("vmin", "vmax"), np.percentile(found.level_db[known], [1, 99]), strict=True))
+        drawn = axis.scatter(
+            *found.place[known].T, c=found.level_db[known], s=size, linewidths=0, label=name, **limits
+        )
+        assert axis.figure is not None
+        axis.figure.colorbar(drawn, ax=axis, label=found.label, extend="both", shrink=0.85, pad=0.02)
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", **_labels(data))
+    axis.ticklabel_format(useOffset=False, style="plain")
+    _draw_stations(axis, data, jumping)
+    _draw_doubts(axis, found, low, high)
+
+
+def _size(place: np.ndarray, extent: float) -> float:
+    """Area [points^2] of a mark as large as the distance between neighbours."""
+    apart = float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])) if len(place) > 1 else extent
+    return float(np.clip(72 * INCHES * apart / extent, 2.5, 9.0)) ** 2
+
+
+def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> None:
+    place, site = _still(data), data.site
+    if not len(place):
+        return
+    what = "transmitter" if site.static_end == "tx" else "receiver"
+    label = f"the {what}" if site.stations is None else f"{len(place)} stations ({what}s)"
+    how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}
+    axis.plot(*place.T, "k^", label=label, **how)
+    if jumping:
+        axis.plot(*place[list(jumping)].T, "^", color="red", label="its level jumps", **how)
+    if site.stations is None or len(place) > NAMED:
+        return
+    for number, (where, name) in enumerate(zip(place, site.stations.name, strict=True)):
+        _say(axis, name, where, "red" if number in jumping else "black")
+
+
+def _draw_doubts(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
+    near, far = np.flatnonzero(found.doubtful & ~found.far), np.flatnonzero(found.far)
+    if len(near):
+        marks = {"s": 90, "facecolors": "none", "edgecolors": "red", "linewidths": 1.5}
+        label = f"level in doubt ({len(near)} place{'s' * (len(near) > 1)})"
+        axis.scatter(*found.place[near].T, label=label, zorder=3, **marks)
+    if len(far):
+        edge = np.clip(
+            found.place[far], *(corner + s * 0.02 * (high - low) for corner, s in ((low, 1), (high, -1)))
+        )
+        axis.scatter(
+            *edge.T, c="red", marker="x", s=60, zorder=3, label=f"far outside, at the edge ({len(far)})"
+        )
+        for row, where in zip(far[:MOST_MARKS], edge, strict=False):
+            _say(
+                axis,
+                f"{found.rows[row]} at ({', '.join(f'{v:.4g}' for v in found.place[row])})",
+                where,
+                "red",
+            )
+    for row in near[:MOST_MARKS]:
+        _say(axis, found.rows[row], found.place[row], "red", above=False)
+
+
+def _say(axis: Any, text: str, where: np.ndarray, colour: str, above: bool = True) -> None:
+    """Write beside a point: above to its right, or below to its left, where the map does not end there."""
+    low, high = axis.get_xlim()
+    left = where[0] > low + (0.75 if above else 0.25) * (high - low)
+    note = axis.annotate(
+        text, where, xytext=(-7 if left else 7, 5 if above else -12), textcoords="offset points",
+        ha="right" if left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=4,
+    )  # fmt: skip
+    note.set_in_layout(False)
+
+
+def _labels(data: Measurements) -> dict[str, str]:
+    origin = data.site.georeference
+    if origin is None:
+        return {"xlabel": "x [m]", "ylabel": "y [m]"}
+    where = f"{abs(origin.longitude):g}° {'E' if origin.longitude >= 0 else 'W'}"
+    north = f"{abs(origin.latitude):g}° {'N' if origin.latitude >= 0 else 'S'}"
+    return {"xlabel": f"metres east of {where}", "ylabel": f"metres north of {north}"}
+
+
+def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep]) -> None:
+    """Levels of a station by row; those between two steps in one colour."""
+    rows = np.flatnonzero(levels.station == station)
+    level = levels.level_db[rows]
+    number = np.arange(len(rows))
+    edges = [0, *(int(np.searchsorted(rows, step.first)) for step in steps), len(rows)]
+    for k, (start, stop) in enumerate(pairwise(edges)):
+        axis.plot(number[start:stop], level[start:stop], ".", markersize=2.5, color=f"C{k}")
+    low, high = axis.get_ylim()
+    axis.set_ylim(low, high + 0.2 * (high - low))  # room for words
+    for k, step in enumerate(steps):
+        last, first = (int(np.searchsorted(rows, row)) for row in (step.last, step.first))
+        axis.axvspan(last, max(first, last + 1), facecolor="red", alpha=0.2)
+        axis.axvline(first, color="red", linewidth=1.2)
+        said = f" {step.change_db:+.0f} dB from {levels.rows[step.last]} to {levels.rows[step.first]} "
+        axis.text(
+            first, 0.97 - 0.1 * k, said, color="red", fontsize="small", va="top",
+            ha="left" if first < len(rows) / 2 else "right", transform=axis.get_xaxis_transform(),
+            path_effects=OUTLINE,
+        )  # fmt: skip
+    wild = [bad for t, bad, _ in wild_of(levels.station, levels.level_db) if t == station]
+    for row in np.concatenate([np.zeros(0, np.int64), *wild]):
+        axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
+    axis.set(title=f"{levels.names[station]}: steps that the places do not explain", ylabel="level [dB]")
+    axis.set_xlabel("place, in the order of measuring")

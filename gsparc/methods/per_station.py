@@ -1,0 +1,211 @@
+"""One copy of a method for each station, and one over all stations for those that it never heard.
+
+Methods know one static end. Measurements with several are several such sites that share their places: a copy
+is fitted to the rows of each. A station without training rows is answered by a copy that takes both ends for
+moving, so that its query is (tx, rx), where the method can do that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.methods.censored import heard
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.time_budget import Clock, less_repeatable
+from gsparc.ops import Pose
+
+SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
+UNHEARD = -1  # in place of a station's number: the copy for all that were never heard
+
+
+def for_links(make: Callable[[], Method], data: Measurements) -> Method:
+    """`make()`, or a copy of it for each station where there are several.
+
+    Raises:
+        ValueError: both ends move, and the method knows one that does.
+    """
+    method = make()
+    if data.site.stations is not None and len(data.site.stations) > 1:
+        return PerStation(make)
+    if data.site.static_end is None and not method.both_ends:
+        raise ValueError(f"{method.name}: both ends move here; it needs one that stands still")
+    return method
+
+
+def taught(method: Method, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
+    """Stations (T,) bool with training rows enough for `method`, and those that are asked for without."""
+    assert data.station is not None and data.site.stations is not None
+    count = len(data.site.stations)
+    rows = fold.train if method.uses_censored else heard(data, fold.train)
+    known = np.bincount(data.station[rows], minlength=count) >= LEAST_ROWS
+    return known, (np.bincount(data.station[fold.test], minlength=count) > 0) & ~known
+
+
+def of_station(site: Site, number: int) -> Site:
+    """The site as one station sees it; of `UNHEARD`, with both ends moving."""
+    assert site.stations is not None
+    if number == UNHEARD:
+        return replace(site, stations=None, static_end=None, static_position=None)
+    stations = site.stations
+    carrier = site.carrier_hz if stations.carrier_hz is None else float(stations.carrier_hz[number])
+    rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
+    return replace(
+        site, name=f"{site.name}, station {stations.name[number]}", stations=None, carrier_hz=carrier,
+        static_position=stations.position[number], rx_rotation=rotation,
+    )  # fmt: skip
+
+
+class PerStation(Method):
+    """Copies of a method by station.
+
+    Args:
+        make: makes an unfitted copy.
+    """
+
+    def __init__(self, make: Callable[[], Method]) -> None:
+        self._make = make
+        first = make()
+        self.name, self.effects, self.guesses = first.name, first.effects, first.guesses
+        self.wrapped = first
+        self._copies: dict[int, Method] = {}
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Fit every station that is asked for, or all together as if both ends moved; seconds are shared.
+
+        Raises:
+            ValueError: a station of the test rows has too few training rows, or all are learned together, and
+                the method cannot take both ends for moving.
+        """
+        assert data.station is not None and data.site.stations is not None
+        together = context.stations == "together"
+        if together and not self.wrapped.both_ends:
+            raise ValueError(f"{self.name}: knows one static end; say stations=each")
+        self.site = data.site
+        self._shape = tuple(data.target.shape[1:])
+        known, unheard = taught(self.wrapped, data, fold)
+        numbers = [int(t) for t in np.flatnonzero(known)]
+        if together:
+            numbers = [UNHEARD]
+        elif unheard.any():
+            if not self.wrapped.both_ends:
+                names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
+                raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
+            numbers.append(UNHEARD)
+        share = None if context.budget_s is None else context.budget_s / len(numbers)
+        seconds, notes = 0.0, []
+        limited: Clock | None = None
+        for number in numbers:
+            rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+            copy, part = self._make(), data.subset(rows, of_station(data.site, number))
+            inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
+            where = context.run_dir / f"station{number}" if number != UNHEARD else context.run_dir / "unheard"
+            report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
+            self._copies[number] = copy
+            seconds, limited = seconds + report.seconds, less_repeatable(limited, report.limited_by)
+            all_or_new = "all stations" if together else "stations never heard"
+            name = all_or_new if number == UNHEARD else data.site.stations.name[number]
+            notes += [f"{name}: {note}" for note in report.notes]
+        return FitReport(seconds, tuple(notes), limited)
+
+    def answer(self, batch: Batch) -> Prediction:
+        """Each row by its station's copy."""
+        stations = self._stations(batch.tx, batch.rx) if batch.station is None else batch.station
+        return self._gathered(stations, lambda copy, chosen: copy.answer(_rows(batch, chosen, copy.site)))
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """By the copy of the station that stands at the static end; see `Method.predict`."""
+        everyone = torch.arange(len(tx))
+
+        def ask(copy: Method, chosen: Tensor) -> Prediction:
+            return copy.predict(tx[chosen], _pose(rx, chosen, copy.site))
+
+        return self._gathered(self._stations(tx, rx)[everyone], ask)
+
+    def of(self, number: int) -> Method:
+        """The copy that answers for a station.
+
+        Raises:
+            ValueError: it had too few training rows, and there is no copy for such stations.
+        """
+        copy = self._copies.get(number, self._copies.get(UNHEARD))
+        if copy is None:
+            assert self.site is not None and self.site.stations is not None
+            name = self.site.stations.name[number]
+            raise ValueError(f"{self.name}: station {name} had too few training rows")
+        return copy
+
+    def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
+        assert self.site is not None and self.site.stations is not None
+        ends = tx if self.site.static_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
+        table = torch.from_numpy(self.site.stations.position)
+        distance = torch.cdist(ends.detach().cpu().double(), table)
+        apart, number = distance.min(dim=1)
+        shared = ((distance <= SAME_PLACE_M).sum(dim=1) > 1).nonzero()[:1, 0].tolist()
+        if shared and set(self._copies) != {UNHEARD}:  # sectors of one mast, or carriers
+            here = (distance[shared[0]] <= SAME_PLACE_M).nonzero()[:, 0].tolist()
+            names = " and ".join(self.site.stations.name[t] for t in here)
+            raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
+        if (apart > SAME_PLACE_M).any() and UNHEARD not in self._copies:
+            row = int(apart.argmax())
+            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M * 100:g} cm of row {row}")
+        return torch.where(apart > SAME_PLACE_M, UNHEARD, number)
+
+    def _gathered(self, stations: Tensor, ask: Callable[[Method, Tensor], Prediction]) -> Prediction:
+        parts: list[tuple[Tensor, Prediction]] = []
+        for number in stations.unique().tolist():
+            chosen = (stations == number).nonzero()[:, 0]
+            parts.append((chosen, ask(self.of(number), chosen)))
+        order = torch.argsort(torch.cat([chosen for chosen, _ in parts]))
+
+        def joined(name: str) -> Tensor | None:
+            values = [getattr(part, name) for _, part in parts]
+            return None if any(v is None for v in values) else torch.cat(values)[order]
+
+        mean = joined("mean")
+        assert mean is not None
+        return Prediction(mean, joined("confidence"), joined("variance"))
+
+    def state(self) -> dict[str, Any]:
+        """The state of every copy, by its station's number."""
+        return {"per_station": {str(number): copy.state() for number, copy in self._copies.items()}}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site = site
+        for number, part in state["per_station"].items():
+            self._copies[int(number)] = copy = self._make()
+            copy.restore(of_station(site, int(number)), part)
+
+    def size(self) -> int:
+        """That of all copies."""
+        return sum(copy.size() for copy in self._copies.values())
+
+    def __iter__(self) -> Iterator[tuple[int, Method]]:
+        return iter(self._copies.items())
+
+
+def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
+    """The chosen poses; one for all where the receiver is the station."""
+    assert site is not None
+    if not rx.batched:
+        return rx
+    if site.static_end == "rx":
+        return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
+    return Pose(rx.position[chosen], rx.rotation[chosen])
+
+
+def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
+    parts = {
+        name: value if value is None or name in ("rx", "station") else value[chosen]
+        for name, value in vars(batch).items()
+    }
+    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": None})

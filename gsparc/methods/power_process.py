@@ -1,0 +1,333 @@
+"""A Gaussian process on powers in decibels about a constant or a distance law, silent rows included."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, solve_triangular
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+from torch import Tensor
+
+from gsparc.data.schema import Site
+from gsparc.methods.censored_ep import condition, log_evidence, propagate
+from gsparc.methods.distance_law import Law, Rows, law_of
+from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
+
+MeanName = Literal["auto", "constant", "distance"]
+MEANS: tuple[MeanName, ...] = get_args(MeanName)
+
+CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors a matrix
+COMPARED_ON = 500  # of them, constant and distance law
+WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
+MOST_ROWS = 6_000  # learned from
+MOST_SILENT = 3_000  # of them, where nothing was heard
+LAW_NEEDS = 8  # rows that were heard, for a distance law
+TWO_LENGTHS_NEED = 100
+SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
+SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
+EVIDENCE_LOOKS = 30
+AMPLITUDES_DB2 = (1e-4, 1e5)
+
+
+@dataclass(frozen=True)
+class Trend:
+    """The mean of powers, and what of it is uncertain.
+
+    Attributes:
+        level: the mean where there is no law [dB].
+        law: the distance law, or None.
+        middle, spread: mean and deviation of the rows' decades of distance: its slope is uncertain in these.
+    """
+
+    level: float
+    law: Law | None = None
+    middle: float = 0.0
+    spread: float = 1.0
+
+    @classmethod
+    def of(cls, rows: Rows, law: Law | None) -> Trend:
+        """About a law; about the mean of what was heard where that is None."""
+        used = ~rows.silent if not rows.silent.all() else rows.silent
+        if law is None:
+            return cls(float(rows.decibels[used].mean()))
+        decades = law.decades(torch.from_numpy(rows.places))
+        return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), 1e-6))
+
+    def mean(self, places: Tensor) -> Tensor:
+        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
+        return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
+
+    def terms(self, places: Tensor) -> Tensor:
+        """What is uncertain of the mean: (n, 1), a constant, or (n, 2), also the slope of the law."""
+        one = torch.ones_like(places[:, :1])
+        if self.law is None:
+            return one
+        return torch.cat([one, (self.law.decades(places)[:, None] - self.middle) / self.spread], 1)
+
+
+@dataclass(frozen=True)
+class PowerProcess:
+    """A fitted process.
+
+    Attributes:
+        trend, kernel: the prior.
+        places: (n, 3) or (n, 6) float64 [m].
+        weights: (n,) of the covariances with these places, in units of the amplitude.
+        extra: (n,) variance of the pseudo-values of silent rows, of the amplitude; 0 at rows that were heard.
+    """
+
+    trend: Trend
+    kernel: PowerKernel
+    places: np.ndarray
+    weights: np.ndarray
+    extra: np.ndarray
+
+    @cached_property
+    def factor(self) -> np.ndarray:
+        """Lower Cholesky factor (n, n) of the covariance, of the amplitude."""
+        return _factored(_gram(self.kernel, self.places, self.trend), self.extra)
+
+    def mean_and_variance(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean [dB], variance of a measurement [dB^2], and its share of the prior's, each (B,)."""
+        places = torch.from_numpy(queries)
+        terms = self.trend.terms(places).numpy()
+        cross = self.kernel.correlation(cdist(queries, self.places)) + terms @ self._terms.T
+        mean = self.trend.mean(places).numpy() + cross @ self.weights
+        prior = 1 + self.kernel.noise + (terms**2).sum(1)
+        known = (solve_triangular(self.factor, cross.T, lower=True, check_finite=False) ** 2).sum(0)
+        left = np.clip(prior - known, 0.0, prior)
+        return mean, self.kernel.amplitude * left, left / prior
+
+    def mean_at(self, queries: Tensor) -> Tensor:
+        """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
+        places, weights = torch.from_numpy(self.places), torch.from_numpy(self.weights)
+        apart = (queries[:, None] - places).square().sum(-1).clamp_min(1e-24).sqrt()  # finite slope at 0
+        cross = self.trend.terms(queries) @ torch.from_numpy(self._terms).T
+        for length, share in zip(self.kernel.lengths, self.kernel.shares, strict=True):
+            far = apart * (math.sqrt(3) / length)
+            cross = cross + share * (1 + far) * torch.exp(-far)
+        return self.trend.mean(queries) + cross @ weights
+
+    @cached_property
+    def _terms(self) -> np.ndarray:
+        return self.trend.terms(torch.from_numpy(self.places)).numpy()
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and numbers that `restored` needs."""
+        law, kernel = self.trend.law, self.kernel
+        return {
+            "trend": [self.trend.level, self.trend.middle, self.trend.spread],
+            "law": [] if law is None else [*astuple(law)[:4]],
+            "law_place": [] if law is None or law.place is None else [*law.place],
+            "lengths": [*kernel.lengths],
+            "shares": [*kernel.shares],
+            "kernel": [kernel.noise, kernel.amplitude],
+            **{name: torch.from_numpy(getattr(self, name)) for name in ("places", "weights", "extra")},
+        }
+
+
+def restored(state: dict[str, Any]) -> PowerProcess:
+    """The process whose `state()` this was."""
+    values, place = [float(v) for v in state["law"]], [float(v) for v in state["law_place"]]
+    at = (place[0], place[1], place[2]) if place else None
+    law = Law(values[0], values[1], values[2], values[3], at) if values else None
+    level, middle, spread = (float(v) for v in state["trend"])
+    lengths, shares = (tuple(float(v) for v in state[name]) for name in ("lengths", "shares"))
+    noise, amplitude = (float(v) for v in state["kernel"])
+    arrays = (state[name].numpy() for name in ("places", "weights", "extra"))
+    return PowerProcess(
+        Trend(level, law, middle, spread), PowerKernel(lengths, shares, noise, amplitude), *arrays
+    )
+
+
+def fit_powers(
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0
+) -> tuple[PowerProcess, tuple[str, ...]]:
+    """A process of largest leave-one-out likelihood, and what must be said of it.
+
+    Where some rows were silent, settings are those of largest evidence as expectation propagation has it.
+
+    Args:
+        rows: at least one.
+        site: where the still end is.
+        mean: the prior mean; `auto` chooses.
+        seed: of the rows that are drawn where there are too many.
+    """
+    notes = []
+    if len(rows.places) > MOST_ROWS:
+        notes.append(f"learned from {MOST_ROWS} of {len(rows.places)} rows, drawn evenly")
+        rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
+    trend, kernel, said = _settings(rows, site, mean, seed)
+    process, more = _conditioned(rows, trend, kernel, seed)
+    return process, (_description(trend, process.kernel), *notes, *said, *more)
+
+
+def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
+    """At most so many rows, sorted; at least half of them were heard where as many were."""
+    rng = np.random.default_rng(seed)
+    loud, quiet = (rng.permutation(np.flatnonzero(one)) for one in (~silent, silent))
+    if len(loud) + len(quiet) > most:
+        share = round(most * len(loud) / (len(loud) + len(quiet)))
+        first = max(share, min(len(loud), most // 2))
+        loud, quiet = loud[:first], quiet[: most - first]
+    return np.sort(np.concatenate([loud, quiet]))
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A prior, its log likelihood less `cost` for fitted parameters, and what must be said of it."""
+
+    score: float
+    trend: Trend
+    kernel: PowerKernel
+    cost: int
+    notes: tuple[str, ...] = ()
+
+
+def _settings(
+    rows: Rows, site: Site, mean: MeanName, seed: int
+) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
+    """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
+    loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
+    loud = loud.at(draw(np.zeros(len(loud.places), bool), CHOSEN_ON, seed))
+    few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
+    weighed = rows.at(draw(rows.silent, WEIGHED_ON, seed))
+    both = weighed.silent.any() and not weighed.silent.all()
+    found = [_one_length(few, trend, cost, notes) for trend, cost, notes in _trends(rows, site, mean)]
+    if both:
+        found = [_weighed(weighed, one) for one in found]
+    best = max(found, key=lambda one: one.score)
+    if len(loud.places) > len(few.places) and not both:
+        best = _refined(loud, best)
+    if len(loud.places) >= TWO_LENGTHS_NEED:
+        two = _two_lengths(loud, best)
+        best = max((best, _weighed(weighed, two) if both else two), key=lambda one: one.score)
+    count = len((weighed if both else loud).places)
+    if count < len(rows.places):
+        said = f"settings chosen on {count} of {len(rows.places)} rows, drawn evenly"
+        return best.trend, best.kernel, (*best.notes, said)
+    return best.trend, best.kernel, best.notes
+
+
+def _trends(rows: Rows, site: Site, mean: MeanName) -> list[tuple[Trend, int, tuple[str, ...]]]:
+    """Candidate means, the number of their parameters that the covariance leaves out, and notes."""
+    constant: tuple[Trend, int, tuple[str, ...]] = (Trend.of(rows, None), 0, ())
+    if mean == "constant" or (mean == "auto" and int((~rows.silent).sum()) < LAW_NEEDS):
+        return [constant]
+    law, notes = law_of(rows, site)
+    trend = Trend.of(rows, law)
+    by_distance = trend, 4 if notes else 1, notes  # its floor, and a place that was sought
+    return [by_distance] if mean == "distance" else [constant, by_distance]
+
+
+def _views(rows: Rows, trend: Trend) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Distances (n, n) [m], terms (n, P) and values less the mean (n,) [dB]."""
+    places = torch.from_numpy(rows.places)
+    distance = cdist(rows.places, rows.places)
+    return distance, trend.terms(places).numpy(), rows.decibels - trend.mean(places).numpy()
+
+
+def _one_length(rows: Rows, trend: Trend, cost: int, notes: tuple[str, ...]) -> _Candidate:
+    distance, terms, values = _views(rows, trend)
+    scale = float(np.median(distance)) or float(distance.max()) or 1.0
+    if len(values) < 3 or not values.any() or not distance.any():
+        amplitude = max(float((values**2).mean()), 1e-12)
+        return _Candidate(0.0, trend, PowerKernel((scale,), (1.0,), 1e-2, amplitude), cost, notes)
+    starts = [PowerKernel((scale * share,), (1.0,), 0.1, 1.0) for share in SHARES]
+    value, kernel = choose(starts, distance, terms, values)
+    return _Candidate(-value - cost, trend, kernel, cost, notes)
+
+
+def _refined(rows: Rows, one: _Candidate) -> _Candidate:
+    """The same with settings of more rows."""
+    value, kernel = choose([one.kernel], *_views(rows, one.trend))
+    return replace(one, score=-value - one.cost, kernel=kernel)
+
+
+def _two_lengths(rows: Rows, one: _Candidate) -> _Candidate:
+    """The same mean with two lengths, for two more parameters."""
+    length, noise = one.kernel.lengths[0], one.kernel.noise
+    starts = [PowerKernel((length * a, length * b), (0.5, 0.5), noise, 1.0) for a, b in SPLITS]
+    value, kernel = choose(starts, *_views(rows, one.trend))
+    return replace(one, score=-value - one.cost - 2, kernel=kernel, cost=one.cost + 2)
+
+
+def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
+    """The same with settings of largest evidence, silent rows among the rest."""
+    distance, terms, values = _views(rows, one.trend)
+    low, high = np.array([*bounds_of(len(one.kernel.lengths), distance), tuple(np.log(AMPLITUDES_DB2))]).T
+
+    def objective(parameters: np.ndarray) -> tuple[float, np.ndarray]:
+        kernel, amplitude = kernel_of(parameters[:-1]), math.exp(parameters[-1])
+        gram = amplitude * kernel.gram(distance, terms)
+        try:
+            value, by_gram = log_evidence(gram, values, rows.silent)
+        except LinAlgError:  # in float64: as bad as it gets
+            return BAD, np.zeros(len(parameters))
+        by_parameter = [*(amplitude * slopes(kernel, distance, by_gram)), float(np.vdot(by_gram, gram))]
+        return -value / len(values), -np.array(by_parameter) / len(values)
+
+    start = np.clip([*one.kernel.parameters(), math.log(one.kernel.amplitude)], low, high)
+    pace = {"ftol": 1e-5, "maxfun": EVIDENCE_LOOKS}
+    limits = list(zip(low, high, strict=True))
+    best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=limits, options=pace)
+    kernel = kernel_of(best.x[:-1], math.exp(best.x[-1]))
+    return replace(one, score=-float(best.fun) * len(values) - one.cost, kernel=kernel)
+
+
+def _conditioned(
+    rows: Rows, trend: Trend, kernel: PowerKernel, seed: int
+) -> tuple[PowerProcess, tuple[str, ...]]:
+    """The process given all rows, and what must be said of the silent ones."""
+    notes: list[str] = []
+    extra = np.zeros(len(rows.places))
+    places = torch.from_numpy(rows.places)
+    values = rows.decibels - trend.mean(places).numpy()
+    gram = _gram(kernel, rows.places, trend)
+    if rows.silent.any():
+        deviation = math.sqrt(kernel.amplitude)
+        notes.append(f"{int(rows.silent.sum())} rows where nothing was heard are below their level")
+        told, level = condition(gram, values / deviation, rows.silent), values[rows.silent] / deviation
+        near = np.flatnonzero(told.uncertain(level))
+        if len(near) > MOST_SILENT:
+            notes.append(f"{MOST_SILENT} of {len(near)} rows near the level are used, drawn evenly")
+            near = np.sort(np.random.default_rng(seed).permutation(near)[:MOST_SILENT])
+        used = np.sort(np.concatenate([np.flatnonzero(~rows.silent), np.flatnonzero(rows.silent)[near]]))
+        rows, values, extra, gram = rows.at(used), values[used], extra[used], gram[np.ix_(used, used)]
+        if len(near):
+            sites = propagate(told.of(near), level[near])
+            extra[rows.silent], values[rows.silent] = sites.variance, deviation * sites.value
+            if not sites.settled:
+                notes.append("what these rows say had not settled after all sweeps")
+    factor = _factored(gram, extra)
+    weights = cho_solve((factor, True), values, check_finite=False)
+    process = PowerProcess(trend, kernel, rows.places, weights, extra)
+    process.__dict__["factor"] = factor  # as `cached_property` would keep it
+    return process, tuple(notes)
+
+
+def _gram(kernel: PowerKernel, places: np.ndarray, trend: Trend) -> np.ndarray:
+    return kernel.gram(cdist(places, places), trend.terms(torch.from_numpy(places)).numpy())
+
+
+def _factored(gram: np.ndarray, extra: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor (n, n) of a covariance with `extra` (n,) on its diagonal; both are consumed."""
+    gram[np.diag_indices_from(gram)] += extra
+    return cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)[0]
+
+
+def _description(trend: Trend, kernel: PowerKernel) -> str:
+    """One line of the settings."""
+    parts = [f"{length:.4g} m" for length in kernel.lengths]
+    if len(parts) == 2:
+        parts = [f"{part} ({share:.0%})" for part, share in zip(parts, kernel.shares, strict=True)]
+    law = trend.law
+    mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
+    word = "length" if len(parts) == 1 else "lengths"
+    return f"{word} {' and '.join(parts)}, noise {kernel.noise:.3g} of the signal's variance, about {mean}"

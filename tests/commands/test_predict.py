@@ -1,0 +1,355 @@
+"""From a table of places to a table of predictions, in degrees and in metres."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from campaigns import compose
+from drives import city_drive, write_table
+
+import gsparc
+from gsparc.commands.check import main as check
+from gsparc.commands.predict.command import predict
+from gsparc.commands.train import train
+from gsparc.data.errors import DataError
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import Fold
+from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
+from gsparc.methods.per_station import for_links
+from gsparc.methods.registry import method_class
+
+ROOT = Path(__file__).parents[2]
+POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
+NAMES = np.array(["roof-0", "roof-1", "mast"])
+
+
+def fitted(arrays, folder, name="gp", skip=()):
+    """A model of arrays of the schema, stored and loaded; rows `skip` are not learned from."""
+    data = from_arrays(arrays)
+    rows = np.setdiff1d(np.arange(len(data)), skip)
+    method = for_links(method_class(name), data)
+    method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(folder))
+    checkpoint.save(folder / "model.ckpt", method)
+    return gsparc.load(folder / "model.ckpt")
+
+
+def walk(count=60, low=0.0, high=20.0):
+    rng = np.random.default_rng(0)
+    return np.column_stack([rng.uniform(low, high, (count, 2)), np.full(count, 1.5)])
+
+
+def powers(places):
+    return -20 * np.log10(np.linalg.norm(places[:, None] - POSTS, axis=-1)) - [0, 10, 20]
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    """Three stations that transmit, in metres; the receiver is 1.5 m above ground."""
+    place = walk()
+    arrays = {
+        "rx_position": place,
+        "station_position": POSTS,
+        "station_name": NAMES,
+        "rssi_db": powers(place),
+    }
+    return fitted(arrays, tmp_path_factory.mktemp("town"))
+
+
+@pytest.fixture(scope="module")
+def valley(tmp_path_factory):
+    """One station, in degrees; the receiver's height differs."""
+    rng = np.random.default_rng(0)
+    latitude, longitude = 47 + rng.uniform(0, 0.01, 60), 11 + rng.uniform(0, 0.01, 60)
+    arrays = {
+        "latitude": latitude, "longitude": longitude, "rx_height": rng.uniform(1, 3, 60),
+        "station_latitude": np.array([47.005]), "station_longitude": np.array([11.005]),
+        "station_height": np.array(30.0), "rssi_db": -60 - 1000 * np.abs(latitude[:, None] - 47.005),
+    }  # fmt: skip
+    return fitted(arrays, tmp_path_factory.mktemp("valley"))
+
+
+def read(path):
+    with Path(path).open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def column(rows, name):
+    return np.array([float(row[name]) for row in rows])
+
+
+def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
+    """Three commands; held-out places of the measured city are predicted better than by the mean."""
+    drive = city_drive(tmp_path)
+    assert check([str(drive.rows), "--stations-file", str(drive.sites)]) == 0
+    settings = [f"dataset.file={drive.rows}", f"dataset.stations_file={drive.sites}", "threads=1"]
+    train(compose("dataset=own", *settings, "model=gp", "baselines=[]", "logger=none"), tmp_path / "run")
+    ours = [f"ckpt={tmp_path / 'run' / 'model.ckpt'}", f"places={drive.places}", f"hydra.run.dir={tmp_path}"]
+    done = subprocess.run(
+        [sys.executable, "-m", "gsparc", "predict", *ours], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "60 places, 2 stations" in done.stdout and (tmp_path / "summary.json").exists()
+    found = read(tmp_path / "places.predicted.csv")
+    given = read(drive.places)
+    assert [row["latitude"] for row in found[::2]] == [row["Latitude"] for row in given]  # every digit
+    level, spread = (column(found, name).reshape(-1, 2) for name in ("rssi_db", "rssi_db_std"))
+    error = np.sqrt(np.mean((level - drive.level_db) ** 2, axis=0))
+    naive = np.sqrt(np.mean((drive.learned_db.mean(axis=0) - drive.level_db) ** 2, axis=0))
+    assert (error < 0.9 * naive).all() and np.sqrt(np.mean(error**2)) < 0.65 * np.sqrt(np.mean(naive**2))
+    assert np.mean(np.abs(level - drive.level_db) < 2 * spread) > 0.8
+
+
+def test_every_station_of_every_place(town, tmp_path):
+    place = walk()[:7] + np.array([0.5, 0, 0])
+    facts = predict(town, write_table(tmp_path / "a.csv", "xyz", place.tolist()))
+    found = read(facts["out"])
+    assert [row["station"] for row in found] == NAMES.tolist() * 7
+    assert column(found, "x").tolist() == np.repeat(place[:, 0], 3).tolist()
+    level = column(found, "rssi_db").reshape(-1, 3)
+    assert np.abs(level - powers(place)).max() < 6
+    for number, name in enumerate(NAMES):
+        expected = 10 * np.log10(town.at(str(name)).rssi(rx=place)[:, 0])
+        assert np.allclose(level[:, number], expected, atol=1e-4)
+    assert facts["predict/predictions"] == 21 and facts["predict/far_outside"] == 0
+
+
+def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
+    table = [[5, 5, 1.5, "mast"], [6, 6, 1.5, "roof-1"], [7, 7, 1.5, "mast"], [8, 8, 1.5, "0"]]
+    file = write_table(tmp_path / "a.csv", ["x", "y", "z", "cell"], table)
+    predict(town, file)
+    found = read(tmp_path / "a.predicted.csv")
+    assert [row["station"] for row in found] == ["mast", "roof-1", "mast", "roof-0"]
+    predict(town, file, tmp_path / "mast.csv", station="mast")
+    assert column(read(tmp_path / "mast.csv"), "x").tolist() == [5, 7]
+    plain = write_table(tmp_path / "b.csv", "xyz", [row[:3] for row in table])
+    predict(town, plain, tmp_path / "one.csv", station="roof-1")
+    assert {row["station"] for row in read(tmp_path / "one.csv")} == {"roof-1"}
+    lost = write_table(tmp_path / "c.csv", ["x", "y", "z", "station"], [*table[:2], [1, 1, 1, "roof-2"]])
+    with pytest.raises(DataError, match=r"line 4: 'roof-2' is no station.*did you mean 'roof-"):
+        predict(town, lost)
+    with pytest.raises(DataError, match=r"station=mats: no such station; did you mean 'mast'"):
+        predict(town, plain, tmp_path / "d.csv", station="mats")
+    few = write_table(tmp_path / "e.csv", ["x", "y", "z", "cell"], table[:1])
+    with pytest.raises(DataError, match=r"no row of .*e\.csv is about it"):
+        predict(town, few, station="roof-0")
+
+
+def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):
+    place = walk()
+    arrays = {
+        "rx_position": place,
+        "station_position": POSTS,
+        "station_name": NAMES,
+        "rssi_db": powers(place),
+    }
+    model = fitted(arrays, tmp_path, skip=np.arange(2, 180, 3))
+    file = write_table(tmp_path / "a.csv", "xyz", place[:4].tolist())
+    facts = predict(model, file)
+    assert facts["predict/stations"] == 2 and "left out: gp: station mast had too few" in caplog.text
+    with pytest.raises(DataError, match="line 2: gp: station mast had too few training rows"):
+        predict(model, file, station="mast", overwrite=True)
+
+
+def test_an_unknown_transmitter(tmp_path):
+    place = walk()
+    model = fitted({"rx_position": place, "rssi_db": powers(place)[:, 0]}, tmp_path)
+    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:5].tolist()))
+    found = read(tmp_path / "a.predicted.csv")
+    assert list(found[0]) == ["x", "y", "z", "rssi_db", "rssi_db_std", "confidence"]
+    assert np.abs(column(found, "rssi_db") - powers(place)[:5, 0]).max() < 3
+
+
+def test_a_height_that_is_not_given(town, valley, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    flat = write_table(tmp_path / "a.csv", "xy", [[5, 5], [6, 6]])
+    predict(town, flat)
+    assert "no height of the receiver: taken as 1.5 m" in caplog.text
+    assert column(read(tmp_path / "a.predicted.csv"), "z").tolist() == [1.5] * 6
+    hill = write_table(tmp_path / "b.csv", ["lat", "lon"], [[47.003, 11.004]])
+    with pytest.raises(DataError, match=r"measured at heights from 1\.\d+ to 2\.\d+ m; say columns.height="):
+        predict(valley, hill)
+    predict(valley, hill, columns={"height": 2.0})
+    assert read(tmp_path / "b.predicted.csv")[0]["height"] == "2.0"
+
+
+def test_degrees_metres_and_arrays_are_one_place(valley, tmp_path):
+    degrees = np.array([[47.003, 11.004, 2.0], [47.006, 11.001, 1.0]])
+    heads = ["lat", "lng", "alt", "RSRP"]  # what was measured does not matter
+    metres = valley.metres(*degrees.T)
+    np.savez(tmp_path / "c.npz", latitude=degrees[:, 0], longitude=degrees[:, 1], rx_height=degrees[:, 2])
+    np.savez(tmp_path / "d.npz", rx_position=metres, station=np.array([0, 0]))
+    files = [
+        write_table(tmp_path / "a.csv", heads, [[*row, ""] for row in degrees.tolist()]),
+        write_table(tmp_path / "b.csv", ["X [km]", "Y [km]", "Z [km]"], (metres / 1e3).tolist()),
+        tmp_path / "c.npz",
+        tmp_path / "d.npz",
+    ]
+    found = [read(predict(valley, file)["out"]) for file in files]
+    assert column(found[0], "latitude").tolist() == column(found[2], "latitude").tolist() == [47.003, 47.006]
+    assert np.allclose(column(found[1], "x"), metres[:, 0]) and "latitude" not in found[3][0]
+    for other in found[1:]:
+        assert np.allclose(column(other, "rssi_db"), column(found[0], "rssi_db"), atol=1e-3)
+    expected = valley.at(0).rssi(rx=metres)
+    assert np.allclose(10 ** (column(found[0], "rssi_db") / 10), expected[:, 0], rtol=1e-3)
+
+
+BAD_TABLES = {
+    "latitude 95": ("lat,lon,height\n47,11,2\n95,11,2\n", r"column 'lat', line 3: 95: latitude is outside"),
+    "no value": ("lat,lon,height\n47,,2\n", r"column 'lon', line 2: no value"),
+    "text": ("lat,lon,height\n47,east,2\n", r"column 'lon', line 2: 'east': is no finite number"),
+    "infinite": ("lat,lon,height\n47,11,inf\n", r"column 'height', line 2: 'inf'"),
+    "no rows": ("lat,lon,height\n", r"there are no rows below it"),
+    "empty": ("", r"empty"),
+    "no coordinates": (
+        "time,speed\n1,2\n",
+        r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat",
+    ),
+    "half": ("lat,height\n47,2\n", r"latitude is there but no longitude; say columns\.longitude=COLUMN"),
+    "far": ("x,y,z\n1,1,2\n2e7,0,2\n", r"line 3: \(2e\+07, 0, 2\) is more than 10000 km"),
+    "the other side": ("lat,lon,height\n-47,-169,2\n", r"line 2: .*more than 10000 km"),
+    "high": ("lat,lon,height\n47,11,1e9\n", r"line 2: .*more than 10000 km"),
+    "another end": ("tx_lat,tx_lon\n47,11\n", r"no coordinates of the receiver"),
+    "no station": ("lat,lon,height,cell\n47,11,2,\n", r"column 'cell', line 2: no station"),
+    "two columns": (
+        "lat,latitude (deg),lon,height\n1,1,1,1\n",
+        r"could each be latitude; say which: columns\.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_TABLES)
+def test_tables_that_hold_no_places_are_refused(valley, tmp_path, name):
+    text, said = BAD_TABLES[name]
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(DataError, match=said) as raised:
+        predict(valley, tmp_path / "a.csv")
+    assert "\n" not in str(raised.value) and not (tmp_path / "a.predicted.csv").exists()
+
+
+PLACE = np.array([47.0, 47.001])
+BAD_ARRAYS = {
+    "nan": ({"latitude": PLACE * [1, np.nan]}, r"row 1: latitude of the receiver is nan"),
+    "beyond": ({"latitude": PLACE + np.array([0, 90])}, r"row 1: latitude 137\.001 is outside"),
+    "lengths": ({"latitude": PLACE[:1]}, r"have shapes \(1,\) and \(2,\)"),
+    "heights": ({"rx_height": np.ones(3)}, r"rx_height: 3 heights for 2 places"),
+    "text": ({"longitude": np.array(["a", "b"])}, r"longitude: expected real numbers, found dtype <U1"),
+    "stations": ({"station": np.zeros(3, int)}, r"station: expected 2 names or numbers"),
+    "number": ({"station": np.array([0, 7]), "station_name": np.array(["a"])}, r"row 1: 7 is none of the 1"),
+    "both": ({"rx_position": np.zeros((2, 3))}, r"rx_position and latitude both say where"),
+    "none": ({"latitude": PLACE[:0], "longitude": PLACE[:0], "rx_height": 1.0}, r"no rows"),
+    "alone": ({"longitude": None}, r"no places of the receiver; expected latitude and longitude"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_ARRAYS)
+def test_arrays_that_hold_no_places_are_refused(valley, tmp_path, name):
+    change, said = BAD_ARRAYS[name]
+    arrays = {"latitude": PLACE, "longitude": np.array([11.0, 11.001]), "rx_height": np.array(2.0), **change}
+    np.savez(tmp_path / "a.npz", **{key: value for key, value in arrays.items() if value is not None})
+    with pytest.raises(DataError, match=said):
+        predict(valley, tmp_path / "a.npz")
+
+
+def test_degrees_where_the_model_knows_none(town, tmp_path):
+    file = write_table(tmp_path / "a.csv", ["lat", "lon"], [[47, 11]])
+    with pytest.raises(DataError, match="places in degrees, but arrays was measured in metres"):
+        predict(town, file)
+
+
+def test_where_the_answers_go(town, tmp_path):
+    file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5]])
+    with pytest.raises(DataError, match=r"expected a name ending in \.csv or \.npz"):
+        predict(town, file, tmp_path / "b.txt")
+    with pytest.raises(DataError, match="these are the places themselves"):
+        predict(town, file, file, overwrite=True)
+    (tmp_path / "b.csv").write_text("kept")
+    with pytest.raises(DataError, match="is there already; say overwrite=true"):
+        predict(town, file, tmp_path / "b.csv")
+    assert (tmp_path / "b.csv").read_text() == "kept"
+    predict(town, file, tmp_path / "b.csv", overwrite=True)
+    assert len(read(tmp_path / "b.csv")) == 3
+    predict(town, file, tmp_path / "b.npz")
+    with np.load(tmp_path / "b.npz") as stored:
+        assert stored["station"].tolist() == NAMES.tolist() and stored["rssi_db"].shape == (3,)
+    with pytest.raises(DataError, match=r"columns\.x: goes with tables"):
+        predict(town, tmp_path / "b.npz", tmp_path / "c.csv", columns={"x": "b"})
+    with pytest.raises(DataError, match="no such file"):
+        predict(town, tmp_path / "absent.csv")
+
+
+def test_places_far_outside_are_counted(town, tmp_path, caplog):
+    file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5], [21, 5, 1.5], [5, 500, 1.5], [5, 5, 90]])
+    assert predict(town, file)["predict/far_outside"] == 2
+    assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
+
+
+@pytest.mark.parametrize("shape, heads", [((), ["csi_re", "csi_im"]), ((2, 3), ["csi_re_0_0", "csi_im_1_2"])])
+def test_channels(tmp_path, shape, heads):
+    place = walk()
+    rng = np.random.default_rng(0)
+    channel = rng.normal(size=(60, *shape)) + 1j * rng.normal(size=(60, *shape))
+    frequency = 2.4e9 + 1e6 * np.arange(shape[-1] if shape else 1)
+    arrays = {"tx_position": place, "rx_position": POSTS[0], "csi": channel, "frequency_hz": frequency}
+    model = fitted(arrays, tmp_path, "nearest")
+    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:3].tolist()))
+    found = read(tmp_path / "a.predicted.csv")
+    assert set(heads) <= set(found[0])
+    first = np.array([column(found, name) for name in found[0] if name.startswith("csi_re")]).T
+    assert np.allclose(first, channel[:3].reshape(3, -1).real, rtol=1e-5)
+
+
+def test_what_is_no_table_goes_to_an_npz(tmp_path):
+    place = walk()
+    many = {"tx_position": place, "rx_position": POSTS[0], "csi": np.ones((60, 4, 5), complex)}
+    model = fitted({**many, "frequency_hz": 2.4e9 + 1e6 * np.arange(5)}, tmp_path, "mean")
+    file = write_table(tmp_path / "a.csv", "xyz", place[:3].tolist())
+    with pytest.raises(DataError, match=r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz"):
+        predict(model, file)
+    predict(model, file, tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as stored:
+        assert np.allclose(stored["csi"], 1) and stored["x"].tolist() == place[:3, 0].tolist()
+    images = np.random.default_rng(0).uniform(0, 1, (60, 12, 24))
+    model = fitted({"tx_position": place, "rx_position": POSTS[0], "spectrum": images}, tmp_path, "mean")
+    with pytest.raises(DataError, match=r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz"):
+        predict(model, file)
+    predict(model, file, tmp_path / "b.npz")
+    with np.load(tmp_path / "b.npz") as stored:
+        assert stored["spectrum"].shape == (3, 12, 24)
+
+
+def test_both_ends_move(tmp_path):
+    rng = np.random.default_rng(0)
+    tx, rx = rng.uniform(0, 20, (2, 80, 3))
+    level = -20 * np.log10(np.linalg.norm(tx - rx, axis=1))
+    model = fitted({"tx_position": tx, "rx_position": rx, "rssi_db": level}, tmp_path, "distance_law")
+    heads = ["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"]
+    table = np.hstack([tx, rx])[:4]
+    predict(model, write_table(tmp_path / "a.csv", heads, table.tolist()))
+    found = read(tmp_path / "a.predicted.csv")
+    assert list(found[0])[:6] == heads and np.abs(column(found, "rssi_db") - level[:4]).max() < 2
+    plain = ["tx_x", "tx_y", "tx_z", "x", "y", "z"]  # of the two, the end without a name is the other one
+    predict(model, write_table(tmp_path / "b.csv", plain, table.tolist()))
+    assert [row["rssi_db"] for row in read(tmp_path / "b.predicted.csv")] == [row["rssi_db"] for row in found]
+    with pytest.raises(DataError, match=r"no coordinates of the receiver among .*say columns\.rx_x=COLUMN"):
+        predict(model, write_table(tmp_path / "c.csv", heads[:3], table[:, :3].tolist()))
+    with pytest.raises(DataError, match="no coordinates of the receiver"):
+        predict(model, write_table(tmp_path / "d.csv", "xyz", table[:, :3].tolist()))
+    degrees = ["tx_lat", "tx_lon", "tx_z", "rx_lat", "rx_lon", "rx_z"]
+    with pytest.raises(DataError, match="places in degrees, but"):
+        predict(model, write_table(tmp_path / "e.csv", degrees, table.tolist()))
+
+
+def test_an_end_that_stood_still_is_where_it_was(town, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    heads = ["rx_x", "rx_y", "rx_z", "tx_x", "tx_y", "tx_z"]
+    predict(town, write_table(tmp_path / "a.csv", heads, [[5, 5, 1.5, 9, 9, 9]]), station="mast")
+    assert "not used: coordinates of the transmitter; that end is where it was measured" in caplog.text
+    found = read(tmp_path / "a.predicted.csv")
+    assert len(found) == 1 and column(found, "x")[0] == 5

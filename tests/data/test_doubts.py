@@ -1,0 +1,261 @@
+"""Doubts about readable measurements: each is said where it should be, and nowhere else."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from releases import real
+from scipy.spatial.distance import cdist
+
+from gsparc.data import doubts as doubt
+from gsparc.data.describe import doubtful
+from gsparc.data.errors import DataError
+from gsparc.data.level_steps import level_steps
+from gsparc.data.link_levels import link_levels
+from gsparc.data.own import from_arrays
+
+
+def names_of(count):
+    return [f"row {i}" for i in range(count)]
+
+
+def walk(seed, count=600, step=8.0):
+    """Places (n, 2) [m] of a walk, its levels (n,) [dB] with correlated shadowing, and the station (2,)."""
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(rng.normal(0, 0.25, count))
+    place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1) * step, axis=0)
+    covariance = 25 * np.exp(-cdist(place, place) / 50) + 1e-9 * np.eye(count)
+    shadow = np.linalg.cholesky(covariance) @ rng.normal(size=count)
+    station = place.mean(0) + rng.normal(0, 200, 2)
+    distance = np.linalg.norm(place - station, axis=1)
+    return place, -30 - 35 * np.log10(distance + 5) + shadow + rng.normal(0, 2, count), station
+
+
+def as_links(
+    position: np.ndarray, level_db: np.ndarray, rows: Sequence[str]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+    """Long arrays (position, station, level, rows) of a wide table: (S, d) places, (S, T) levels."""
+    count = level_db.shape[1]
+    station = np.tile(np.arange(count), len(level_db))
+    names = [row for row in rows for _ in range(count)]
+    return np.repeat(position, count, axis=0), station, level_db.reshape(-1), names
+
+
+def room(seed=0, count=100):
+    rng = np.random.default_rng(seed)
+    place = rng.uniform([0, 0, 0.5], [6, 5, 2], (count, 3))
+    return place, -40 - 20 * np.log10(np.linalg.norm(place - [3, 2, 2.5], axis=1)) + rng.normal(0, 1, count)
+
+
+def test_a_sound_room_raises_none():
+    place, level = room()
+    found = doubt.doubts(place, None, level, ["a"], names_of(100), np.array([[3, 2, 2.5]]))
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    "position, said",
+    [
+        (lambda p: p * 0 + 2, "a box of 0 m"),
+        (lambda p: np.round(p * 1000), "whole numbers up to"),
+        (lambda p: p * [1, 1, 1000], "heights differ by"),
+        (lambda p: np.stack([40.76 + p[:, 0] / 1e3, -111.8 + p[:, 1] / 1e3], 1), "degrees? then give"),
+        (lambda p: np.where(np.arange(100)[:, None] == 7, 1e5, p), "row 7: far outside"),
+    ],
+)
+def test_positions(position, said):
+    found = doubt.position_doubts(position(room()[0]), names_of(100))
+    assert len(found) == 1 and said in found[0], found
+
+
+def test_small_tables_far_from_the_origin_are_not_degrees():
+    place = np.random.default_rng(0).uniform([3, 1, 0], [4.2, 2.2, 0.5], (50, 3))
+    assert doubt.position_doubts(place, names_of(50)) == []
+    assert doubt.position_doubts(place + np.array([4e5, 5e6, 100]), names_of(50)) == []  # UTM
+    assert doubt.position_doubts(np.round(place), names_of(50)) == []
+
+
+@pytest.mark.parametrize(
+    "latitude, longitude, said",
+    [
+        (
+            [-111.8, -111.9],
+            [40.7, 40.8],
+            "row 0, row 1: latitude -111.8 is beyond 90 degrees; latitude and long",
+        ),
+        ([-74.0, -74.1], [40.7, 40.8], "Antarctic"),
+        ([80.2, 80.3], [13.0, 13.1], "Arctic"),
+        ([40.7, 0.0, 40.8], [8.1, 0.0, 8.2], "row 1: latitude and longitude are 0"),
+    ],
+)
+def test_degrees(latitude, longitude, said):
+    found = doubt.degree_doubts(np.array(latitude), np.array(longitude), names_of(3))
+    assert len(found) == 1 and said in found[0], found
+
+
+def test_sound_degrees():
+    assert doubt.degree_doubts(np.array([40.7, -33.9]), np.array([-111.8, 151.2]), names_of(2)) == []
+
+
+@pytest.mark.parametrize(
+    "level, said",
+    [
+        (lambda v: 10 ** (v / 10), "linear power? then give it as rssi"),
+        (lambda v: -v + 40, "all positive: losses, percent, or linear?"),
+        (lambda v: np.round((v + 100) / 2), "whole numbers from"),
+        (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
+        (lambda v: np.where(np.arange(len(v)) % 5 == 0, 100, v), "exactly 100, far from all others"),
+        (lambda v: np.where(np.arange(len(v)) % 5 == 0, -200, v), "exactly -200, far from all others"),
+        (lambda v: np.maximum(v, -48), "exactly -48, the least: not heard? leave them empty and give"),
+        (lambda v: v * 0 - 3, "all levels are -3 dB"),
+    ],
+)
+def test_levels(level, said):
+    found = doubt.level_doubts(level(room()[1]))
+    assert len(found) == 1 and said in found[0], found
+
+
+def test_whole_decibels_are_sound():
+    assert doubt.level_doubts(np.round(room()[1])) == []
+    assert doubt.level_doubts(np.array([np.nan, np.nan])) == []
+
+
+def test_losses_rise_with_distance():
+    place, level = room()
+    station, where = np.zeros(100, int), np.array([[3, 2, 2.5]])
+    assert doubt.direction_doubts(place, station, level, where) == []
+    assert "rise with distance" in doubt.direction_doubts(place, station, -level, where)[0]
+
+
+def test_copies_and_repeated_measurements():
+    place, level = room(count=20)
+    place[5], level[5] = place[3], level[3]  # a copy
+    place[9], level[9] = place[8], level[8] + 2  # measured again
+    place[11] = place[10]  # of another station
+    level[11] = level[10]
+    station = np.zeros(20, int)
+    station[11] = 1
+    found = doubt.copies(place, station, level, ["a", "b"], names_of(20))
+    assert len(found) == 2 and "row 5 of row 3; leave" in found[0]
+    assert "1 places were measured more than once" in found[1] and "1.4 dB" in found[1]
+
+
+def test_a_wild_row_is_named():
+    level = walk(0)[1]
+    level[123] += 60
+    found = doubt.wild_rows(np.zeros(600, int), level, ["a"], names_of(600))
+    assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
+    assert doubt.wild_rows(np.zeros(600, int), walk(0)[1], ["a"], names_of(600)) == []
+
+
+def test_a_step_is_found_at_its_row():
+    """The place of the step is sharp where the walk is dense; its size is within the shadowing."""
+    place, level, station = walk(3, step=3.0)
+    level[350:] -= 25
+    steps = level_steps(place, level, station)
+    assert len(steps) == 1 and abs(steps[0].first - 350) <= 6 and steps[0].last < steps[0].first
+    assert steps[0].change_db == pytest.approx(-25, abs=5)
+
+
+def test_two_steps_are_found():
+    """Walked thrice, another gain the second time."""
+    place, level, station = walk(4, 400)
+    rng = np.random.default_rng(0)
+    thrice = np.concatenate([level + rng.normal(0, 2, 400) for _ in range(3)])
+    thrice[400:800] += 14
+    steps = level_steps(np.tile(place, (3, 1)), thrice, station)
+    assert [abs(s.first - at) <= 3 for s, at in zip(steps, (400, 800), strict=True)] == [True, True]
+    assert steps[0].change_db == pytest.approx(14, abs=1) and steps[1].change_db == pytest.approx(-14, abs=1)
+
+
+def test_no_wolf_on_thirty_sound_walks():
+    alarms = sum(bool(level_steps(*walk(seed, 400))) for seed in range(30))
+    assert alarms == 0
+
+
+def test_steps_of_little_or_wrong_input():
+    place, level, station = walk(0)
+    assert level_steps(place[:50], level[:50], station) == ()
+    assert level_steps(np.zeros((600, 2)), level) == () and level_steps(place, level * 0) == ()
+    assert level_steps(place, np.full(600, np.nan)) == ()
+    with pytest.raises(DataError, match="level_steps"):
+        level_steps(place, level[:-1])
+    with pytest.raises(DataError, match="level_steps"):
+        level_steps(np.where(place > 0, np.nan, place), level)
+
+
+def test_outages_and_what_was_not_heard():
+    place, level, _ = walk(1)
+    level = np.stack([level, walk(2)[1], walk(5)[1]], axis=1)
+    level[100:160, 0] = np.nan  # off
+    level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
+    level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
+    _, station, long, rows = as_links(place, level, names_of(600))
+    found = doubt.gaps(station, long, ["a", "b", "c"], rows)
+    assert (
+        found[0]
+        == "no level in the 60 rows from row 100 to row 159 of station a: an outage; these rows are not used"
+    )
+    assert "of station b, beside the weakest ones: not heard? then give sensitivity_db (" in found[1]
+    assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
+    silent = doubt.gaps(np.zeros(4, int), np.full(4, np.nan), ["a"], names_of(4))
+    assert silent == ["no level in any row"]
+
+
+@pytest.fixture(scope="module")
+def campus():
+    """Links of twelve stations as (position, station, level, names, rows, station_position)."""
+    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
+        given = {name: stored[name] for name in stored.files}
+    place, level = given["mobile_position"], given["rssi_db"].astype(float)
+    links = as_links(place, level, names_of(len(place)))
+    return (*links[:3], given["station"].tolist(), links[3], given["station_position"])
+
+
+def test_a_real_station_that_lost_its_gain(campus):
+    """One of twelve changes: 17 dB more from row 350 on, 19 dB less from row 1162 on, where it was off."""
+    found = doubt.changed_levels(*campus)
+    assert len(found) == 2 and all("ebc-nuc1" in line for line in found)
+    assert "rises by 17 dB between row 349 and row 350" in found[0]
+    assert "falls by 19 dB between row 1161 and row 1461" in found[1]
+
+
+def test_real_outages_are_not_taken_for_silence(campus):
+    _, station, level, names, rows, _ = campus
+    found = doubt.gaps(station, level, names, rows)
+    assert sum("an outage" in line for line in found) == 8
+    assert any("the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found)
+    assert any(
+        "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line for line in found
+    )
+    assert not any("sensitivity_db" in line for line in found)
+
+
+def test_other_real_campaigns_raise_few(campus):
+    for file in ("ble-hall-1", "ble-hall-2"):
+        with np.load(real(f"real/{file}.npz")) as stored:
+            place, wide = stored["mobile_position"], stored["rssi_db"].astype(float)
+            names, fixed = stored["station"].tolist(), stored["station_position"]
+        links = as_links(place, wide, names_of(len(place)))
+        found = doubt.doubts(*links[:3], names, links[3], fixed)
+        assert len(found) <= 1, found
+    place, station, level, names, rows, fixed = campus
+    assert doubt.position_doubts(place, rows) == [] and doubt.level_doubts(level) == []
+    assert doubt.direction_doubts(place, station, level, fixed) == []
+
+
+def test_copies_in_a_file_of_links_were_one_row():
+    """Rows of one place and station were entered into one cell before anyone looked for copies."""
+    place, level, station = walk(0, 60)
+    where = np.repeat(np.column_stack([place, np.ones(60)]), 2, axis=0)
+    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
+    links = {"rx_position": where, "station_position": posts, "station": np.repeat(np.arange(60) % 2, 2)}
+    found = doubtful(link_levels(from_arrays({**links, "rssi_db": np.repeat(level, 2)})))
+    assert found[0].startswith("copies (same place, station and level): row 1 of row 0, row 3 of row 2")
+
+
+def test_a_station_for_each_place_is_no_outage_of_the_others():
+    place, level, station = walk(0, 60)
+    links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
+    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
+    assert not doubtful(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))

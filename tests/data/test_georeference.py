@@ -1,0 +1,104 @@
+"""Degrees and metres: known lengths of the ellipsoid, and back again to a millimetre."""
+
+import pickle
+
+import numpy as np
+import pytest
+from releases import real
+
+from gsparc.data.errors import DataError
+from gsparc.data.georeference import Georeference
+
+
+@pytest.mark.parametrize(
+    "latitude, longitude", [(40.76, -111.84), (0, 0), (-33.9, 151.2), (0, 180), (89.99, 12), (-90, 0)]
+)
+def test_there_and_back_over_100_km(latitude, longitude):
+    origin = Georeference(latitude, longitude)
+    xy = np.random.default_rng(0).uniform(-1e5, 1e5, (500, 2))
+    back = origin.from_degrees(*origin.to_degrees(xy))
+    assert np.abs(back - xy).max() < 1e-6
+    np.testing.assert_allclose(origin.to_degrees(np.zeros((1, 2)))[0], [latitude], atol=1e-12)
+
+
+def test_known_lengths():
+    """A degree of the equator is a pi / 180; one of the meridian from it 110574.389 m (WGS 84)."""
+    origin = Georeference(0, 0)
+    np.testing.assert_allclose(origin.from_degrees(0, 1), [[6378137 * np.pi / 180, 0]], atol=1e-6)
+    np.testing.assert_allclose(origin.from_degrees(1, 0), [[0, 110574.3886]], atol=1e-3)
+    quarter = origin.from_degrees(90, 0)[0, 1]
+    assert quarter == pytest.approx(10001965.729, abs=1e-2)
+
+
+def test_x_is_east_and_y_is_north():
+    east, north = Georeference(50, 8).from_degrees([50, 50.01], [8.01, 8])
+    assert east[0] > 700 and abs(east[1]) < 1 and north[1] > 1100 and abs(north[0]) < 1e-6
+
+
+def test_distances_are_those_of_the_ground():
+    """Between two places off the origin, too: against the radius of curvature at that latitude."""
+    latitude, step = np.radians(40.8), np.radians(0.001)
+    a, e2 = 6378137.0, 0.0066943799901413165
+    north = a * (1 - e2) / (1 - e2 * np.sin(latitude) ** 2) ** 1.5 * step
+    east = a * np.cos(latitude) / np.sqrt(1 - e2 * np.sin(latitude) ** 2) * step
+    degrees = np.degrees(latitude)
+    local = Georeference(40.76, -111.84).from_degrees(
+        [degrees - 0.0005, degrees + 0.0005, degrees], [-111.8, -111.8, -111.799]
+    )
+    assert np.linalg.norm(local[1] - local[0]) == pytest.approx(north, rel=1e-6)
+    middle = (local[0] + local[1]) / 2
+    assert np.linalg.norm(local[2] - middle) == pytest.approx(east, rel=1e-5)
+
+
+def test_the_antimeridian_and_the_poles_are_places():
+    origin = Georeference.about([10.0, 10.0, 10.0], [179.999, -179.999, -179.998])
+    assert abs(origin.longitude) > 179.9
+    xy = origin.from_degrees([10.0, 10.0], [179.999, -179.999])
+    assert np.linalg.norm(xy[1] - xy[0]) == pytest.approx(219.2, abs=0.3)
+    across = Georeference(90, 0).from_degrees([89.9, 89.9], [0, 180])
+    assert np.linalg.norm(across[1] - across[0]) == pytest.approx(22338.8, abs=0.1)
+    np.testing.assert_allclose(
+        Georeference(10, 1).from_degrees(10, 359.5), Georeference(10, 1).from_degrees(10, -0.5), atol=1e-6
+    )
+
+
+def test_the_origin_is_the_rounded_median():
+    origin = Georeference.about([40.76521977, 40.7, 40.8], [-111.83475621, -111.0, -112.0])
+    assert origin == Georeference(40.7652, -111.8348)
+    assert pickle.loads(pickle.dumps(origin)) == origin
+
+
+@pytest.mark.parametrize(
+    "latitude, longitude, said",
+    [
+        (91, 0, "latitude 91 is outside -90 to 90"),
+        (-111.8, 40.7, "are latitude and longitude swapped"),
+        (0, 400, "longitude 400"),
+        (np.nan, 0, "latitude nan"),
+        (0, np.inf, "longitude inf"),
+    ],
+)
+def test_what_is_not_on_earth_is_refused(latitude, longitude, said):
+    with pytest.raises(DataError, match=said):
+        Georeference(latitude, longitude)
+    with pytest.raises(DataError, match=said):
+        Georeference(0, 0).from_degrees([latitude], [longitude])
+    with pytest.raises(DataError, match=said):
+        Georeference.about([latitude], [longitude])
+
+
+def test_local_coordinates_that_are_none_are_refused():
+    for xy in (np.zeros(2), np.zeros((3, 3)), [[np.nan, 0]], [[3e7, 0]]):
+        with pytest.raises(DataError, match="local coordinates"):
+            Georeference(0, 0).to_degrees(np.asarray(xy))
+    with pytest.raises(DataError, match="no places"):
+        Georeference.about(np.zeros(0), np.zeros(0))
+
+
+def test_a_real_campaign_has_its_size():
+    """Its own metres are of a sphere: 0.1 % less to the east and 0.4 % to the north."""
+    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
+        latitude, longitude, given = stored["latitude"], stored["longitude"], stored["mobile_position"]
+    xy = Georeference.about(latitude, longitude).from_degrees(latitude, longitude)
+    scale = np.ptp(given, axis=0) / np.ptp(xy, axis=0)
+    assert (np.abs(scale - 1) < 0.005).all()

@@ -1,0 +1,260 @@
+"""Stations, both ends moving, missing and censored powers: what a file may say, and what it becomes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsparc.data.describe import describe, suspicious_values
+from gsparc.data.errors import DataError
+from gsparc.data.own import interpret, load_own
+from gsparc.data.raw import Raw
+from gsparc.data.selection import Selection, select
+
+PLACES, STATIONS = 10, 3
+RNG = np.random.default_rng(0)
+WALK = RNG.uniform(0, 20, (PLACES, 3))
+POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
+LEVELS = RNG.uniform(-90, -40, (PLACES, STATIONS))
+
+
+def town(**changes):
+    """Powers of a walking transmitter at three stations, one column for each."""
+    arrays = {
+        "tx_position": WALK,
+        "station_position": POSTS,
+        "station_name": np.array(["north", "east", "roof"]),
+        "rssi_db": LEVELS,
+    }
+    return {k: np.asarray(v) for k, v in {**arrays, **changes}.items() if v is not None}
+
+
+def read(arrays):
+    return interpret(Raw(dict(arrays)), "town.npz")
+
+
+def test_a_wide_file_is_a_row_for_each_link():
+    data = read(town()).data
+    assert len(data) == PLACES * STATIONS and data.site.static_end == "rx"
+    assert data.site.stations.name == ("north", "east", "roof") and data.site.static_position is None
+    link = 4 * STATIONS + 2
+    assert data.station[link] == 2 and data.place[link] == 4 and data.row_names[link] == "row 4, station roof"
+    np.testing.assert_allclose(data.tx[link] + data.site.origin, WALK[4])
+    np.testing.assert_allclose(data.rx_position[link] + data.site.origin, POSTS[2])
+    np.testing.assert_allclose(
+        10 * np.log10(data.target[link, 0] * data.site.target_scale), LEVELS[4, 2], atol=1e-3
+    )
+
+
+def test_a_long_file_is_the_same_measurements():
+    which = np.tile(np.arange(STATIONS), PLACES)
+    long = town(tx_position=np.repeat(WALK, STATIONS, axis=0), rssi_db=LEVELS.reshape(-1), station=which)
+    one, other = read(long).data, read(town()).data
+    np.testing.assert_array_equal(one.station, other.station)
+    np.testing.assert_array_equal(one.target, other.target)
+    first = np.unique(one.place, return_index=True)[1]
+    assert len(first) == PLACES
+
+
+def test_three_access_points_by_their_positions_alone():
+    """One end at three places was refused: both ends move."""
+    rows = 60
+    which = np.arange(rows) % 3
+    walk = RNG.uniform(0, 20, (rows, 3))
+    found = read({"rx_position": walk, "tx_position": POSTS[which], "rssi_db": RNG.uniform(-80, -40, rows)})
+    assert len(found.data.site.stations) == 3 and found.data.site.static_end == "tx"
+    assert any("taken as 3 stations" in note for note in found.notes)
+
+
+def test_both_ends_may_move():
+    data = read({"rx_position": WALK, "tx_position": WALK + 1, "rssi_db": LEVELS[:, 0]}).data
+    assert data.site.static_end is None and data.moving.shape == (PLACES, 6)
+
+
+def test_powers_may_have_an_unknown_transmitter():
+    found = read({"rx_position": WALK, "rssi_db": LEVELS[:, 0]})
+    assert found.data.site.static_position is None and np.isnan(found.data.tx).all()
+    assert np.isfinite(found.data.site.box).all() and "place is unknown" in found.notes[0]
+    assert "unknown place" in dict(describe(found.data))["stays"]
+
+
+def test_missing_powers_are_no_rows_and_are_counted():
+    """A mask over missing powers was advised and then refused."""
+    holes = LEVELS.copy()
+    holes[[1, 2, 5], [0, 0, 2]] = np.nan
+    found = read(town(rssi_db=holes))
+    assert len(found.data) == PLACES * STATIONS - 3 and found.data.censored is None
+    assert "3 of 30 values are missing (most: north 2, roof 1)" in found.notes[0]
+    masked = read(town(mask=np.isfinite(holes)))
+    np.testing.assert_array_equal(masked.data.station, found.data.station)
+
+
+def test_powers_below_the_sensitivity_are_kept_as_that():
+    holes = np.where(LEVELS < -80, np.nan, LEVELS)
+    data = read(town(rssi_db=holes, sensitivity_db=-80.0)).data
+    assert len(data) == PLACES * STATIONS
+    np.testing.assert_array_equal(data.censored.reshape(PLACES, STATIONS), np.isnan(holes))
+    np.testing.assert_array_equal(data.mask[:, 0], ~data.censored)
+    level = 10 * np.log10(data.target[data.censored] * data.site.target_scale)
+    np.testing.assert_allclose(level, -80, atol=1e-3)
+
+
+def test_the_mask_wins_over_the_sensitivity():
+    holes = np.where(LEVELS < -80, np.nan, LEVELS)
+    mask = np.ones_like(holes, bool)
+    mask[np.isnan(holes)] = False
+    assert read(town(rssi_db=holes, mask=mask, sensitivity_db=-80.0)).data.censored is None
+
+
+def test_two_coordinates_and_a_height():
+    data = read(town(tx_position=WALK[:, :2], tx_height=1.5)).data
+    np.testing.assert_allclose(data.tx[:, 2] + data.site.origin[2], 1.5)
+
+
+def test_a_station_at_two_carriers_is_two():
+    carriers = np.repeat([4.6e8, 3.5e9], PLACES // 2)
+    data = read(town(carrier_hz=carriers)).data
+    assert len(data.site.stations) == 2 * STATIONS
+    assert data.site.stations.name[:2] == ("north at 460 MHz", "north at 3500 MHz")
+    assert data.site.stations.carrier_hz[data.station[-1]] == 3.5e9
+
+
+def test_channels_of_a_run_share_a_factor():
+    csi = RNG.normal(size=(PLACES, STATIONS, 2)) @ [1, 1j]
+    runs = np.array(["a", "b"])[np.arange(PLACES) % 2]
+    data = read(town(rssi_db=None, csi=csi, frequency_hz=9.2e8, run=runs)).data
+    assert data.target.shape == (PLACES * STATIONS, 1, 1)
+    np.testing.assert_array_equal(data.run, np.repeat(np.arange(PLACES) % 2, STATIONS))
+
+
+def test_the_files_own_split_names_rows_of_the_file():
+    data = read(town(split_train=np.arange(8), split_test=np.array([8, 9]))).data
+    np.testing.assert_array_equal(np.unique(data.place[data.release_split[1]]), [8, 9])
+
+
+def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
+    three = town(**{k: v[:3] for k, v in town().items() if isinstance(v, np.ndarray) and len(v) == PLACES})
+    found = read({**three, "carrier_hz": np.array([4e8, 5e8, 6e8])})
+    assert any("carrier_hz: as many values as rows and as stations" in note for note in found.notes)
+
+
+SPOILT = {
+    "station out of range": (town(station=np.full(PLACES, 3), rssi_db=LEVELS[:, 0]), "row 0 is of station 3"),
+    "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "numbers of stations"),
+    "columns": (town(rssi_db=LEVELS[:, :2]), r"expected shape \(S, 3, ...\), a column for each station"),
+    "names": (town(station_name=np.array(["a", "a", "b"])), "'a' twice"),
+    "fewer names": (town(station_name=np.array(["a", "b"])), r"station_name: expected shape \(T,\)"),
+    "nan station": (town(station_position=POSTS * [1, np.nan, 1]), "station_position, row 0"),
+    "transposed": (town(station_position=np.ones((3, 5))), "transposed"),
+    "no height": (town(tx_position=WALK[:, :2]), "two coordinates; expected .* as tx_height"),
+    "height of 3-D": (town(tx_height=1.5), "tx_height: given, but tx_position has three"),
+    "both ends and stations": (town(rx_position=WALK), "found rx_position and tx_position"),
+    "no end": (town(tx_position=None), "of the end that moves; found neither"),
+    "no table": (town(station_position=None, station=np.zeros(PLACES, int)), "without station_position"),
+    "all missing": (town(rssi_db=LEVELS * np.nan), "nothing was measured"),
+    "an infinite power": (town(rssi_db=np.where(LEVELS.max() == LEVELS, np.inf, LEVELS)), "not finite"),
+    "below the level": (town(sensitivity_db=-50.0), r"row \d+, station \w+: rssi_db is .* below -50"),
+    "level of channels": (town(rssi_db=None, rssi=LEVELS**2, sensitivity_db=-80.0), "goes with rssi_db"),
+    "level of 1e9": (town(sensitivity_db=1e9), "expected dB between -400 and 400"),
+    "turned transmitters": (
+        town(tx_position=None, rx_position=WALK, station_orientation=np.eye(4)[:3]), "are not turned",
+    ),
+    "orientation": (town(station_orientation=np.ones((3, 4))), "row 0: expected a quaternion"),
+    "runs of floats": (town(run=np.zeros(PLACES)), "run: expected names or numbers"),
+    "mask of another shape": (town(mask=np.ones(PLACES, bool)), "mask: expected shape"),
+    "NaN under a mask": (town(rssi_db=LEVELS * np.nan, mask=np.ones_like(LEVELS, bool)), "not finite"),
+    "carriers in MHz": (town(carrier_hz=np.array([460.0, 461, 462])), r"expected Hz"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", SPOILT)
+def test_what_is_wrong_is_one_line(case):
+    arrays, words = SPOILT[case]
+    with pytest.raises(DataError, match=words) as refused:
+        read(arrays)
+    assert "\n" not in str(refused.value)
+
+
+def test_hdf5_and_npz_alike(tmp_path):
+    np.savez(tmp_path / "town.npz", **town())
+    assert load_own(tmp_path / "town.npz").site.stations.name == ("north", "east", "roof")
+
+
+def test_degrees_become_metres_and_back():
+    north = 40.76 + RNG.uniform(0, 0.01, PLACES)
+    east = -111.84 + RNG.uniform(0, 0.01, PLACES)
+    posts = {"station_latitude": np.array([40.76, 40.77, 40.765]), "station_longitude": np.full(3, -111.835)}
+    found = read(
+        town(tx_position=None, station_position=None, latitude=north, longitude=east, tx_height=1.5, **posts)
+    )
+    data = found.data
+    world = data.tx[::STATIONS, :2] + data.site.origin[:2]
+    back = data.site.georeference.to_degrees(world)
+    np.testing.assert_allclose(back[0], north, atol=1e-8)
+    np.testing.assert_allclose(back[1], east, atol=1e-8)
+    assert any("no station_height: taken as 0 m" in note for note in found.notes)
+
+
+BAD_DEGREES = {
+    "alone": ({"latitude": np.full(PLACES, 40.0)}, "given alone"),
+    "beyond": (
+        {"latitude": np.full(PLACES, 140.0), "longitude": np.full(PLACES, 4.0), "station_position": None},
+        "row 0: latitude 140",
+    ),
+    "metres beside": (
+        {"latitude": WALK[:, 0], "longitude": WALK[:, 1]}, "in metres beside places in degrees",
+    ),
+    "counts": (
+        {"latitude": WALK[:, 0], "longitude": WALK[1:, 1], "station_position": None}, "9 values for 10",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", BAD_DEGREES)
+def test_degrees_that_are_none_are_one_line(case):
+    arrays, words = BAD_DEGREES[case]
+    with pytest.raises(DataError, match=words) as refused:
+        read(town(tx_position=None, **arrays))
+    assert "\n" not in str(refused.value)
+
+
+def test_messages_name_the_rows_of_the_file():
+    """Rows were counted after those without a value were gone, or places, or links were."""
+    one = {"rx_position": WALK, "tx_position": POSTS[0]}
+    levels_db = LEVELS[:, 0].copy()
+    levels_db[[3, 7]] = np.nan, np.inf
+    with pytest.raises(DataError, match="rssi_db, row 7: not finite"):
+        read({**one, "rssi_db": levels_db})
+    walk, which = np.repeat(WALK, STATIONS, axis=0), np.tile(np.arange(STATIONS), PLACES)
+    levels_db = LEVELS.reshape(-1).copy()
+    levels_db[17] = np.inf
+    with pytest.raises(DataError, match="rssi_db, row 17, station roof: not finite"):
+        read(town(tx_position=walk, station=which, rssi_db=levels_db))
+    levels_db = LEVELS.copy()
+    levels_db[4, 1] = -120
+    with pytest.raises(DataError, match="row 4, station east: rssi_db is -120, below -100"):
+        read(town(rssi_db=levels_db, sensitivity_db=np.array(-100.0)))
+
+
+def test_rows_keep_their_numbers_when_a_part_is_taken():
+    """What was selected was counted from 0 again: a message named another row than the file's."""
+    raw = Raw(town(run=np.array(["a"] * 4 + ["b"] * 6)))
+    part = interpret(select(raw, Selection(runs=["b"], stations=["roof"]), "town.npz").raw, "town.npz")
+    assert part.data.row_names == [f"row {i}, station roof" for i in range(4, 10)]
+
+
+def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers():
+    levels_db = np.where(LEVELS < -80, np.nan, LEVELS)
+    carriers = np.where(np.arange(PLACES) % 2, 1e9, 2e9)
+    data = read(town(rssi_db=levels_db, carrier_hz=carriers, sensitivity_db=np.array([-80.0, -81, -82]))).data
+    assert len(data.site.stations) == 2 * STATIONS and data.censored.any()
+    level_db = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
+    expected = [{"n": -80.0, "e": -81.0, "r": -82.0}[data.site.stations.name[t][0]] for t in data.station]
+    np.testing.assert_allclose(level_db[data.censored], np.array(expected)[data.censored], atol=1e-3)
+
+
+def test_powers_of_zero_are_doubted():
+    """They are learned as -300 dB, which nobody said."""
+    powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
+    data = read({**town(rssi_db=None), "rssi": powers}).data
+    assert f"{(powers == 0).sum()} powers are exactly 0, learned as -300 dB" in suspicious_values(data)[0]

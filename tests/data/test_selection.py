@@ -1,0 +1,257 @@
+"""Parts of a campaign: which rows and links stay, what is said of the others, which settings cannot be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from measured import ble_arrays, techtile_arrays
+from releases import real
+
+from gsparc.data.errors import DataError
+from gsparc.data.own import from_arrays
+from gsparc.data.raw import Raw, read_raw
+from gsparc.data.selection import (
+    Selection,
+    keep_loud,
+    keep_rows,
+    keep_runs,
+    keep_stations,
+    select,
+    take_rows,
+)
+from gsparc.data.techtile import raw_of_techtile
+
+
+def wide() -> Raw:
+    """Fifteen places heard by four named stations, with two values missing."""
+    arrays = ble_arrays()
+    arrays["rssi_db"][[2, 5], [1, 3]] = np.nan
+    names = {"mobile_position": "tx_position", "station": "station_name", "frequency_hz": "carrier_hz"}
+    return Raw({names.get(name, name): array for name, array in arrays.items()}, {}, {"tx_position": "m"})
+
+
+def long() -> Raw:
+    """The same, one row per link."""
+    arrays = dict(wide().arrays)
+    rows, count = arrays["rssi_db"].shape
+    arrays["tx_position"] = np.repeat(arrays["tx_position"], count, axis=0)
+    arrays["station"] = np.tile(np.arange(count), rows)
+    arrays["rssi_db"] = arrays["rssi_db"].ravel()
+    return Raw(arrays)
+
+
+def channels() -> Raw:
+    """Twelve places in two runs."""
+    arrays = techtile_arrays()
+    return Raw({"station_position" if n == "rx_antenna_position" else n: a for n, a in arrays.items()})
+
+
+def plain(rows: int = 40, **more: np.ndarray) -> Raw:
+    """Powers of one link per row; row i is at x = i."""
+    places = np.stack([np.arange(rows), np.zeros(rows), np.ones(rows)], axis=1)
+    return Raw({"rx_position": places, "rssi_db": -40.0 - np.arange(rows), **more})
+
+
+def test_nothing_set_leaves_the_file_as_it_is():
+    raw = wide()
+    assert select(raw, Selection(), "file").raw is raw and select(raw, Selection(), "file").notes == ()
+
+
+def test_stations_of_a_wide_file_are_columns():
+    raw = wide()
+    kept = keep_stations(raw, ["sensor42", 1, "sensor42"], "file")
+    assert kept.raw.arrays["station_name"].tolist() == ["sensor11", "sensor42"]
+    assert np.array_equal(kept.raw.arrays["rssi_db"], raw.arrays["rssi_db"][:, [1, 3]], equal_nan=True)
+    assert np.array_equal(kept.raw.arrays["station_position"], raw.arrays["station_position"][[1, 3]])
+    assert kept.raw.arrays["tx_position"] is raw.arrays["tx_position"]
+    assert kept.raw.units == raw.units and kept.notes == ("dataset.stations: 2 of 4 stations left out",)
+
+
+def test_stations_of_a_long_file_are_rows_and_numbered_anew():
+    raw, kept = long(), keep_stations(long(), ["sensor11", "sensor42"], "file")
+    rows = np.isin(raw.arrays["station"], [1, 3])
+    assert np.array_equal(kept.raw.arrays["rssi_db"], raw.arrays["rssi_db"][rows], equal_nan=True)
+    assert np.array_equal(kept.raw.arrays["station"], np.tile([0, 1], 15))
+    assert "with them 30 of 60 rows" in kept.notes[0]
+
+
+def test_what_belongs_to_a_station_goes_with_it():
+    more = {
+        "sensitivity_db": np.arange(4.0),
+        "carrier_hz": 1e9 + np.arange(4.0),
+        "mask": np.ones((15, 4), bool),
+    }
+    kept = keep_stations(Raw({**wide().arrays, **more}), [2, 0], "file").raw.arrays
+    assert kept["sensitivity_db"].tolist() == [0, 2] and kept["carrier_hz"].tolist() == [1e9, 1e9 + 2]
+    assert kept["mask"].shape == (15, 2)
+
+
+def test_runs_are_rows():
+    kept = keep_runs(channels(), ["EXP006"], "file")
+    assert set(kept.raw.arrays["run"]) == {"EXP006"}
+    assert kept.raw.arrays["csi"].shape == (4, 3) and kept.raw.arrays["mask"].shape == (4, 3)
+    assert kept.raw.arrays["station_position"].shape == (3, 3)
+    assert kept.notes == ("dataset.runs=EXP006: 8 of 12 rows left out",)
+
+
+def test_runs_may_be_numbers():
+    raw = Raw({**channels().arrays, "run": np.repeat([5, 6], [8, 4])})
+    assert len(keep_runs(raw, [5], "file").raw.arrays["csi"]) == 8
+    assert len(keep_runs(raw, ["6"], "file").raw.arrays["csi"]) == 4
+
+
+def test_low_powers_of_single_links_are_rows_left_out():
+    kept = keep_loud(plain(), -50, "file")
+    assert kept.raw.arrays["rssi_db"].min() == -50 and len(kept.raw.arrays["rx_position"]) == 11
+    assert kept.notes == ("dataset.min_rssi_db=-50: 29 of 40 rows left out",)
+    linear = Raw(
+        {"rx_position": plain().arrays["rx_position"], "rssi": 10 ** (plain().arrays["rssi_db"] / 10)}
+    )
+    assert len(keep_loud(linear, -50.0001, "file").raw.arrays["rssi"]) == 11
+
+
+def test_low_powers_of_a_wide_file_are_not_measured():
+    raw = wide()
+    level = float(np.nanquantile(raw.arrays["rssi_db"], 0.1))
+    kept = keep_loud(raw, level, "file").raw.arrays
+    with np.errstate(invalid="ignore"):
+        assert np.array_equal(kept["mask"], raw.arrays["rssi_db"] >= level)
+    assert np.array_equal(kept["rssi_db"], raw.arrays["rssi_db"], equal_nan=True)
+
+
+def test_a_fault_is_not_a_signal_below_the_sensitivity():
+    """NaN stays for the reader to take as not heard; what was left out is masked."""
+    raw = Raw({**wide().arrays, "sensitivity_db": np.array(-100.0)})
+    level = float(np.nanquantile(raw.arrays["rssi_db"], 0.1))
+    mask = keep_loud(raw, level, "file").raw.arrays["mask"]
+    unheard = np.isnan(raw.arrays["rssi_db"])
+    assert mask[unheard].all() and not mask[raw.arrays["rssi_db"] < level].any()
+
+
+def test_a_place_that_nobody_heard_loud_enough_is_left_out():
+    raw = wide()
+    raw.arrays["rssi_db"][4] = -200
+    kept = keep_loud(raw, -150, "file")
+    assert len(kept.raw.arrays["rssi_db"]) == 14 and kept.raw.arrays["mask"].shape == (14, 4)
+    assert kept.notes[0].endswith("4 links left out") and kept.notes[1].endswith("1 of 15 rows left out")
+
+
+def test_fewer_rows_cover_the_campaign():
+    rows = keep_rows(plain(1000), 100, "file").raw.arrays["rx_position"][:, 0]
+    assert len(rows) == 100 and (rows // 10).tolist() == list(range(100))
+    assert len(set(rows % 10)) > 5  # not in step with a raster of ten columns
+    again = keep_rows(plain(1000), 100, "file").raw.arrays["rx_position"][:, 0]
+    assert np.array_equal(rows, again)
+
+
+@pytest.mark.parametrize("most", [2, 7, 39])
+def test_the_number_of_rows_is_met(most):
+    kept = keep_rows(plain(40), most, "file")
+    assert len(kept.raw.arrays["rssi_db"]) == most and f"{40 - most} of 40 rows left out" in kept.notes[0]
+
+
+def test_enough_rows_are_all_rows():
+    raw = plain(40)
+    kept = keep_rows(raw, 40, "file")
+    assert kept.raw is raw and not kept.notes
+
+
+def test_the_file_s_split_follows_its_rows():
+    raw = plain(10, split_train=np.arange(7), split_test=np.array([9, 8, 7]))
+    kept = take_rows(raw, np.array([1, 3, 8, 9]), "file").arrays
+    assert kept["split_train"].tolist() == [0, 1] and kept["split_test"].tolist() == [2, 3]
+    assert "split_train" not in take_rows(raw, np.array([1, 3]), "file").arrays
+
+
+def test_paths_follow_their_rows():
+    raw = plain(
+        4,
+        path_offsets=np.array([0, 2, 2, 5, 6]),
+        path_gain=np.arange(6.0),
+        path_last_point=np.arange(18.0).reshape(6, 3),
+    )
+    kept = take_rows(raw, np.array([0, 2]), "file").arrays
+    assert kept["path_offsets"].tolist() == [0, 2, 5] and kept["path_gain"].tolist() == [0, 1, 2, 3, 4]
+    assert kept["path_last_point"].shape == (5, 3)
+
+
+def test_a_static_end_is_no_row():
+    raw = plain(3, tx_position=np.arange(3.0), rx_orientation=np.array([1.0, 0, 0, 0]))
+    kept = take_rows(raw, np.array([0, 2]), "file").arrays
+    assert kept["tx_position"].tolist() == [0, 1, 2] and kept["rx_position"].shape == (2, 3)
+
+
+def test_what_is_left_is_read_as_any_file():
+    raw = plain(40, tx_position=np.array([0.0, 5, 2]))
+    kept = select(raw, Selection(min_rssi_db=-70, max_rows=12), "file")
+    assert len(from_arrays(kept.raw.arrays)) == 12 and len(kept.notes) == 2
+
+
+CANNOT = {
+    "misspelt station": (
+        wide,
+        {"stations": ["senor42"]},
+        "no station senor42 in file; did you mean 'sensor42'?",
+    ),
+    "station of another file": (
+        wide,
+        {"stations": ["x"]},
+        "there are sensor10, sensor11, sensor40, sensor42",
+    ),
+    "station beyond the last": (wide, {"stations": [4]}, "dataset.stations=4: file has stations 0 to 3"),
+    "negative station": (wide, {"stations": [-1]}, "stations 0 to 3"),
+    "name without names": (channels, {"stations": ["A05"]}, "dataset.stations=A05: file has stations 0 to 2"),
+    "no stations": (plain, {"stations": [0]}, "file has no stations; expected station_position"),
+    "no station at all": (wide, {"stations": []}, "expected names"),
+    "stations by True": (wide, {"stations": [True]}, "expected names"),
+    "misspelt run": (channels, {"runs": ["EXP05"]}, "no such run in file; did you mean 'EXP005'?"),
+    "no runs": (wide, {"runs": ["EXP005"]}, "file names no runs; expected an array run"),
+    "no powers": (channels, {"min_rssi_db": -80}, "file holds csi; expected powers"),
+    "all below": (wide, {"min_rssi_db": 0}, "0 rows of file are left"),
+    "all below, single": (plain, {"min_rssi_db": 0.5}, "0 rows of file are left"),
+    "level in words": (plain, {"min_rssi_db": "low"}, "expected a level in dB"),
+    "level NaN": (plain, {"min_rssi_db": float("nan")}, "expected a level in dB"),
+    "no rows": (plain, {"max_rows": 0}, "expected a whole number, at least 2"),
+    "half a row": (plain, {"max_rows": 2.5}, "expected a whole number"),
+    "rows by True": (plain, {"max_rows": True}, "expected a whole number"),
+    "no measurement": (lambda: Raw({"rx_position": np.zeros((3, 3))}), {"max_rows": 2}, "found none of them"),
+    "places of other rows": (
+        lambda: Raw({**plain(40).arrays, "rx_position": np.zeros((39, 3))}),
+        {"max_rows": 9},
+        "file, rx_position: expected 40 rows as the measurement has, found 39",
+    ),
+    "columns of other stations": (
+        lambda: Raw({**wide().arrays, "rssi_db": np.zeros((15, 5))}),
+        {"stations": [0]},
+        r"rssi_db: expected a column for each of the 4 stations",
+    ),
+}
+
+
+@pytest.mark.parametrize(("make", "settings", "words"), CANNOT.values(), ids=CANNOT)
+def test_what_cannot_be_is_one_line(make, settings, words):
+    with pytest.raises(DataError) as caught:
+        select(make(), Selection(**settings), "file")
+    assert words in str(caught.value) and "\n" not in str(caught.value) and len(caught.value.problems) == 1
+
+
+def test_one_name_needs_no_brackets():
+    assert Selection(stations="A05").stations == ("A05",) and Selection(runs=3).runs == (3,)
+
+
+def test_the_faulty_rows_of_the_measured_plane():
+    path = real("real/techtile-power-reci-rf-1.npz")
+    raw = read_raw(path)
+    kept = select(raw, Selection(min_rssi_db=-75, max_rows=5000), path)
+    assert kept.notes[0] == "dataset.min_rssi_db=-75: 73 of 20382 rows left out"
+    assert kept.raw.arrays["rssi_db"].min() > -75 and len(kept.raw.arrays["rx_position"]) == 5000
+    # Fewer rows reach as far as all do, in centimetres.
+    for end in (np.min, np.max):
+        whole, part = (end(r.arrays["rx_position"][:, :2], axis=0) for r in (raw, kept.raw))
+        assert np.abs(whole - part).max() < 0.03
+
+
+def test_one_measured_run():
+    path = real("real/techtile-csi-920mhz.npz")
+    kept = select(raw_of_techtile(path), Selection(runs=["EXP006"], stations=[0, 41]), path)
+    assert kept.raw.arrays["csi"].shape == (238, 2) and "777 of 1015 rows" in kept.notes[1]

@@ -1,0 +1,99 @@
+"""A station whose level steps is another one from there on; nothing else changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsparc.data.errors import DataError
+from gsparc.data.own import from_arrays, interpret
+from gsparc.data.raw import Raw
+from gsparc.data.selection import keep_stations
+from gsparc.data.station_parts import rows_by_station, split_stations
+
+
+def wide(**more: np.ndarray) -> Raw:
+    """12 places, stations a and b; b was off at row 3."""
+    rng = np.random.default_rng(0)
+    rssi = rng.normal(-60, 5, (12, 2))
+    rssi[3, 1] = np.nan
+    arrays = {
+        "rx_position": rng.uniform(0, 9, (12, 3)), "station_position": np.array([[0.0, 0, 3], [9, 9, 3]]),
+        "station_name": np.array(["a", "b"]), "rssi_db": rssi, **more,
+    }  # fmt: skip
+    return Raw(arrays, {}, {})
+
+
+def links(raw: Raw) -> list[tuple[str, float]]:
+    """(station, power) of every row, as loaded."""
+    data = interpret(raw, "file").data
+    level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
+    return [
+        (data.site.stations.name[t], round(float(v), 3)) for t, v in zip(data.station, level, strict=True)
+    ]
+
+
+def test_rows_after_a_step_are_another_stations():
+    parts = links(split_stations(wide(), {"b": (5, 8)}, "file"))
+    names = [name for name, _ in parts]
+    assert [names.count(n) for n in ("a", "b", "b from row 5", "b from row 8")] == [12, 4, 3, 4]
+    assert sorted(v for _, v in parts) == sorted(v for _, v in links(wide())), "no power came or went"
+    raw = wide()
+    assert {v for n, v in parts if n == "b from row 5"} == {
+        round(float(v), 3) for v in raw.arrays["rssi_db"][5:8, 1]
+    }
+
+
+def test_a_part_stays_censored_where_it_heard_nothing_and_only_there():
+    """Columns filled up with NaN would be rows where nothing was heard."""
+    data = interpret(split_stations(wide(sensitivity_db=np.array(-90.0)), {"b": (5,)}, "file"), "file").data
+    assert data.censored.sum() == 1 and data.site.stations.name[data.station[data.censored][0]] == "b"
+
+
+def test_rows_of_a_long_file_and_its_parts_by_the_stations_name():
+    raw = wide()
+    arrays = {k: v for k, v in raw.arrays.items() if k != "rssi_db"}
+    long = Raw({**arrays, "station": np.arange(12) % 2, "rssi_db": raw.arrays["rssi_db"][:, 0]}, {}, {})
+    parts = split_stations(long, {"b": (6,)}, "file")
+    assert parts.arrays["station"].tolist() == [0, 1, 0, 1, 0, 1, 0, 2, 0, 2, 0, 2]
+    kept = keep_stations(parts, ["b"], "file").raw.arrays
+    assert kept["station_name"].tolist() == ["b", "b from row 6"] and kept["station"].tolist() == [
+        0,
+        0,
+        0,
+        1,
+        1,
+        1,
+    ]
+
+
+def test_places_of_a_row_are_held_out_together_as_before():
+    before, after = (interpret(r, "file").data for r in (wide(), split_stations(wide(), {"b": (5,)}, "file")))
+    assert np.array_equal(np.unique(before.place), np.unique(after.place)) and len(before) == len(after)
+
+
+@pytest.mark.parametrize(
+    ("steps", "said"),
+    [
+        ({"c": (5,)}, "no station c in file"),
+        ({"b": (12,)}, "expected a row between 1 and 11"),
+        ({"b": (0,)}, "expected a row between 1 and 11"),
+    ],
+)
+def test_a_step_that_cannot_be_is_one_line(steps, said):
+    with pytest.raises(DataError, match=said):
+        split_stations(wide(), steps, "file")
+
+
+def test_steps_without_stations_are_refused():
+    one = Raw({"rx_position": np.zeros((4, 3)), "tx_position": np.ones(3), "rssi_db": np.zeros(4)}, {}, {})
+    with pytest.raises(DataError, match="has no stations"):
+        split_stations(one, {"b": (2,)}, "file")
+    assert len(from_arrays({**one.arrays, "rx_position": np.eye(4)[:, :3]})) == 4
+
+
+@pytest.mark.parametrize("given", ["x", [], [1.5], [True], None])
+def test_the_setting_holds_lists_of_rows(given):
+    with pytest.raises(DataError, match=r"level_steps\.b=.*expected first rows"):
+        rows_by_station({"b": given})
+    assert rows_by_station({"b": 5, 3: [6, 7]}) == {"b": (5,), "3": (6, 7)}

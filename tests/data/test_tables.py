@@ -1,0 +1,430 @@
+"""Tables of measurements: what is understood, what is said, and 41 spoilt ones with one line each."""
+# ruff: noqa: E501 (a case is a row of a table)
+
+import importlib.util
+import time
+
+import numpy as np
+import pytest
+from releases import real
+
+from gsparc.data.errors import DataError
+from gsparc.data.modules.own import Own
+from gsparc.data.own import interpret
+from gsparc.data.tables.heads import understand
+from gsparc.data.tables.read import read_table, understand_table
+
+PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
+STATIONS = "name,x,y,z\na,1,2,3\nb,2,3,4\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    """`write(text, name)`: a file of it; bytes as they are."""
+
+    def written(content, name="drive.csv"):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        return path
+
+    return written
+
+
+@pytest.mark.parametrize(
+    "head, role, unit",
+    [
+        ("RSRP [dBm]", "rssi_db", "dBm"),
+        ("Rx Power (dBm)", "rssi_db", "dBm"),
+        ("power_dbm", "rssi_db", "dBm"),
+        ("rss", "rssi_db", None),
+        ("power [mW]", "rssi", "mW"),
+        ("lat", "latitude", None),
+        ("latitude_deg", "latitude", "deg"),
+        ("GPS Longitude", "longitude", None),
+        ("lng", "longitude", None),
+        ("x_m", "x", "m"),
+        ("x/mm", "x", "mm"),
+        ("rx_x", "rx_x", None),
+        ("txZ", "tx_z", None),
+        ("rx pos y [cm]", "rx_y", "cm"),
+        ("height", "z", None),
+        ("alt", "z", None),
+        ("gateway_height_m", "station_z", "m"),
+        ("bs_lat", "station_latitude", None),
+        ("station", "station", None),
+        ("Cell ID", "station", None),
+        ("pci", "station", None),
+        ("frequency_mhz", "carrier_hz", "MHz"),
+        ("h_re_0", "csi_re", None),
+        ("csi_im", "csi_im", None),
+        ("run", "run", None),
+        ("time", None, None),
+        ("tx_power_dbm", None, None),
+        ("noise_power", None, None),
+        ("", None, None),
+    ],
+)
+def test_usual_heads(head, role, unit):
+    found = understand(head)
+    assert found.role == role and (unit is None or found.unit.name == unit)
+
+
+def test_labels_of_stations():
+    assert [understand(h).label for h in ("rssi_gw-01 [dBm]", "rssi_db_gw7", "RSSI A", "rssi12")] == [
+        "gw-01", "gw7", "A", "12",
+    ]  # fmt: skip
+
+
+def test_a_plain_table(write):
+    raw = read_table(write(PLAIN))
+    np.testing.assert_array_equal(raw.arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(raw.arrays["rssi_db"], [-80, -81.5])
+    assert list(raw.arrays["row_name"]) == ["line 2", "line 3"]
+
+
+@pytest.mark.parametrize(
+    "content, name",
+    [
+        (PLAIN.encode("utf-8-sig"), "bom.csv"),
+        (PLAIN.encode("utf-16"), "utf16.csv"),
+        (PLAIN.replace("\n", "\r\n"), "windows.csv"),
+        (PLAIN.replace("\n", "\r"), "old.csv"),
+        (PLAIN.replace(",", "\t"), "tabs.tsv"),
+        (PLAIN.replace(",", ";"), "semicolons.csv"),
+        (PLAIN.replace(",", ";").replace(".", ","), "decimal.csv"),
+        (PLAIN.replace(",", " | "), "bars.csv"),
+        (PLAIN.replace(",", "  "), "spaces.txt"),
+        ("# " + PLAIN, "savetxt.csv"),
+        ("# by hand\n\n" + PLAIN + "\n,,,\n% end\n", "comments.csv"),
+        ("sep=;\n" + PLAIN.replace(",", ";"), "excel.csv"),
+        (PLAIN.replace("-80", '"-80"').replace("x,", '"x",'), "quotes.csv"),
+        (PLAIN.replace("x,y", "X [m], Y [m]").replace("rssi", " RSSI (dBm) "), "units.csv"),
+        (PLAIN.replace("z,rssi", "z,rssi,note").replace("-80", "-80,caf\xe9").replace("81.5", "81.5,")
+         .encode("cp1252"), "latin.csv"),
+    ],
+)  # fmt: skip
+def test_the_same_table_in_other_forms(write, content, name):
+    raw = read_table(write(content, name))
+    np.testing.assert_array_equal(raw.arrays["rx_position"], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(raw.arrays["rssi_db"], [-80, -81.5])
+
+
+def test_no_value_in_a_level_is_missing(write):
+    marks = ["", "-", "N/A", "NA", "nan", "NaN", "null", "#N/A", "?", " "]
+    text = "x,y,rssi\n1,1,-80\n" + "".join(f"{i},2,{mark}\n" for i, mark in enumerate(marks))
+    level = read_table(write(text)).arrays["rssi_db"]
+    assert np.isnan(level[1:]).all() and level[0] == -80
+
+
+def test_units_are_converted_and_said(write):
+    text = (
+        "x [mm],y [cm],z_km,power [mW],frequency (MHz)\n1000,200,0.003,1e-6,2400\n2000,300,0.004,2e-6,2400\n"
+    )
+    table = understand_table(write(text))
+    arrays = table.raw.arrays
+    np.testing.assert_allclose(arrays["rx_position"], [[1, 2, 3], [2, 3, 4]])
+    np.testing.assert_allclose(arrays["rssi"], [1e-9, 2e-9])
+    assert arrays["carrier_hz"] == 2.4e9 and arrays["carrier_hz"].shape == ()
+    said = " ".join(table.notes)
+    assert "column 'x [mm]' taken as x [m], mm turned into m" in said
+    assert "column 'power [mW]' taken as rssi [W], mW turned into W" in said
+    assert "MHz turned into Hz" in said and "taken as the receiver's" in said
+
+
+def test_every_guess_is_said_and_what_is_not_used(write):
+    notes = understand_table(write("lat,lng,RSRP [dBm],SINR,battery\n40,8,-80,3,1\n40.1,8,-81,3,1\n")).notes
+    assert "column 'RSRP [dBm]' taken as rssi_db [dBm]" in notes
+    assert (
+        "column 'lat' taken as latitude [deg]" in notes and "column 'lng' taken as longitude [deg]" in notes
+    )
+    assert "not used: columns 'SINR', 'battery'" in notes
+    assert "no height of the receiver: taken as 0 m" in notes
+    assert read_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).arrays["rssi_db"].tolist() == [4, 8]
+
+
+def test_many_transmitters_did_not_become_one_without_a_word(write):
+    rows = "".join(f"A{i % 3},{i},{i * i},2,-{60 + i % 7}\n" for i in range(24))
+    notes = understand_table(write("Transmitter ID,x,y,z,rssi\n" + rows)).notes
+    assert sum("'Transmitter ID' holds 3 names again and again: stations?" in note for note in notes) == 1
+    other = understand_table(write("Operator ID,x,y,z,rssi\n" + rows)).notes
+    assert not any("stations?" in note for note in other)
+
+
+def test_what_is_said_wins_over_guesses(write):
+    text = "lat,lon,px,py,RSRP,RSSI\n40,8,1,2,-80,-60\n40,9,3,4,-81,-61\n"
+    said = {"rssi_db": "rsrp", "tx_x": "px", "tx_y": "py", "tx_z": 1.5, "rx_x": 0, "rx_y": 0, "rx_z": 2}
+    # lat and lon are of an end without a name, which is a third one: it must be said to be none
+    with pytest.raises(DataError, match="expected two ends"):
+        read_table(write(text), said)
+    arrays = read_table(write(text.replace("lat,lon", "a,b")), said).arrays
+    np.testing.assert_array_equal(arrays["rssi_db"], [-80, -81])
+    np.testing.assert_array_equal(arrays["tx_position"], [[1, 2, 1.5], [3, 4, 1.5]])
+    np.testing.assert_array_equal(arrays["rx_position"], [0, 0, 2])
+    degrees = read_table(write(text), {"lat": "lat", "lon": "lon", "rssi_db": "RSSI", "height": 1.5}).arrays
+    assert degrees["latitude"].tolist() == [40, 40] and degrees["rx_height"] == 1.5
+
+
+def test_long_layout_with_places_in_columns(write):
+    text = "x,y,z,rssi,gateway,gateway_x,gateway_y,gateway_z\n"
+    text += "1,1,1,-80,g7,9,9,3\n1,1,1,-85,12,0,0,3\n2,1,1,-81,g7,9,9,3\n"
+    arrays = read_table(write(text)).arrays
+    assert arrays["station"].tolist() == [0, 1, 0] and arrays["station_name"].tolist() == ["g7", "12"]
+    np.testing.assert_array_equal(arrays["station_position"], [[9, 9, 3], [0, 0, 3]])
+    assert "tx_position" in arrays and "rx_position" not in arrays  # gateways listen
+
+
+def test_long_layout_with_transmitters_in_columns(write):
+    text = "rx_x,rx_y,tx_x,tx_y,rsrp,cell\n1,1,9,9,-80,a\n2,1,9,9,-81,a\n1,1,0,0,-85,b\n"
+    arrays = read_table(write(text)).arrays
+    np.testing.assert_array_equal(arrays["station_position"], [[9, 9], [0, 0]])
+    assert arrays["station"].tolist() == [0, 0, 1] and "tx_position" not in arrays
+    assert arrays["station_height"] == 0 and arrays["rx_height"] == 0
+
+
+def test_long_layout_with_a_second_file(write, caplog):
+    listed = "Name;lat;lon;height [m];sensitivity_db;frequency [MHz]\n33;40,1;8,1;10;-120;800\n"
+    listed += "212;40,2;8,2;20;-110;1800\n5;41;8;3;-110;800\n"
+    stations = write(listed, "stations.csv")
+    table = understand_table(write("lat,lon,rssi,pci\n40,8,-80,212\n40,8,-90,33\n"), {}, stations)
+    arrays = table.raw.arrays
+    assert arrays["station_name"].tolist() == ["33", "212", "5"] and arrays["station"].tolist() == [1, 0]
+    np.testing.assert_array_equal(arrays["station_latitude"], [40.1, 40.2, 41])
+    np.testing.assert_array_equal(arrays["station_height"], [10, 20, 3])
+    np.testing.assert_array_equal(arrays["sensitivity_db"], [-120, -110, -110])
+    np.testing.assert_array_equal(arrays["carrier_hz"], [8e8, 1.8e9, 8e8])
+    assert "listed, but in no row: 5" in table.notes
+
+
+@pytest.mark.parametrize(
+    "heads, columns",
+    [
+        ("rssi_b,rssi_a", {}),
+        ("b,a", {}),
+        ("level of b (s),level of a (s)", {"rssi_db": "level of * (s)"}),
+        ("b dBm,a dBm", {"rssi_db": "* dBm"}),
+    ],
+)
+def test_wide_layout(write, heads, columns):
+    text = f"x,y,z,{heads}\n1,2,3,-80,-90\n4,5,6,,-91\n"
+    arrays = read_table(write(text), columns, write(STATIONS, "stations.csv")).arrays
+    assert arrays["station_name"].tolist() == ["b", "a"] and "station" not in arrays
+    np.testing.assert_array_equal(arrays["rssi_db"], [[-80, -90], [np.nan, -91]])
+    np.testing.assert_array_equal(arrays["station_position"], [[2, 3, 4], [1, 2, 3]])
+
+
+def test_channels(write):
+    text = "tx_x,tx_y,tx_z,h_re_0,h_im_0,h_re_1,h_im_1\n1,2,3,1,2,3,4\n2,2,3,5,6,,\n"
+    said = {"rx_x": 0, "rx_y": 0, "rx_z": 0, "frequency_hz": "2.4e9:2.5e9"}
+    arrays = read_table(write(text), said).arrays
+    assert arrays["csi"][0].tolist() == [1 + 2j, 3 + 4j] and arrays["frequency_hz"].tolist() == [2.4e9, 2.5e9]
+    assert arrays["mask"].tolist() == [[True, True], [True, False]]
+    one = "x,y,z,tx_x,tx_y,tx_z,real,imag,frequency_ghz\n1,2,3,0,0,0,1,2,2.4\n2,2,3,0,0,0,5,6,2.4\n"
+    raw = read_table(write(one))
+    assert raw.arrays["frequency_hz"] == 2.4e9 and raw.arrays["csi"].shape == (2,)
+    assert interpret(raw, "drive.csv").data.site.kind == "csi"
+
+
+def test_runs_and_names_of_rows(write):
+    arrays = read_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).arrays
+    assert arrays["run"].tolist() == ["7", "8"] and arrays["row_name"].tolist() == ["p", "q"]
+
+
+def test_two_ends_in_degrees_become_stations(write):
+    text = "rx_lat,rx_lon,tx_lat,tx_lon,rsrp\n40,8,40.1,8,-80\n40,8.1,40.1,8,-80\n40,8.2,40.3,8,-80\n"
+    arrays = read_table(write(text + "40,8.3,40.3,8,-80\n")).arrays
+    assert arrays["station_latitude"].tolist() == [40.1, 40.3] and arrays["station"].tolist() == [0, 0, 1, 1]
+    assert arrays["longitude"].tolist() == [8, 8.1, 8.2, 8.3]
+
+
+def test_the_dataset_own_reads_tables(write):
+    rng = np.random.default_rng(0)
+    rows = "".join(f"{x:.3f},{y:.3f},1,5,5,2,{-40 - x - y:.2f}\n" for x, y in rng.uniform(0, 4, (30, 2)))
+    path = write("x,y,z,tx_x,tx_y,tx_z,RSRP\n" + rows)
+    data = Own(path, columns={"rssi_db": "RSRP", "lat": None}).measurements
+    assert len(data) == 30 and data.site.static_end == "tx" and data.row_names[0] == "line 2"
+
+
+# What is in the file, settings, and words of the line that refuses it.
+SPOILT = {
+    "empty": ("", {}, "empty; expected a line of heads"),
+    "comments only": ("# x,y,rssi\n\n", {}, "empty; expected a line of heads"),
+    "heads only": ("x,y,rssi\n", {}, "line 1 names columns, but there are no rows"),
+    "no heads": ("1,2,-80\n2,3,-81\n", {}, "line 1 holds numbers; expected the names"),
+    "one column": ("rssi\n-80\n-81\n", {}, "line 1 ('rssi') is a single column"),
+    "no numbers": ("x,y,rssi\na,b,c\n", {}, "column 'rssi', line 2: 'c': is no finite number"),
+    "a line too long": ("x,y,rssi\n1,2,-80\n1,2,3,-81\n", {}, "line 3 (4 cells): expected 3 cells"),
+    "a line too short": ("x,y,rssi\n1,2,-80\n1,2\n", {}, "line 3 (2 cells): expected 3 cells"),
+    "decimal commas between commas": ("x,y\n1,5,2,5\n2,5,3,5\n", {}, "2 heads, but every line below has 4"),
+    "an open quote": ('x,y,rssi\n1,2,"-80\n3,4,-81\n', {}, "line 2: a quotation mark is not closed"),
+    "two columns of one name": ("x,y,x,rssi\n1,2,3,-80\n", {}, "columns 1 and 3 are both named 'x'"),
+    "mixed decimal marks": (
+        "x;y;rssi\n1,5;2;-80,5\n1,6;2;-80.5\n", {}, "column 'rssi', line 3: '-80.5': is no finite number; this",
+    ),
+    "thousands": ('x,y,rssi\n"1,234.5",2,-80\n1.5,2,-8.5\n', {}, "column 'x', line 2: '1,234.5': is no finite"),
+    "text in a column of numbers": (
+        "# my drive\nx,y,rssi\n1,2,-80\n\n2,3,none heard\n", {}, "column 'rssi', line 5: 'none heard': is no",
+    ),
+    "infinity": ("x,y,rssi\n1,2,-80\n2,3,-inf\n", {}, "column 'rssi', line 3: '-inf': is no finite number"),
+    "no place in a row": ("x,y,rssi\n1,2,-80\n,3,-81\n", {}, "column 'x', line 3: no value; x is needed"),
+    "no place at all": ("rssi,speed\n-80,1\n-81,2\n", {}, "no coordinates among 'rssi', 'speed'"),
+    "no y": ("x,rssi\n1,-80\n2,-81\n", {}, "x is there but no y; say dataset.columns.y=COLUMN"),
+    "no levels": ("x,y,speed\n1,2,3\n", {}, "no column of levels, powers or channels among 'x', 'y', 'speed'"),
+    "no level in any row": ("x,y,rssi\n1,2,\n2,3,-\n", {}, "column 'rssi': no value in any row"),
+    "two levels": ("x,y,RSRP,RSSI\n1,2,-80,-60\n", {}, "'RSRP' and 'RSSI' could each be rssi_db; say which"),
+    "dBm and mW": ("x,y,power_dbm,power_mw\n1,2,-80,1\n", {}, "are different measurements; say dataset.col"),
+    "metres and degrees": ("x,y,lat,lon,rssi\n1,2,40,8,-80\n", {}, "both say where; say dataset.columns.x=x"),
+    "dBm or watts": ("x,y,power\n1,2,3\n2,3,4\n", {}, "column 'power': no value below 0: dBm or W? say"),
+    "an unknown unit": ("x [inch],y [m],rssi\n1,2,-80\n", {}, "column 'x [inch]': [inch] is no known unit"),
+    "a misspelt column": (PLAIN, {"rssi_db": "rsi"}, "dataset.columns.rssi_db=rsi: drive.csv has no such column; "
+                          "did you mean 'rssi'?"),
+    "a misspelt quantity": (PLAIN, {"rsi_db": "rssi"}, "no such quantity; did you mean rssi_db?"),
+    "a unit that does not suit": (PLAIN.replace("rssi", "p [mW]"), {"rssi_db": "p"}, "is in mW; rssi_db needs"),
+    "latitude beyond the pole": ("lat,lon,rssi\n40,8,-80\n140,8,-81\n", {}, "column 'lat', line 3: 140: latitude"),
+    "latitude and longitude swapped": (
+        "lat,lon,rssi\n-111.8,40.7,-80\n", {}, "-111.8: latitude is outside -90 to 90 degrees; are latitude and",
+    ),
+    "stations without places": ("x,y,rssi,cell\n1,2,-80,a\n", {}, "stations without places; add columns"),
+    "columns of stations without places": ("x,y,rssi_a,rssi_b\n1,2,-80,-81\n", {}, "say dataset.stations_file"),
+    "a station that moved": (
+        "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,a,5,6\n", {}, "'a' is at (5, 5) in line 2 and at (5, 6)",
+    ),
+    "a row of no station": (
+        "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,,5,5\n", {}, "column 'cell', line 3: no station",
+    ),
+    "half of a channel": ("x,y,h_re_0,h_im_0,h_re_1\n1,2,3,4,5\n", {}, "'h_re_1' has no csi_im beside it"),
+    "degrees and metres": ("lat,lon,rssi,cell,cell_x,cell_y\n40,8,-80,a,5,5\n", {}, "of stations in metres"),
+    "Excel": (b"PK\x03\x04" + bytes(50), {}, "not a table of text but an Excel workbook"),
+    "gzip": (b"\x1f\x8b" + bytes(50), {}, "compressed by gzip"),
+    "JSON": ('{"x": 1}', {}, "not a table of text but JSON"),
+    "zeros": (b"x,y\0,rssi\n1,2,-80\n", {}, "not text (byte 3 is zero"),
+    "UTF-16 cut short": (PLAIN.encode("utf-16")[:-1], {}, "damaged UTF-16"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_a_spoilt_table_is_refused_in_a_line(write, name, monkeypatch, tmp_path):
+    content, columns, words = SPOILT[name]
+    write(content)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError) as caught:
+        read_table("drive.csv", columns)
+    problems = caught.value.problems
+    assert words in problems[0], problems
+    assert all("\n" not in p and ("drive.csv" in p or "dataset." in p) for p in problems)
+    assert len(problems) <= 3, problems
+
+
+def test_all_bad_cells_are_listed_at_once(write):
+    rows = "".join(f"{i},{'?!' if i % 2 else i},-8x\n" for i in range(20))
+    with pytest.raises(DataError) as caught:
+        read_table(write("x,y,rssi\n" + rows))
+    said = "\n".join(caught.value.problems)
+    assert "line 2: '-8x'" in said and "line 3: '?!'" in said
+    assert "the same in 15 more rows" in said and "the same in 5 more rows" in said
+
+
+@pytest.mark.parametrize(
+    "listed, words",
+    [
+        ("name,x,y,z\na,1,2,3\n", "column 'station', line 3: 'b' is no listed station"),
+        ("name,x,y,z\na,1,2,3\nB1,1,2,3\nb7,3,4,5\n", "did you mean 'b7'?"),
+        ("name,x,y,z\na,1,2,3\na,1,2,4\n", "station 'a' is listed twice, in line 2 and line 3"),
+        ("x,y,z\n1,2,3\n", "no column of names"),
+        ("name,height\na,1\n", "no coordinates; expected columns x, y, z"),
+        ("name,x,y\na,1,\n", "column 'y', line 2: no value; station_y is needed"),
+    ],
+)
+def test_a_spoilt_list_of_stations(write, listed, words):
+    with pytest.raises(DataError) as caught:
+        read_table(write("x,y,rssi,station\n1,2,-80,a\n1,3,-81,b\n"), {}, write(listed, "stations.csv"))
+    assert any(words in problem for problem in caught.value.problems), caught.value.problems
+
+
+def test_names_of_files(write, tmp_path):
+    with pytest.raises(DataError, match="no such file"):
+        read_table(tmp_path / "nothing.csv")
+    with pytest.raises(DataError, match=r"expected a name ending in .csv"):
+        read_table(write(PLAIN, "drive.xlsx"))
+
+
+def test_marks_between_thousands_were_decimal_commas(write):
+    """\"448,262\" in quotes between commas was 448.262 m."""
+    with pytest.raises(
+        DataError, match=r"line 2: '448,262': is no finite number; .* no marks between thousands"
+    ):
+        read_table(write('x,y,rssi\n"448,262","412,100",-60\n"448,263","412,107",-61\n'))
+    some = read_table(write('x,y,rssi\n"448,262","412,1",-60\n"448,263","412,25",-61\n'))
+    np.testing.assert_array_equal(some.arrays["rx_position"], [[448.262, 412.1], [448.263, 412.25]])
+
+
+def test_access_points_that_receive_were_transmitters(write):
+    """Stations whose places are called rx_x, ... receive: the other end is the transmitter, and moves."""
+    lines = [f"{i},{i % 7},1,{'ab'[i % 2]},{50 * (i % 2)},0,3,{-50 - i % 13}" for i in range(40)]
+    path = write("\n".join(["x,y,z,ap,rx_x,rx_y,rx_z,rssi", *lines]))
+    arrays = read_table(path).arrays
+    assert "tx_position" in arrays and "rx_position" not in arrays
+    assert "rx_position" in read_table(write(path.read_text().replace("rx_", "tx_"))).arrays
+
+
+def test_parquet(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gsparc[tables]'")
+    from pyarrow import parquet
+
+    columns = {"lat": [40.0, 40.1], "lon": [8.0, 8.1], "RSRP [dBm]": [-80, None], "pci": [7, 8]}
+    columns |= {"cell_lat": [41.0, 42.0], "cell_lon": [8.0, 8.0]}
+    parquet.write_table(pyarrow.table(columns), tmp_path / "drive.parquet")
+    arrays = read_table(tmp_path / "drive.parquet").arrays
+    assert arrays["station_name"].tolist() == ["7", "8"] and arrays["row_name"][1] == "row 1"
+    assert arrays["rssi_db"][0] == -80 and np.isnan(arrays["rssi_db"][1])
+    (tmp_path / "bad.parquet").write_bytes(b"PAR1" + bytes(20))
+    with pytest.raises(DataError, match="damaged or not a Parquet file"):
+        read_table(tmp_path / "bad.parquet")
+
+
+def test_an_index_of_parquet_was_dropped(tmp_path):
+    """pandas sets a column aside as the index: stations were lost, and all rows one station's."""
+    pytest.importorskip("pyarrow", reason="pyarrow is not installed: pip install 'gsparc[tables]'")
+    import pandas as pd
+
+    columns = {
+        "x": [0.0, 1],
+        "y": [0.0, 2],
+        "station": ["a", "b"],
+        "station_x": [5.0, 6],
+        "station_y": [0.0, 0],
+    }
+    frame = pd.DataFrame({**columns, "rssi": [-80.0, -70]})
+    for index in (["station"], ["station", "x"]):
+        frame.set_index(index).to_parquet(tmp_path / "drive.parquet")
+        arrays = read_table(tmp_path / "drive.parquet").arrays
+        assert arrays["station_name"].tolist() == ["a", "b"] and arrays["rx_position"].tolist() == [
+            [0, 0],
+            [1, 2],
+        ]
+
+
+def test_parquet_without_pyarrow(write, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
+    with pytest.raises(DataError, match=r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"):
+        read_table(write(b"PAR1", "drive.parquet"))
+    assert importlib.util.find_spec("pandas") is not None
+
+
+def test_a_real_drive_as_a_table(tmp_path):
+    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
+        wide, names = stored["rssi_db"].astype(float), stored["station"]
+        place, fixed = stored["mobile_position"], stored["station_position"]
+    lines = ["x,y," + ",".join(f"rssi_{name}" for name in names)]
+    lines += [
+        ",".join([f"{p[0]!r}", f"{p[1]!r}", *("" if np.isnan(v) else repr(v) for v in row)])
+        for p, row in zip(place.tolist(), wide.tolist(), strict=True)
+    ]
+    (tmp_path / "drive.csv").write_text("\n".join(lines))
+    listed = [f"{n},{x!r},{y!r}" for n, (x, y) in zip(names, fixed.tolist(), strict=True)]
+    (tmp_path / "stations.csv").write_text("name,x,y\n" + "\n".join(listed))
+    start = time.perf_counter()
+    arrays = read_table(tmp_path / "drive.csv", {}, tmp_path / "stations.csv").arrays
+    assert time.perf_counter() - start < 5
+    np.testing.assert_array_equal(arrays["rssi_db"], wide)
+    np.testing.assert_array_equal(arrays["rx_position"], place)
+    assert arrays["station_name"].tolist() == names.tolist()

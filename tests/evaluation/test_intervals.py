@@ -1,0 +1,78 @@
+"""Intervals and outages of predicted normal distributions, against draws from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsparc.data.own import from_arrays
+from gsparc.evaluation.intervals import levels, power_intervals
+from gsparc.evaluation.scores import Scores
+
+COUNT, LEVEL = 4000, -80.0
+
+
+@pytest.fixture(scope="module")
+def drawn():
+    """Powers about -80 dB with 6 dB of shadowing, half of them too weak; what is predicted is their law."""
+    rng = np.random.default_rng(0)
+    mean_db = rng.normal(LEVEL, 8, COUNT)
+    truth = mean_db + rng.normal(0, 6, COUNT)
+    data = from_arrays(
+        {
+            "rx_position": rng.uniform(0, 9, (COUNT, 3)), "tx_position": np.zeros(3), "sensitivity_db": LEVEL,
+            "rssi_db": np.where(truth < LEVEL, np.nan, truth),
+        }
+    )  # fmt: skip
+    return data, mean_db
+
+
+def scored(data, mean_db, spread_db):
+    mean = 10 ** (mean_db / 10)
+    linear = (np.log(10) / 10 * mean * spread_db / data.site.target_scale) ** 2
+    samples = {"prediction": mean}
+    return Scores("rssi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), linear)
+
+
+def test_the_level_is_that_of_the_file(drawn):
+    assert levels(drawn[0]) == pytest.approx([LEVEL], abs=1e-3)
+
+
+def test_a_true_law_is_calibrated(drawn):
+    data, mean_db = drawn
+    found = power_intervals(scored(data, mean_db, 6.0), data)
+    assert found["outage/rate"] == pytest.approx(0.5, abs=0.03)
+    assert found["outage/brier"] < 0.8 * found["outage/brier_rate"]
+    assert found["interval/width_db"] == pytest.approx(2 * 1.645 * 6, rel=0.01)
+    # Heard rows are the upper part of their laws: a little fewer than 90 % lie inside.
+    assert 0.84 < found["interval/coverage_90"] < 0.93
+
+
+def test_too_sure_and_too_unsure_are_told_apart(drawn):
+    data, mean_db = drawn
+    sure, right, unsure = (power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0))
+    assert sure["interval/coverage_90"] < 0.4 < 0.99 < unsure["interval/coverage_90"]
+    assert right["outage/brier"] < min(sure["outage/brier"], unsure["outage/brier"])
+
+
+def test_no_variance_no_figures(drawn):
+    data, mean_db = drawn
+    scores = scored(data, mean_db, 6.0)
+    assert power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
+
+
+def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
+    """The summary of the whole run was refused for it, after the training."""
+    walk = np.random.default_rng(0).uniform(0, 9, (40, 3))
+    levels_db = np.stack([-80 - walk[:, 0], -80 - walk[:, 1]], axis=1)
+    levels_db[levels_db[:, 0] < -85, 0] = np.nan
+    posts = {
+        "station_position": np.array([[0.0, 0, 5], [9, 9, 5]]),
+        "sensitivity_db": np.array([-85.0, -200]),
+    }
+    data = from_arrays({"rx_position": walk, "rssi_db": levels_db, **posts})
+    row = np.flatnonzero(data.station == 1)
+    mean = data.target[row, 0].astype(float) * data.site.target_scale
+    spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
+    scores = Scores("rssi", 0 * row, row, {"prediction": mean}, np.full(len(row), np.nan), spread)
+    assert set(power_intervals(scores, data)) == {"interval/coverage_90", "interval/width_db"}

@@ -1,0 +1,83 @@
+"""Data of another file in the coordinates, units and stations of a model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import SplitSettings, make_split
+from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.open_runs import aligned
+from gsparc.evaluation.scores import score
+from gsparc.methods.method import FitContext
+from gsparc.methods.per_station import for_links
+from gsparc.methods.registry import method_class
+
+RNG = np.random.default_rng(0)
+WALK = np.column_stack([RNG.uniform(0, 50, (80, 2)), np.full(80, 1.5)])
+POSTS = np.array([[0.0, 0, 5], [50, 0, 5], [25, 60, 5]])
+LEVELS = -20 * np.log10(np.linalg.norm(WALK[:, None] - POSTS, axis=-1)) - np.array([0.0, 30, 60])
+NAMES = np.array(["north", "east", "roof"])
+
+
+def town(chosen=(0, 1, 2), **changes):
+    """The stations `chosen`, in that order."""
+    some = list(chosen)
+    arrays = {"rx_position": WALK, "station_position": POSTS[some], "rssi_db": LEVELS[:, some]}
+    return from_arrays({**arrays, "station_name": NAMES[some], **changes})
+
+
+@pytest.mark.parametrize("chosen", [(2, 0, 1), (1, 2), (2,)])
+def test_stations_in_another_order_were_answered_by_each_other(chosen):
+    """One file lists the stations of a model in another order, or some of them: 31 dB off without a word."""
+    data, other = town(), town(chosen)
+    method = for_links(method_class("idw"), data)
+    method.fit(data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext())
+    same = aligned(other, data.site)
+    assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]
+    split = make_split(same.moving, SplitSettings(), place=same.place)
+    assert score([method], same, split).figures()["rmse_db"] < 4
+
+
+def test_a_station_that_the_model_does_not_know_is_refused():
+    with pytest.raises(ValueError, match="station roof of arrays is none of the model's"):
+        aligned(town(), town((0, 1)).site)
+    alone = from_arrays({"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0]})
+    with pytest.raises(ValueError, match="arrays has one static end, the model has stations"):
+        aligned(alone, replace(town().site, name="arrays"))
+
+
+def test_stations_at_one_place_are_known_by_their_names():
+    mast = {"station_position": POSTS[[0, 0, 0]]}
+    same = aligned(town((1, 2, 0), **mast), town(**mast).site)
+    np.testing.assert_array_equal(same.station[:3], [1, 2, 0])
+
+
+def test_degrees_about_another_origin_were_taken_for_the_same_metres():
+    """Another part of a drive has another origin: its places were hundreds of metres off."""
+    latitude, longitude = 48 + RNG.uniform(0, 0.02, 80), 179.99 + RNG.uniform(0, 0.02, 80)
+    levels_db = np.linspace(-90, -50, 80)
+
+    def drive(rows):
+        degrees = {"latitude": latitude[rows], "longitude": longitude[rows], "rx_height": 1.5}
+        return from_arrays({**degrees, "rssi_db": levels_db[rows]})
+
+    whole, part = drive(slice(None)), drive(slice(50, None))
+    assert whole.site.georeference != part.site.georeference
+    same = aligned(part, whole.site)
+    np.testing.assert_allclose(same.rx_position, whole.rx_position[50:], atol=1e-3)
+    assert same.site.georeference == whole.site.georeference
+
+
+def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations(tmp_path, monkeypatch):
+    """A cache told data apart by their content, not by the numbers that a model has for their stations."""
+    monkeypatch.setattr("gsparc.evaluation.baseline_cache.STORE_ABOVE_S", 0.0)
+    other = town((2, 0, 1))
+    split = make_split(other.moving, SplitSettings(), place=other.place)
+    for data in (other, aligned(other, town().site)):
+        assert baseline("idw", data, split, cache=tmp_path).scores.figures()["rmse_db"] < 4
+    found = baseline("idw", aligned(other, town().site), split, "train", cache=tmp_path)
+    assert found.scores.figures()["rmse_db"] < 1e-3

@@ -1,0 +1,145 @@
+"""The map of a campaign: what is on it, and that it is drawn for every kind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+from releases import real
+
+from gsparc.data.doubts import steps_of
+from gsparc.data.link_levels import link_levels
+from gsparc.data.load import load
+from gsparc.data.own import from_arrays
+from gsparc.evaluation import site_plan
+from gsparc.evaluation.site_plan import draw_site, spots
+
+REAL = {
+    "techtile": "techtile-csi-920mhz",
+    "powder": "powder-rss-462mhz",
+    "ble": "ble-hall-1",
+    "own": "techtile-power-reci-rf-1",
+}
+
+
+def scattered(count=80):
+    return np.random.default_rng(0).uniform([0, 0, 1], [30, 12, 2], (count, 3))
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that were drawn; nothing is written."""
+    kept: list[Figure] = []
+    monkeypatch.setattr(site_plan, "save", lambda figure, path: kept.append(figure))
+    return kept
+
+
+def words(figure: Figure) -> str:
+    """All text of a figure, a line each."""
+    figure.draw_without_rendering()
+    return "\n".join(text.get_text() for text in figure.findobj(lambda part: hasattr(part, "get_text")))
+
+
+def shown(data, figures):
+    levels = link_levels(data)
+    steps = []
+    if levels is not None:
+        steps = steps_of(levels.position, levels.station, levels.level_db, levels.station_position)
+    draw_site(data, "unused.png", levels, steps)
+    return figures[-1], words(figures[-1])
+
+
+def test_levels_are_means_over_what_was_heard():
+    place = scattered(10)
+    level = np.stack([np.full(10, -60.0), np.full(10, -80.0), np.full(10, -70.0)], axis=1)
+    level[3, 0], level[4, :2] = np.nan, np.nan
+    data = from_arrays({"rx_position": place, "station_position": scattered(3), "rssi_db": level})
+    found = spots(data, link_levels(data))
+    assert np.allclose(found.place, place[:, :2])  # world coordinates, in the order of measuring
+    expected = np.full(10, -70.0)
+    expected[3] = -75
+    assert np.allclose(found.level_db, expected, atol=1e-4) and not found.doubtful.any()
+    assert found.label == "received power, mean of the stations heard [dB]"
+
+
+def test_channels_are_means_of_power():
+    csi = np.ones((20, 2, 3)) * np.array([1.0, 3.0])[:, None]
+    arrays = {"rx_position": scattered(20), "tx_position": np.zeros(3), "csi": csi * (1 + 0j)}
+    found = spots(from_arrays({**arrays, "frequency_hz": 1e9 + 1e6 * np.arange(3)}), None)
+    assert np.allclose(found.level_db, 10 * np.log10(5), atol=1e-4)
+
+
+def test_rows_that_are_wrong_are_marked(figures):
+    place = scattered()
+    place[17] = [5000, 300, 1]
+    level = -20 * np.log10(np.linalg.norm(place - [3, 3, 5], axis=1))
+    level[40] = -150
+    data = from_arrays({"rx_position": place, "tx_position": np.array([3.0, 3, 5]), "rssi_db": level})
+    found = spots(data, link_levels(data))
+    assert np.flatnonzero(found.far).tolist() == [17] and found.doubtful[40]
+    figure, said = shown(data, figures)
+    assert "row 17 at (5000, 300)" in said and "row 40" in said and "level in doubt (1 place)" in said
+    assert figure.axes[0].get_xlim()[1] < 40  # the map is of the others
+    assert figure.axes[0].get_aspect() == 1
+
+
+def test_stations_that_jump_have_a_panel(figures):
+    rng = np.random.default_rng(0)
+    place = rng.uniform(0, 100, (200, 3)) * [1, 1, 0]
+    posts = np.array([[0.0, 0, 9], [100, 0, 9], [0, 100, 9]])
+    level = -30 * np.log10(np.linalg.norm(place[:, None] - posts, axis=-1)) + rng.normal(0, 1, (200, 3))
+    level[120:, 1] += 20
+    names = np.array(["a", "b", "c"])
+    data = from_arrays(
+        {"tx_position": place, "station_position": posts, "station_name": names, "rssi_db": level}
+    )
+    figure, said = shown(data, figures)
+    panels = [axis for axis in figure.axes if axis.get_title()]
+    assert [axis.get_title() for axis in panels] == ["b: steps that the places do not explain"]
+    assert (
+        "dB from row 119 to row 120" in said
+        and "its level jumps" in said
+        and "3 stations (receivers)" in said
+    )
+
+
+def test_the_origin_of_degrees_is_said(figures):
+    rng = np.random.default_rng(0)
+    arrays = {"latitude": -33 - rng.uniform(0, 0.01, 30), "longitude": 151 + rng.uniform(0, 0.01, 30)}
+    data = from_arrays({**arrays, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 30)})
+    origin = data.site.georeference
+    said = shown(data, figures)[1]
+    assert f"metres east of {origin.longitude:g}° E" in said
+    assert f"metres north of {-origin.latitude:g}° S" in said
+
+
+def test_many_stations_are_counted_and_not_named(figures):
+    arrays = {
+        "rx_position": scattered(),
+        "station_position": scattered(16),
+        "rssi_db": np.full((80, 16), -50.0),
+    }
+    arrays["station_name"] = np.array([f"post{i}" for i in range(16)])
+    said = shown(from_arrays(arrays), figures)[1]
+    assert "16 stations" in said and "post3" not in said
+    few = {name: values[:15] if name != "rx_position" else values for name, values in arrays.items()}
+    few["rssi_db"] = np.full((80, 15), -50.0)
+    assert "post3" in shown(from_arrays(few), figures)[1]
+
+
+def test_other_kinds_are_drawn_too(campaign, figures):
+    assert "spectra" in shown(campaign("spectrum"), figures)[1]
+    ends = {"rx_position": scattered(), "tx_position": scattered()[::-1], "frequency_hz": np.array(1e9)}
+    said = shown(from_arrays({**ends, "csi": np.exp(1j * np.arange(80))}), figures)[1]
+    assert "transmitter" in said and "receiver" in said and "mean channel power [dB]" in said
+    line = {"rx_position": np.arange(30.0)[:, None] * [1, 0, 0], "rssi_db": np.arange(30.0)}
+    assert "30 powers at 30 places" in shown(from_arrays(line), figures)[1]
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_campaigns_become_pictures(name, tmp_path):
+    data = load({"name": name, "file": str(real(f"real/{REAL[name]}.npz")), "max_rows": 400})
+    draw_site(data, tmp_path / "map.png", link_levels(data))
+    with Image.open(tmp_path / "map.png") as picture:
+        assert min(picture.size) > 300

@@ -1,0 +1,70 @@
+"""A drive test with GPS as people keep it: a table of rows, one of stations, and places to ask about."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from releases import real
+
+from gsparc.data.powder import raw_of_powder
+
+STATIONS = ("ebc-nuc1-b210", "law73-nuc2-b210")
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Files of a drive test.
+
+    Attributes:
+        rows, sites, places: tables of measurements, of stations, and of places that are in no row.
+        degrees: (n, 2) latitude and longitude of `places` [deg].
+        level_db: (n, T) measured there [dB].
+        learned_db: (m, T) measured in `rows`.
+    """
+
+    rows: Path
+    sites: Path
+    places: Path
+    degrees: np.ndarray
+    level_db: np.ndarray
+    learned_db: np.ndarray
+
+
+def write_table(path: Path, heads: Iterable[str], rows: Iterable[Iterable[object]]) -> Path:
+    """A CSV file."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(heads)
+        writer.writerows(rows)
+    return path
+
+
+def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
+    """Rows of the measured city at two stations; `held` of them are left for asking."""
+    arrays = raw_of_powder(real("real/powder-rss-462mhz.npz")).arrays
+    names = list(map(str, arrays["station_name"]))
+    chosen = [names.index(station) for station in STATIONS]
+    level = arrays["rssi_db"][:, chosen].astype(np.float64)
+    heard = np.flatnonzero(np.isfinite(level).all(axis=1))
+    rng = np.random.default_rng(0)
+    rows = np.sort(rng.choice(heard, count, replace=False))
+    asked = np.zeros(count, bool)
+    asked[rng.choice(count, held, replace=False)] = True
+    degrees = np.stack([arrays["latitude"], arrays["longitude"]], axis=1)[rows]
+    level = level[rows].round(2)
+    table = np.array([[*map(repr, d), *map(str, p)] for d, p in zip(degrees.tolist(), level, strict=True)])
+    sites = [
+        [station, arrays["station_latitude"][i], arrays["station_longitude"][i], 10.0]
+        for station, i in zip(STATIONS, chosen, strict=True)
+    ]
+    heads = ["Latitude", "Longitude", *(f"RSRP_{station} [dBm]" for station in STATIONS)]
+    return Drive(
+        write_table(folder / "drive.csv", heads, table[~asked]),
+        write_table(folder / "sites.csv", ["name", "lat", "lon", "height"], sites),
+        write_table(folder / "places.csv", heads[:2], table[asked, :2]),
+        degrees[asked], level[asked], level[~asked],
+    )  # fmt: skip

@@ -1,0 +1,177 @@
+"""Rows where nothing was heard: the likelihood of "below the level", and a town half of which is silent."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mpmath
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+from scipy.stats import multivariate_normal
+
+from gsparc.data.own import from_arrays
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.methods import censored_ep
+from gsparc.methods.censored import heard, left_out_note
+from gsparc.methods.censored_ep import condition, log_evidence, propagate, truncated
+from gsparc.methods.method import FitContext
+from gsparc.methods.power_process import draw
+from gsparc.methods.registry import build
+
+STATION = np.array([500.0, 500.0, 20.0])
+SHADOWING_DB, LENGTH_M, NOISE_DB = 7.0, 80.0, 1.5
+
+
+def town(count: int = 500, seed: int = 0) -> tuple[Measurements, np.ndarray, np.ndarray]:
+    """A kilometre of streets, half of it below the sensitivity; true powers [dB], and which were heard."""
+    rng = np.random.default_rng(seed)
+    places = np.c_[rng.uniform(0, 1000, (count, 2)), np.full(count, 1.5)]
+    gap = np.sqrt(3) * cdist(places, places) / LENGTH_M
+    root = np.linalg.cholesky((1 + gap) * np.exp(-gap) + 1e-9 * np.eye(count))
+    law = -20 - 32 * np.log10(np.linalg.norm(places - STATION, axis=1))
+    true = law + SHADOWING_DB * root @ rng.standard_normal(count)
+    level = float(np.median(true))
+    measured = true + NOISE_DB * rng.standard_normal(count)
+    silent = measured < level
+    shown = np.where(silent, level, measured)
+    arrays = {"rx_position": places, "tx_position": STATION, "rssi_db": shown, "carrier_hz": np.array(9e8)}
+    data = from_arrays(arrays, {"name": "town"})
+    return replace(data, censored=silent, mask=~silent[:, None]), true, silent
+
+
+def fold_of(data: Measurements, share: float = 0.6) -> Fold:
+    rows = np.random.default_rng(1).permutation(len(data))
+    cut = round(share * len(rows))
+    return Fold(np.sort(rows[:cut]), rows[:0], np.sort(rows[cut:]))
+
+
+def predicted(model: str, data: Measurements, rows: np.ndarray, asked: np.ndarray):
+    """Mean and deviation [dB] at rows `asked` of a fit to `rows`, and its notes."""
+    method = build({"_target_": model})
+    report = method.fit(data, Fold(rows, rows[:0], asked), FitContext())
+    batch = data.batch(asked)
+    found = method.predict(batch.tx, batch.rx)
+    power = found.mean[:, 0].double()
+    deviation = found.variance.double().sqrt() / (np.log(10) / 10 * power)
+    return (10 * torch.log10(power * data.site.target_scale)).numpy(), deviation.numpy(), report.notes
+
+
+MODELS = ["gsparc.methods.distance_law.DistanceLaw", "gsparc.methods.gp.GaussianProcess"]
+
+
+@pytest.mark.parametrize(("model", "margin"), list(zip(MODELS, (0.93, 0.85), strict=True)))
+def test_silent_rows_tell_of_a_half_silent_town(model, margin):
+    """Over all places, learned from and not: the truth is nearer when silence counts as "below the level"."""
+    ratios, inside = [], []
+    for seed in range(3):
+        data, true, _ = town(seed=seed)
+        fold, everywhere = fold_of(data), np.arange(len(data))
+        told, deviation, _ = predicted(model, data, fold.train, everywhere)
+        untold = predicted(model, data, heard(data, fold.train), everywhere)[0]
+        error = [float(np.sqrt(((one - true) ** 2).mean())) for one in (told, untold)]
+        ratios.append(error[0] / error[1])
+        new = fold.test
+        inside.append(np.abs(told - true)[new] < 1.645 * deviation[new])
+    assert np.mean(ratios) < margin and max(ratios) < 1, ratios
+    assert 0.84 < np.mean(inside) < 0.96, np.mean(inside)  # of 90 %
+
+
+def test_the_process_says_what_it_did_with_silent_rows():
+    data, _, silent = town(200)
+    rows = np.arange(len(data))
+    notes = predicted(MODELS[1], data, rows, rows)[2]
+    assert f"gp: {silent.sum()} rows where nothing was heard are below their level" in notes
+
+
+@pytest.mark.parametrize("model", ["gsparc.methods.idw.InverseDistance", "gsparc.methods.mean.Mean"])
+def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
+    data, _, silent = town(60)
+    rows = np.arange(len(data))
+    asked = rows[:10]
+    found = build({"_target_": model})
+    notes = found.fit(data, Fold(rows, rows[:0], asked), FitContext()).notes
+    assert notes == (f"{silent.sum()} rows where nothing was heard are not learned from",)
+    assert found.size() == (~silent).sum()
+    again = build({"_target_": model})
+    assert not again.fit(data, Fold(heard(data, rows), rows[:0], asked), FitContext()).notes
+    batch = data.batch(asked)
+    assert torch.equal(found.predict(batch.tx, batch.rx).mean, again.predict(batch.tx, batch.rx).mean)
+
+
+def test_without_censoring_all_rows_were_heard():
+    data, _, _ = town(20)
+    plain = replace(data, censored=None, mask=None)
+    assert np.array_equal(heard(plain, np.array([3, 1])), [3, 1]) and not left_out_note(plain, np.arange(3))
+
+
+def test_nothing_heard_at_all_is_finite():
+    data, _, _ = town(40)
+    deaf = replace(data, censored=np.ones(40, bool), mask=np.zeros((40, 1), bool))
+    for model in MODELS:
+        found, deviation, _ = predicted(model, deaf, np.arange(40), np.arange(40))
+        assert np.isfinite(found).all() and np.isfinite(deviation).all()
+
+
+def test_moments_of_a_truncated_normal():
+    z = np.array([-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0])
+    ratio, lost = truncated(z)
+    for one, mean, share in zip(z, ratio, lost, strict=True):
+        with mpmath.workdps(60):
+            exact = mpmath.npdf(one) / mpmath.ncdf(one)
+            kept = 1 - exact * (exact + one)
+        assert mean == pytest.approx(float(exact), rel=1e-7)
+        assert 1 - share == pytest.approx(float(kept), rel=1e-5)
+    assert np.isfinite(truncated(np.array([-1e8, 1e8]))).all()
+
+
+def small_vector(count: int = 8):
+    rng = np.random.default_rng(0)
+    places = rng.uniform(size=(count, 2))
+    gram = 30 * np.exp(-cdist(places, places) / 0.5) + 2 * np.eye(count)
+    values, unknown = rng.multivariate_normal(np.zeros(count), gram), np.arange(count) > 4
+    return gram, values + unknown, unknown
+
+
+def test_evidence_and_means_are_those_of_sampling():
+    gram, values, unknown = small_vector()
+    told = condition(gram, values, unknown)
+    sites = propagate(told, values[unknown])
+    normal = multivariate_normal(told.mean, told.covariance, seed=1)
+    assert sites.settled
+    assert sites.log_evidence == pytest.approx(normal.logcdf(values[unknown]), abs=0.03)
+    drawn = normal.rvs(400_000)
+    drawn = drawn[(drawn < values[unknown]).all(1)]
+    weights = np.linalg.solve(told.covariance + np.diag(sites.variance), sites.value - told.mean)
+    assert np.allclose(told.mean + told.covariance @ weights, drawn.mean(0), atol=0.05)
+
+
+def test_the_slope_of_the_evidence(monkeypatch):
+    monkeypatch.setattr(censored_ep, "SETTLED", 1e-10)
+    gram, values, unknown = small_vector()
+    slope = log_evidence(gram, values, unknown)[1]
+    change = np.random.default_rng(1).normal(size=gram.shape)
+    change = 1e-4 * (change + change.T)
+    ends = [log_evidence(gram + step * change, values, unknown)[0] for step in (-0.5, 0.5)]
+    assert np.vdot(slope, change) == pytest.approx(ends[1] - ends[0], rel=1e-4)
+
+
+def test_rows_certain_to_be_silent_change_nothing():
+    gram, values, unknown = small_vector()
+    level = values[unknown] + [0.0, 60.0, 0.0]
+    told = condition(gram, values, unknown)
+    kept = told.uncertain(level)
+    assert kept.tolist() == [True, False, True]
+    every, rest = propagate(told, level), propagate(told.of(kept), level[kept])
+    assert np.allclose(every.value[kept], rest.value, atol=1e-2)
+    assert np.allclose(every.variance[kept], rest.variance, rtol=1e-2)
+
+
+def test_drawn_rows_keep_half_of_what_was_heard():
+    silent = np.arange(1000) >= 100
+    rows = draw(silent, 150, 0)
+    assert len(rows) == 150 and (~silent[rows]).sum() == 75 and (np.diff(rows) > 0).all()
+    assert (~silent[draw(silent, 300, 0)]).sum() == 100
+    assert np.array_equal(draw(silent, 1000, 0), np.arange(1000))
