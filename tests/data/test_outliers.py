@@ -9,8 +9,8 @@ import pytest
 from campaigns import channels, powers, spectra
 
 from gsparc.commands.check import main as check
+from gsparc.data.checks.outliers import outliers, too_far, too_strong
 from gsparc.data.load import load, split_for
-from gsparc.data.outliers import outliers, too_far, too_strong
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
 KINDS = pytest.mark.parametrize("kind", MAKERS)
