@@ -145,7 +145,7 @@ def test_a_robot_that_waits_makes_no_outliers():
 
 def test_passing_a_station_is_no_outlier():
     """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
-    file = Path(__file__).parents[2] / ".." / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+    file = Path(__file__).parents[3] / ".." / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
     if not file.is_file():
         pytest.skip(f"{file.name} is not here")
     with np.load(file) as stored:
