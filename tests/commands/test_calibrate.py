@@ -209,7 +209,7 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
     _, objects = train(compose(*settings), tmp_path / "run")
     path, count = str(objects.checkpoints[0]), len(arrays["spectrum"])
 
-    def written(name: str, rows: np.ndarray, shift: float = 0.0) -> dict[str, str]:
+    def written(name: str, rows: np.ndarray, shift: float | np.ndarray = 0.0) -> dict[str, str]:
         moved = {"spectrum": arrays["spectrum"][rows], "tx_position": arrays["tx_position"][rows] + shift}
         np.savez(tmp_path / f"{name}.npz", **{**arrays, **moved})
         return {"file": str(tmp_path / f"{name}.npz")}
@@ -218,7 +218,7 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
     wrong = {
         "reordered": written("reordered", rng.permutation(count)),
         "fewer": written("fewer", every[:-1]),
-        "more": written("more", np.append(every, every[0])),
+        "more": written("more", np.append(0, every), np.append(1.0, 0 * every)[:, None]),
         "moved by less than its accuracy": written("moved", rng.permutation(count), 1e-7),
     }
     for name, file in wrong.items():

@@ -23,7 +23,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         path: PNG file.
     """
     splits = list(dict.fromkeys(row.split for row in rows))
-    names = sorted({row.method for row in rows}, key=lambda name: mean_behind(rows, name))
+    names = sorted(dict.fromkeys(row.method for row in rows), key=lambda name: mean_behind(rows, name))
     figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
     for axis, split in zip(grid[0], splits, strict=True):
         here = {row.method: row for row in rows if row.split == split}
