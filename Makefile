@@ -8,6 +8,8 @@ export OMP_WAIT_POLICY ?= passive
 # A process per core, each with one thread; whoever is done takes tests from the others.
 PYTEST = OMP_NUM_THREADS=1 $(RUN) -m pytest -n auto --dist worksteal --durations=10
 SOURCES := $(wildcard ops/csrc/*.* CMakeLists.txt)
+# An editable installation knows its modules by a list: one that came or went needs another.
+MODULES := $(VENV)/.modules-$(shell find gsparc ops callbacks conf -name '*.py' | LC_ALL=C sort | cksum | cut -d' ' -f1)
 
 .DEFAULT_GOAL := help
 RFID ?= ../shared/data/rfid-s23-160
@@ -24,7 +26,11 @@ $(VENV)/.python:
 	$(PYTHON) -m venv $(VENV)
 	@touch $@
 
-$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES)
+$(MODULES): $(VENV)/.python
+	@rm -f $(VENV)/.modules-*
+	@touch $@
+
+$(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES) $(MODULES)
 	@echo "Installing what gsparc needs into $(VENV) (a few minutes the first time)"
 	$(VENV)/bin/pip install --quiet -c constraints.txt torch
 	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[dev,sweep,tables]'

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gsparc.data.describe import describe, doubtful, read_any
-from gsparc.data.doubts import steps_of
+from gsparc.data.checks.describe import describe, doubtful, read_any
+from gsparc.data.checks.doubts import steps_of
+from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.errors import DataError
-from gsparc.data.level_steps import LevelStep
-from gsparc.data.link_levels import link_levels
 from gsparc.data.load import split_for
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.errors import DataError, Problems
-from gsparc.data.georeference import bad_degrees
+from gsparc.data.links.georeference import bad_degrees
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import End
 from gsparc.data.tables import is_table

@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
-from gsparc.data.outliers import peaks, too_far, too_strong
 from gsparc.data.schema import Links, Measurements, Site
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres

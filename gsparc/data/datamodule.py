@@ -12,7 +12,7 @@ import lightning.pytorch as pl
 import numpy as np
 import torch
 
-from gsparc.data import outliers
+from gsparc.data.checks import outliers
 from gsparc.data.schema import Batch, Measurements
 from gsparc.data.splits import Fold
 

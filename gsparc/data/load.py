@@ -14,10 +14,10 @@ from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.data.checks.outliers import outliers
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import find, known_keys, refuse_foreign, suggest, targets
-from gsparc.data.outliers import outliers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import (
     FileSettings,

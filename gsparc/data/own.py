@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
+from gsparc.data.checks.outliers import peaks, too_strong
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
-from gsparc.data.links import expand
-from gsparc.data.outliers import peaks, too_strong
+from gsparc.data.links.expand import expand
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import LIGHT, Kind, Links, Measurements

@@ -12,7 +12,7 @@ from torch import Tensor
 from gsparc.ops import Pose, SphereGrid
 
 if TYPE_CHECKING:
-    from gsparc.data.georeference import Georeference
+    from gsparc.data.links.georeference import Georeference
 
 Kind = Literal["spectrum", "csi", "rssi"]
 End = Literal["rx", "tx"]

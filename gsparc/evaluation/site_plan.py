@@ -12,10 +12,10 @@ import numpy as np
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
-from gsparc.data.doubts import wild_of
-from gsparc.data.level_steps import LevelStep
-from gsparc.data.link_levels import LinkLevels
-from gsparc.data.outliers import outliers, too_far
+from gsparc.data.checks.doubts import wild_of
+from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.link_levels import LinkLevels
+from gsparc.data.checks.outliers import outliers, too_far
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
 

@@ -267,7 +267,7 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
         stations = values["stations"]
         values["stations"] = Stations(**{**stations, "name": tuple(stations["name"])})
     if values.get("georeference") is not None:
-        from gsparc.data.georeference import Georeference
+        from gsparc.data.links.georeference import Georeference
 
         values["georeference"] = Georeference(**values["georeference"])
     return Site(**values)

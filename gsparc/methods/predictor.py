@@ -19,7 +19,7 @@ from gsparc.methods.timing import Call
 from gsparc.ops import Pose
 
 if TYPE_CHECKING:
-    from gsparc.data.georeference import Georeference
+    from gsparc.data.links.georeference import Georeference
     from gsparc.methods.export import Paths
     from gsparc.methods.stored_front import Operating
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from gsparc.data import argos
-from gsparc.data.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
+from gsparc.data.campaigns import argos
+from gsparc.data.campaigns.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
 from gsparc.data.files import whole_folder
 from gsparc.data.schema import LIGHT
 from gsparc.simulate.streets import Rays, Streets, trace

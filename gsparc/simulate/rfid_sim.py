@@ -15,8 +15,8 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from gsparc.data.campaigns.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
 from gsparc.data.files import whole_folder
-from gsparc.data.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, planar_array
 from gsparc.data.schema import LIGHT
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering

@@ -14,8 +14,8 @@ from gsparc.array.cross_validation import tune
 from gsparc.array.method import ArrayField
 from gsparc.array.vector_gp import Kernel, fit_vector_gp, mirror_elements, refine_alignment, twin
 from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
+from gsparc.data.campaigns.rfid import planar_array
 from gsparc.data.load import load, split_for
-from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint

@@ -14,8 +14,8 @@ from gsparc.array import vector_cache
 from gsparc.array.method import ArrayField
 from gsparc.array.phase_retrieval import recover
 from gsparc.array.vector_gp import align, mirror_elements, twin
+from gsparc.data.campaigns.rfid import planar_array
 from gsparc.data.load import load
-from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext
 from gsparc.ops import SphereGrid

@@ -27,7 +27,7 @@ from gsparc.auto.decide import (
     spacing_in_wavelengths,
 )
 from gsparc.auto.method import Gsparc
-from gsparc.data.rfid import load_rfid, planar_array
+from gsparc.data.campaigns.rfid import load_rfid, planar_array
 from gsparc.data.schema import Site
 from gsparc.data.splits import Fold
 from gsparc.methods.gp import GaussianProcess

@@ -12,11 +12,11 @@ import pytest
 from campaigns import channels, powers, spectra
 from releases import write_release
 
-from gsparc.data.argos import load_argos
-from gsparc.data.describe import describe, read_any
+from gsparc.data.campaigns.argos import load_argos
+from gsparc.data.campaigns.sionna import load_sionna
+from gsparc.data.checks.describe import describe, read_any
 from gsparc.data.errors import DataError
 from gsparc.data.raw import Raw, write_raw
-from gsparc.data.sionna import load_sionna
 
 
 def own(make):

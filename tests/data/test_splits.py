@@ -4,10 +4,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
 from gsparc.data.own import from_arrays
-from gsparc.data.rfid import load_rfid
 from gsparc.data.splits import SplitSettings, make_split, path_order, read_split, write_split
 
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from releases import real
 
-from gsparc.data.doubts import steps_of
-from gsparc.data.link_levels import link_levels
+from gsparc.data.checks.doubts import steps_of
+from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan

@@ -17,8 +17,8 @@ from rooms import nmse, shoebox
 from torch import Tensor
 
 from gsparc.callbacks import ContributionPruning
+from gsparc.data.campaigns.rfid import planar_array
 from gsparc.data.load import load as load_data
-from gsparc.data.rfid import planar_array
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import frozen_view
 from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse

@@ -12,7 +12,7 @@ from rooms import directed
 from scenes import error
 
 from gsparc.commands.study.disturb import turned
-from gsparc.data.newrf import load_newrf
+from gsparc.data.campaigns.newrf import load_newrf
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.methods.method import FitContext
 from gsparc.multipath.directional_gp import DirectionalGP

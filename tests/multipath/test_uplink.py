@@ -9,7 +9,7 @@ import pytest
 import torch
 from cities import city, deaf, fold, folder
 
-from gsparc.data.argos import load_argos
+from gsparc.data.campaigns.argos import load_argos
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.ridge import Ridge

@@ -9,7 +9,7 @@ from known_arrays import array_site, measure, room_vectors, walk
 from scenes import error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
-from gsparc.data.rfid import planar_array
+from gsparc.data.campaigns.rfid import planar_array
 from gsparc.methods.kriging import fit_variogram
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class

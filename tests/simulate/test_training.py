@@ -9,9 +9,9 @@ from campaigns import compose
 
 import gsparc
 from gsparc.commands.train import train
+from gsparc.data.campaigns.sionna import with_true_targets
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
-from gsparc.data.sionna import with_true_targets
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import SceneSettings

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.argos import FACTS
+from gsparc.data.campaigns.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.confidence_scores import Evidence, expected_score, rivals

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from gsparc.data.argos import describe_missing, load_argos
+from gsparc.data.campaigns.argos import describe_missing, load_argos
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.modules.stand_in import StandIn

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsparc.data.ble import raw_of_ble
+from gsparc.data.campaigns.ble import raw_of_ble
 from gsparc.data.modules.campaign import Campaign
 from gsparc.data.raw import Raw
 

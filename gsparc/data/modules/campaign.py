@@ -7,13 +7,13 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsparc.data.checks.describe import suspicious_values
 from gsparc.data.datamodule import DataModule
-from gsparc.data.describe import suspicious_values
+from gsparc.data.links.station_parts import rows_by_station, split_stations
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection, select
-from gsparc.data.station_parts import rows_by_station, split_stations
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ class Campaign(DataModule):
         file: what `raw` reads.
         name, batch_size: see `DataModule`.
         stations, runs, min_rssi_db, max_rows: see `gsparc.data.selection.Selection`.
-        level_steps: by station, rows from which it counts as another; see `gsparc.data.station_parts`.
+        level_steps: by station, rows from which it counts as another; see `gsparc.data.links.station_parts`.
     """
 
     def __init__(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gsparc.data.campaigns.newrf import load_newrf
 from gsparc.data.datamodule import DataModule
-from gsparc.data.newrf import load_newrf
 from gsparc.data.schema import Measurements
 
 

@@ -6,8 +6,8 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from gsparc.data.campaigns import campaign_of
-from gsparc.data.describe import raw_of
+from gsparc.data.campaigns.recognise import campaign_of
+from gsparc.data.checks.describe import raw_of
 from gsparc.data.errors import DataError
 from gsparc.data.modules.campaign import Campaign
 from gsparc.data.raw import Raw

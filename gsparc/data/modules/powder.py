@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsparc.data.campaigns.powder import STATION_M, WALKER_M, raw_of_powder
 from gsparc.data.modules.campaign import Campaign
-from gsparc.data.powder import STATION_M, WALKER_M, raw_of_powder
 from gsparc.data.raw import Raw
 
 

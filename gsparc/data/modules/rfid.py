@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from gsparc.data.campaigns.rfid import WAVELENGTH, describe_missing, load_rfid, planar_array
 from gsparc.data.datamodule import DataModule
 from gsparc.data.errors import DataError
 from gsparc.data.modules.stand_in import StandIn
-from gsparc.data.rfid import WAVELENGTH, describe_missing, load_rfid, planar_array
 from gsparc.data.schema import Measurements
 
 log = logging.getLogger(__name__)

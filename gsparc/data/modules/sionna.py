@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from gsparc.data.campaigns.sionna import load_sionna
 from gsparc.data.datamodule import DataModule
 from gsparc.data.schema import Measurements
-from gsparc.data.sionna import load_sionna
 
 
 class Sionna(DataModule):

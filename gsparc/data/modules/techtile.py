@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from gsparc.data.campaigns.techtile import raw_of_techtile
 from gsparc.data.modules.campaign import Campaign
 from gsparc.data.raw import Raw
-from gsparc.data.techtile import raw_of_techtile
 
 
 class Techtile(Campaign):

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data import outliers
-from gsparc.data.campaigns import campaign_of, is_release, raw_of_campaign
-from gsparc.data.doubts import doubts
+from gsparc.data.campaigns.newrf import is_newrf, read_newrf
+from gsparc.data.campaigns.recognise import campaign_of, is_release, raw_of_campaign
+from gsparc.data.campaigns.rfid import load_rfid
+from gsparc.data.checks import outliers
+from gsparc.data.checks.doubts import doubts
+from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.errors import DataError
-from gsparc.data.level_steps import LevelStep
-from gsparc.data.link_levels import LinkLevels
-from gsparc.data.newrf import is_newrf, read_newrf
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.rfid import load_rfid
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.tables import is_table
 from gsparc.ops import SphereGrid

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.data.georeference import Georeference, bad_degrees
+from gsparc.data.links.georeference import Georeference, bad_degrees
 from gsparc.data.own_checks import Checker
 
 

@@ -7,11 +7,11 @@ import pytest
 from releases import real
 from scipy.spatial.distance import cdist
 
-from gsparc.data import doubts as doubt
-from gsparc.data.describe import doubtful
+from gsparc.data.checks import doubts as doubt
+from gsparc.data.checks.describe import doubtful
+from gsparc.data.checks.level_steps import level_steps
+from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.errors import DataError
-from gsparc.data.level_steps import level_steps
-from gsparc.data.link_levels import link_levels
 from gsparc.data.own import from_arrays
 
 

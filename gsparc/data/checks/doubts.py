@@ -13,8 +13,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsparc.data.level_steps import MOST_BLOCKS, LevelStep, level_steps
-from gsparc.data.outliers import too_far
+from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
+from gsparc.data.checks.outliers import too_far
 
 NAMED = 5  # rows or stations in a line
 HIGHEST_DBM = 60.0  # a kilowatt received

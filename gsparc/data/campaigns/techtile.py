@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.campaigns.layout import COMPLEX, FLAGS, LABELS, TEXT, Expected, check_layout
+from gsparc.data.campaigns.netcdf import SUFFIXES, read_netcdf
 from gsparc.data.errors import DataError
 from gsparc.data.files import read_yaml
-from gsparc.data.layout import COMPLEX, FLAGS, LABELS, TEXT, Expected, check_layout
-from gsparc.data.netcdf import SUFFIXES, read_netcdf
 from gsparc.data.raw import Raw, read_raw, renamed
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.data.describe import describe, suspicious_values
+from gsparc.data.checks.describe import describe, suspicious_values
 from gsparc.data.errors import DataError
 from gsparc.data.own import interpret, load_own
 from gsparc.data.raw import Raw

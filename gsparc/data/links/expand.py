@@ -10,11 +10,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.degrees import in_metres
+from gsparc.data.links.degrees import in_metres
+from gsparc.data.links.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import End, Links
-from gsparc.data.stations import OTHER, by_carrier, ends_of, numbered, station_of_row, station_table
 
 POWERS = ("rssi", "rssi_db")
 PER_ROW = ("noise_variance", "rx_orientation", "rx_rotation", "run", "row_name", "received_power")

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.campaigns.layout import TEXT, Expected, check_layout
 from gsparc.data.errors import DataError, Problems, shortened
-from gsparc.data.layout import TEXT, Expected, check_layout
 from gsparc.data.raw import Raw, read_raw
 
 CARRIER_HZ = 462.7e6

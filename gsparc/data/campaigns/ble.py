@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsparc.data.layout import TEXT, Expected, check_layout
+from gsparc.data.campaigns.layout import TEXT, Expected, check_layout
 from gsparc.data.raw import Raw, read_raw, renamed
 
 LAYOUT = {

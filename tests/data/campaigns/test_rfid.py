@@ -5,8 +5,8 @@ import pytest
 import torch
 from poses import boresight_degrees
 
+from gsparc.data.campaigns.rfid import WAVELENGTH, load_rfid, planar_array
 from gsparc.data.load import load
-from gsparc.data.rfid import WAVELENGTH, load_rfid, planar_array
 
 
 def test_tiny_folder(rfid_folder):

@@ -7,7 +7,7 @@ import pytest
 from releases import real
 
 from gsparc.data.errors import DataError
-from gsparc.data.georeference import Georeference
+from gsparc.data.links.georeference import Georeference
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from gsparc.data.ble import raw_of_ble
-from gsparc.data.netcdf import SUFFIXES
-from gsparc.data.powder import raw_of_powder
+from gsparc.data.campaigns.ble import raw_of_ble
+from gsparc.data.campaigns.netcdf import SUFFIXES
+from gsparc.data.campaigns.powder import raw_of_powder
+from gsparc.data.campaigns.techtile import raw_of_techtile
 from gsparc.data.raw import Raw
-from gsparc.data.techtile import raw_of_techtile
 
 LOADERS: dict[str, Callable[[Path], Raw]] = {
     "techtile": raw_of_techtile,

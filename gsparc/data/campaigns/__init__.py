@@ -1,0 +1,1 @@
+"""Files of published campaigns, read as the arrays of docs/own-data.md or as measurements."""

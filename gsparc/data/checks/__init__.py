@@ -1,0 +1,1 @@
+"""What measurements are in words, and what about them looks wrong."""
