@@ -139,7 +139,7 @@ def choose(
     return chosen, notes
 
 
-def _perhaps_stations(sheet: Sheet, used: set[str]) -> list[str]:
+def _perhaps_stations(sheet: Sheet, used: Container[str | None]) -> list[str]:
     """Columns that repeat few words and are called an end: without them all transmitters would be one."""
     found = []
     for head in (head for head in sheet.heads if head and head not in used):
