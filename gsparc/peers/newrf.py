@@ -19,6 +19,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Kind, Measurements
@@ -131,9 +132,9 @@ class DirectedRays(Network):
         turn = self.heading(heading.reshape(-1, 3)).view(*heading.shape[:2], 1, -1)
         out = self.network(torch.cat([place, turn.expand(-1, -1, self.samples, -1)], -1))
         # Before training the samples of a ray let 1/e through: what stands at its end can be seen.
-        opaque = torch.sigmoid(out[..., 2] - math.log(self.samples))
-        clear = torch.log1p(-opaque)
-        weight = (clear.cumsum(-1) - clear).exp() * opaque
+        opacity = out[..., 2] - math.log(self.samples)
+        clear = F.logsigmoid(-opacity)  # finite also where the sigmoid rounds to 1
+        weight = (clear.cumsum(-1) - clear).exp() * torch.sigmoid(opacity)
         gain = torch.view_as_complex(out[..., :2].contiguous())
         wave = torch.polar(weight / depth, -self.wavenumber * depth)
         return ((gain * wave).sum(-1) * likely).sum(-1)

@@ -130,6 +130,20 @@ def test_rays_meet_at_the_virtual_transmitters():
     assert (nearest.min(1)[support > 10] < 0.02).all(), "and what many see is an image"
 
 
+def test_newrf_opaque_samples_give_no_nan(tmp_path):
+    """An opacity that rounds to 1 left a transmittance of exp(-inf + inf)."""
+    data, fold, _ = room(40, directions=True)
+    method = fitted("newrf", data, fold, tmp_path, width=8, samples=8, max_steps=1)
+    with torch.no_grad():
+        last = [layer for layer in method.network.network if isinstance(layer, torch.nn.Linear)][-1]
+        last.bias[2] = 200.0
+    batch = data.batch(fold.train[:4])
+    loss = method.network.loss(batch, torch.Generator().manual_seed(0))
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert all(torch.isfinite(p.grad).all() for p in method.network.parameters() if p.grad is not None)
+
+
 def test_newrf_predicts_where_no_direction_was_measured(tmp_path):
     data, fold, _ = room(80, directions=True)
     settings = {"width": 48, "depth": 3, "octaves": 3, "samples": 24, "max_steps": 250, "rate": 4e-3}
