@@ -1,0 +1,91 @@
+"""Fields whose weights are known in closed form once Gaussians and covariances are: conditioned on rows.
+
+What is learned by gradient are places, sizes and covariance parameters; the weights follow from the training
+rows as in a Gaussian process (Rasmussen and Williams 2006, section 2.2), of which such a field is one: its
+covariance is a sum of terms, one of them the Gaussians'. Without Gaussians it is the plain process.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements
+from gsparc.ops import Pose
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """What a field says about B queries, in the units of the stored targets.
+
+    Attributes:
+        mean: (B, ...) of all terms.
+        variance: (B,) float32, expected squared error per entry of the mean.
+        explained: (B, ...) the share of the mean that its Gaussians predict; None where it has none.
+        unknown: (B,) float32 in [0, 1], the posterior's variance relative to the prior's; 1 far away.
+    """
+
+    mean: Tensor
+    variance: Tensor
+    explained: Tensor | None
+    unknown: Tensor
+
+
+@dataclass(frozen=True)
+class LeftOutRows:
+    """Training rows predicted from all others (Rasmussen and Williams 2006, eq. 5.12).
+
+    Attributes:
+        rows: (n,) of the measurements.
+        mean: (n, ...) predictions, stored units.
+        variance: (n,) expected squared error per entry.
+    """
+
+    rows: np.ndarray
+    mean: Tensor
+    variance: Tensor
+
+
+class ConditionalField(nn.Module, ABC):
+    """Parameters by gradient, weights in closed form.
+
+    `parameters()` are what gradient steps move; `condition` sets everything else.
+    """
+
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """Number of Gaussians; 0 where the residual process is all there is."""
+
+    @property
+    @abstractmethod
+    def terms(self) -> tuple[str, ...]:
+        """Terms that are computed, as in `model.effects`: `phase`, `power`, `residual` and so on."""
+
+    @abstractmethod
+    def loss(self, batch: Batch) -> Tensor:
+        """Loss per row (B,), differentiable in the parameters.
+
+        The negative log density [nats per real entry] of each row given the others of the batch: the
+        leave-one-out predictive density.
+        """
+
+    @abstractmethod
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """Set the weights from rows (n,) with the parameters as they are; no gradients."""
+
+    @abstractmethod
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates."""
+
+    @abstractmethod
+    def left_out(self) -> LeftOutRows:
+        """The rows it was conditioned on, each predicted from the others."""
+
+    @abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Tensors, numbers and strings from which `restored` of its module makes it again."""
