@@ -31,7 +31,7 @@ class Pictures(Checked, L.Callback):
         step = trainer.global_step
         if not trainer.is_global_zero:
             return
-        if (step % self.every and step != trainer.max_steps) or module.model.site.kind != "spectrum":
+        if (step % self.every and step != trainer.max_steps) or module.site.kind != "spectrum":
             return
         data = trainer.datamodule  # type: ignore[attr-defined]
         candidates = data.fold.val

@@ -35,7 +35,7 @@ class OpacityReset(Checked, L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Reset when the schedule says so."""
         step = trainer.global_step
-        if step == 0 or step > self.stop or step % self.interval:
+        if module.conditional or step == 0 or step > self.stop or step % self.interval:
             return
         if step + self.interval > module.total_steps:
             left = module.total_steps - step

@@ -5,17 +5,52 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 from torch import Tensor
 
+from gsparc.data.limits import POSITIVE, Checked, choice, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
 from gsparc.field.model import GaussianModel, ModelSettings
 from gsparc.ops import Pose
 
 Snapshot = Literal["none", "phase", "phase_timing"]  # what every channel snapshot has of its own
+
+
+InitName = Literal[
+    "auto", "sphere", "uniform", "images", "vectors", "sources", "rays", "bearings", "diffuse", "scene"
+]
+
+
+@dataclass(frozen=True)
+class InitSettings(Checked):
+    """Where a field's Gaussians come from; one instance of the config group `init`.
+
+    Attributes:
+        name: `sphere` around a static receiver and `uniform` in the scene box with random weights; `images`,
+            the sphere with weights fitted to spectra; `vectors`, the same through an array whose phases are
+            retrieved; `sources`, image sources searched for; `rays`, where measured directions meet;
+            `bearings`, where those of a moving array cross; `scene`, mirror images in known walls.
+        file: of the walls, for `scene`.
+        searches: of sources: how many, with different seeds; all are kept and averaged.
+        search_rows, rows: receivers times tones of a search, and of the final weights.
+        margin: around the scene box in which sources are sought [m].
+        max_sources: of a search.
+        order: largest number of reflections.
+        edges: search for diffracting edges.
+    """
+
+    name: InitName = setting("auto", choice(*get_args(InitName)))
+    file: str | None = None
+    searches: int = setting(6, whole(1))
+    search_rows: int = setting(700, whole(8))
+    rows: int = setting(3000, whole(8))
+    margin: float = setting(8.0, POSITIVE)
+    max_sources: int = setting(60, whole(1))
+    order: int = setting(3, whole(0))
+    edges: bool = True
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ import math
 import signal
 import threading
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,8 @@ from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.time_budget import SPENT, Budget, Stretched
 
 SECONDS = "time/learning_s"
+KEPT = ("steps/kept", "steps/kept_position")
+CONDITIONAL_ROWS = 256  # of a step of a conditional field: it factors a matrix of this size
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
 
 # What conf/trainer/cpu.yaml says, for callers from Python.
@@ -42,6 +45,21 @@ DEFAULTS = partial(
     enable_progress_bar=False,
     enable_model_summary=False,
 )
+
+
+@dataclass(frozen=True)
+class Ran:
+    """What a stage took.
+
+    Attributes:
+        seconds: spent learning [s].
+        steps: whose result is kept.
+        position: of that in the schedule [steps]; None where nothing was kept back.
+    """
+
+    seconds: float
+    steps: int
+    position: int | None
 
 
 def total_steps(context: FitContext) -> int:
@@ -126,17 +144,27 @@ class StopBetweenSteps(L.Callback):
 
 def run_stage(
     module: GaussianModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
-    budget: TimeBudget,
-) -> float:  # fmt: skip
-    """Train `module` on `fold.train`, watching `fold.val`; returns the seconds spent learning [s].
+    budget: TimeBudget, watch: Sequence[L.Callback] = (), validate_every: int | None = None,
+) -> Ran:  # fmt: skip
+    """Train `module` on `fold.train`, watching `fold.val`.
 
     The budget is paused before and after, and counts them too.
+
+    Args:
+        module: what is trained.
+        data, fold, context: of the fit.
+        checkpoints: how `last.ckpt` is written.
+        budget: of the fit.
+        watch: callbacks that say which steps are kept.
+        validate_every: steps between validations; None: as the Trainer is configured.
 
     Raises:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
     """
     folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
-    if batches is None or batches.measurements is not data:
+    if module.conditional:  # a row is predicted from the others of its batch
+        batches = Loaded(data, min(len(fold.train), CONDITIONAL_ROWS))
+    elif batches is None or batches.measurements is not data:
         batches = Loaded(data, context.batch_size)
     batches.use(fold, context.seed)
     _quieten_lightning()
@@ -144,11 +172,11 @@ def run_stage(
     callbacks, pace = list(context.callbacks()), module.pace
     if pace is not None:
         callbacks = [Stretched(c, pace) if hasattr(c, "interval") else c for c in callbacks]
-    callbacks = [Budget(pace, budget), *callbacks]
+    callbacks = [Budget(pace, budget), *watch, *callbacks]
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
-    every = make.keywords.get("val_check_interval")
+    every = validate_every or make.keywords.get("val_check_interval")
     every = every if type(every) is int else LOG_EVERY
     module.log_every = math.gcd(LOG_EVERY, every)  # a validation sees the figures of its own step
     per_epoch = max(1, len(fold.train) // batches.batch_size)
@@ -156,6 +184,8 @@ def run_stage(
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         "check_val_every_n_epoch": None,  # validations are counted in steps
     }
+    if validate_every is not None:
+        options["val_check_interval"] = validate_every
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     if pace is not None:
@@ -186,8 +216,10 @@ def run_stage(
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     finally:
         batches.trainer = None  # which holds the optimizer's state
-    budget.charge(Spent(*trainer.callback_metrics[SPENT].tolist()) - budget.counted)
-    return float(trainer.callback_metrics[SECONDS])
+    metrics = trainer.callback_metrics
+    budget.charge(Spent(*metrics[SPENT].tolist()) - budget.counted)
+    steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
+    return Ran(float(metrics[SECONDS]), trainer.global_step if steps is None else steps, position)
 
 
 def _last_line(error: ProcessException) -> str:

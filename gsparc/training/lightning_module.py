@@ -13,6 +13,7 @@ from torch import Tensor
 from gsparc.data.limits import Checked, choice, number, setting
 from gsparc.data.schema import Batch
 from gsparc.field import edit
+from gsparc.field.conditional import ConditionalField
 from gsparc.field.confidence import weighted
 from gsparc.field.initial import Snapshot
 from gsparc.field.model import GaussianModel, Rendered
@@ -20,7 +21,12 @@ from gsparc.methods import checkpoint
 from gsparc.methods.method import TrainsByGradient
 from gsparc.ops import UnsoundGaussian
 from gsparc.training.losses import channel_loss, holds_window, spectrum_loss, ssim
-from gsparc.training.optimizer import OptimizerSettings, optimizer_for, scheduler_for
+from gsparc.training.optimizer import (
+    OptimizerSettings,
+    conditional_optimizer,
+    optimizer_for,
+    scheduler_for,
+)
 from gsparc.training.time_budget import Pace
 
 
@@ -52,7 +58,7 @@ class HasModule(TrainsByGradient, Protocol):
 
 
 class GaussianModule(L.LightningModule):
-    """Trains a GaussianModel.
+    """Trains a Gaussian field: by rendering it, or by the density of left-out rows where weights are closed form.
 
     Args:
         model: what is trained.
@@ -64,17 +70,28 @@ class GaussianModule(L.LightningModule):
     """
 
     def __init__(
-        self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings, total_steps: int,
+        self, model: GaussianModel | ConditionalField, loss: LossSettings, optimizer: OptimizerSettings, total_steps: int,
         run_dir: Path, pace: Pace | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
-        self.model, self.loss, self.rates = model, loss, optimizer
+        self.model: Any = model
+        self.loss, self.rates = loss, optimizer
         self.total_steps, self.run_dir, self.pace = total_steps, run_dir, pace
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
         self.log_every = 1  # steps; a figure costs as much as a kernel to log
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
+
+    @property
+    def position(self) -> int:
+        """How far the schedule is [steps]."""
+        return self.global_step if self.pace is None else self.pace.step
+
+    @property
+    def conditional(self) -> bool:
+        """Whether weights follow from the rows in closed form."""
+        return isinstance(self.model, ConditionalField)
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
         """Loss per sample (B,) before confidence; what was not measured counts as met."""
@@ -94,6 +111,9 @@ class GaussianModule(L.LightningModule):
     def training_step(self, batch: Batch, step: int) -> Tensor:
         """Confidence-weighted loss of a batch."""
         self.batch = batch
+        if self.conditional:
+            # A variance weighs every error in this density, as the confidence does below.
+            return self._checked(self.model.loss(batch), batch)
         self.rendered = self._render(batch)
         task = self.task_loss(self.rendered.mean, batch)
         confidence = self.model.confidence
@@ -102,22 +122,55 @@ class GaussianModule(L.LightningModule):
         else:
             exponent = confidence.exponent(self.model.site.moving(batch.tx, batch.rx))
             loss = weighted(task, exponent, confidence.settings.alpha).mean()
+        return self._checked(task, batch, loss)
+
+    def _checked(self, task: Tensor, batch: Batch, loss: Tensor | None = None) -> Tensor:
+        """The loss, or the mean of its samples' (B,), logged and known to be finite."""
+        loss = task.mean() if loss is None else loss
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
         if (self.global_step + 1) % self.log_every == 0:
             self.log("train/task_loss", task.detach().mean())
-            self.log("model/num_gaussians", float(len(self.model.gaussians)))
+            self.log("model/num_gaussians", float(self.count))
         return loss
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians."""
+        return self.model.count if self.conditional else len(self.model.gaussians)
+
+    def prepare_validation(self, data: Any) -> None:
+        """Closed-form weights of the training rows with the parameters as they are."""
+        if self.conditional:
+            self.model.condition(data.measurements, data.fold.train)
+
+    def on_validation_epoch_start(self) -> None:
+        """See `prepare_validation`."""
+        self.prepare_validation(self.trainer.datamodule)  # type: ignore[attr-defined]
+
+    def error(self, batch: Batch) -> Tensor:
+        """Squared error of each row (B,): per entry, of powers in decibels."""
+        return squared_error(self._mean(batch), batch, str(self.site.kind))
+
+    @property
+    def site(self) -> Any:
+        """What the data declare."""
+        return self.model.site
+
+    def _mean(self, batch: Batch) -> Tensor:
+        found = self.model(batch.tx, batch.rx) if self.conditional else self._render(batch)
+        return found.mean
 
     def validation_step(self, batch: Batch, step: int) -> None:
         """Log validation figures."""
-        mean = self._render(batch).mean
+        mean = self._mean(batch)
         if batch.mask is not None:
             mean = torch.where(batch.mask, mean, batch.target)
-        size, figures = len(batch), {}
+        size = len(batch)
+        figures = {"val/error": squared_error(mean, batch, str(self.site.kind)).mean()}
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
-        if self.model.site.kind != "spectrum":
+        if self.site.kind != "spectrum":
             figures["val/mse"] = error.mean()
         else:
             if holds_window(mean):
@@ -129,8 +182,12 @@ class GaussianModule(L.LightningModule):
 
     def predict_step(self, batch: Batch, step: int) -> Tensor:
         """Targets (B, ...) in stored units, spectra within [0, 1]."""
-        mean = self._render(batch).mean
-        return mean.clamp(0, 1) if self.model.site.kind == "spectrum" else mean
+        mean = self._mean(batch)
+        return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
+
+    def test_step(self, batch: Batch, step: int) -> None:
+        """Log the squared error of test rows; `gsparc evaluate` has all figures."""
+        self.log("test/error", self.error(batch).mean(), batch_size=len(batch))
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
@@ -154,12 +211,16 @@ class GaussianModule(L.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """One Adam group per tensor, rates as pure functions of the step."""
+        if self.conditional:
+            return conditional_optimizer(self.model)
         optimizer = optimizer_for(self.model, self.rates)
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps, self.pace)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Make room for the checkpoint's number of Gaussians before its tensors arrive."""
+        if self.conditional:
+            return
         count = len(checkpoint["state_dict"]["model.gaussians.ids"])
         edit.resize(self.model, self.model.gaussians, count)
 
@@ -170,7 +231,7 @@ class GaussianModule(L.LightningModule):
 
     def _offender(self) -> str | None:
         """The first parameter that is not finite, with the id of its Gaussian; None when all are."""
-        rows = edit.row_parameters(self.model, len(self.model.gaussians))
+        rows = {} if self.conditional else edit.row_parameters(self.model, len(self.model.gaussians))
         for name, parameter in self.model.named_parameters():
             bad = ~torch.isfinite(parameter)
             if not bad.any():
@@ -197,3 +258,16 @@ class GaussianModule(L.LightningModule):
             f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "
             f"batch and parameters are in {path}"
         )
+
+
+def squared_error(mean: Tensor, batch: Batch, kind: str) -> Tensor:
+    """Squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
+    target = batch.target
+    if kind == "rssi":
+        error = 10 * (mean.clamp_min(1e-30).log10() - target.clamp_min(1e-30).log10())
+    else:
+        error = (mean - target).abs()
+    square = error.square()
+    if batch.mask is not None:
+        square = torch.where(batch.mask, square, 0)
+    return square.flatten(1).mean(1)

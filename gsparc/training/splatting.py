@@ -35,6 +35,7 @@ from gsparc.training.auto_settings import Choices, resolve, settled
 from gsparc.training.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.initialise import prepare
+from gsparc.training.keep_best import KeepBest, StopAt
 from gsparc.training.lightning_module import GaussianModule, LossSettings
 from gsparc.training.optimizer import OptimizerSettings
 from gsparc.training.time_budget import Pace
@@ -56,6 +57,7 @@ class LearnedField(Method):
         warm_start: solve the emission in closed form before training (spectra of a static receiver);
             `auto` does so where it can.
         refit: after validation, train again on training and validation rows together.
+        keep_best: end with the parameters of the best validation, and end early when none is better.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -76,19 +78,23 @@ class LearnedField(Method):
         name: str = "gsparc",
         warm_start: bool | Literal["auto"] = "auto",
         refit: bool = True,
+        keep_best: bool = True,
         guesses: Sequence[str] = (),
     ) -> None:
-        check_arguments(locals(), warm_start=switch("auto"), refit=switch())
+        check_arguments(locals(), warm_start=switch("auto"), refit=switch(), keep_best=switch())
         response = response or ResponseSettings()
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.warm_start, self.refit, self.guesses = warm_start, refit, tuple(guesses)
+        self.keep_best = keep_best
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
         self._ends: dict[str, Tensor] = {}
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
+        self._paying: int | None = None  # position in the schedule after which steps did not pay
+        self.steps, self.init_s = 0, 0.0  # gradient steps of the last stage, seconds of all initialisers
         self._billed = Spent()  # for reusable work, by the stages so far
         self._frozen: FrozenView | FrozenArray | None = None
 
@@ -115,10 +121,12 @@ class LearnedField(Method):
         budget = context.time_budget(before=Spent(*marks.get("spent", (seconds, seconds))))
         budget.pause()
         now = None if context.budget_s is None else context.budget_clock
+        self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
+            self._watched(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
         if self.refit and len(fold.val):
@@ -166,6 +174,7 @@ class LearnedField(Method):
             self.fitted().confidence = confidence.requires_grad_(False)
         budget.pause()
         prepared = (budget.counted - started).wall
+        self.init_s += prepared
         steps, pace = total_steps(context), None
         if context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
@@ -181,10 +190,23 @@ class LearnedField(Method):
         module.prepared_seconds = earlier_s + prepared
         marks = {
             "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
-            "limited_by": self._limited_by, **origin.marks(),
+            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s, **origin.marks(),
         }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
-        return prepared + run_stage(module, data, fold, context, files, budget)
+        if stage == "refit" and self._paying == 0:
+            self.steps = 0
+            return prepared
+        watch: list[L.Callback] = [KeepBest()] if self.keep_best and stage == "train" else []
+        if stage == "refit" and self._paying is not None:
+            watch.append(StopAt(self._paying))
+        ran = run_stage(module, data, fold, context, files, budget, watch)
+        self.steps = ran.steps
+        if stage == "train":
+            self._paying = ran.position
+        return prepared + ran.seconds
+
+    def _watched(self, data: Measurements, fold: Fold) -> None:
+        """What is to be learned of validation rows between the stages."""
 
     def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
         """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""

@@ -1,0 +1,176 @@
+"""Image sources as the Gaussians of a field: mirror planes by gradient, gains in closed form.
+
+A Gaussian here is a virtual source, the image of the static end in a word of mirror planes; what steps of
+gradient move are the planes, of which many sources share each, and the sources' powers. The gains given the
+rows are those of `phased_gp`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
+from gsparc.methods.method import FitContext
+from gsparc.multipath.directional_gp import DirectionalGP
+from gsparc.multipath.gp_likelihood import correlations, steering
+from gsparc.multipath.image_source_gp import ImageSourceGP
+from gsparc.multipath.rows import Rows
+
+
+class SourceField(ConditionalField):
+    """The scenes of an ensemble of searches.
+
+    Args:
+        method: fitted.
+    """
+
+    rates: ClassVar[dict[str, float]] = {"planes": 1e-4}  # [m] of a plane's offset, and of its unit normal
+
+    def __init__(self, method: ImageSourceGP) -> None:
+        super().__init__()
+        self.method = method
+        scenes = [member.scene for member in method.members]
+        self.planes = nn.ParameterList([scene.planes.clone() for scene in scenes])
+        self.log_amplitudes = nn.ParameterList([scene.log_amplitude.clone() for scene in scenes])
+
+    @property
+    def count(self) -> int:
+        """Sources of the largest search."""
+        return self.method.size()
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Carrier phase, and visibility where it is modelled."""
+        clutter = any(len(member.scene.clutter) for member in self.method.members)
+        return ("phase", "visibility") if clutter else ("phase",)
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `ConditionalField.loss`; of every search by its weight, with circular gains."""
+        rows = rows_of(self.method, batch)
+        each = []
+        for number, member in enumerate(self.method.members):
+            scene = self._scene(number)
+            seen = scene.visible_share(rows.position).detach()
+            waves = steering(rows, scene.sources) * seen * scene.log_amplitude.exp()
+            correlation = correlations(rows, scene.sources.detach(), scene.visibility)
+            covariance = torch.einsum("nk,mk,knm->nm", waves, waves.conj(), correlation.to(waves.dtype))
+            noise = float(np.exp(member.scene.log_noise)) + self.method.noise_floor
+            density = leave_one_out_density(covariance + noise * torch.eye(len(rows)), rows.target)
+            each.append(density * self.method.weights[number])
+        summed = torch.stack(each).sum(0)
+        return torch.zeros(len(batch)).index_reduce(0, rows.receiver, summed, "mean", include_self=False)
+
+    def _scene(self, number: int) -> Any:
+        """The scene of a search with the parameters as they are."""
+        scene = self.method.members[number].scene
+        return replace(scene, planes=self.planes[number], log_amplitude=self.log_amplitudes[number])
+
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`."""
+        scenes = [
+            replace(member.phased, scene=_detached(self._scene(number)))
+            for number, member in enumerate(self.method.members)
+        ]
+        self.method.condition(data, rows, scenes)
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`."""
+        return _posterior(self.method, tx, rx)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`."""
+        return _left_out(self.method)
+
+    def state(self) -> dict[str, Any]:
+        """The method's."""
+        return {"kind": "sources", "method": self.method.state()}
+
+
+class RayField(ConditionalField):
+    """Sources where measured directions of arrival meet.
+
+    Args:
+        method: fitted.
+    """
+
+    def __init__(self, method: DirectionalGP) -> None:
+        super().__init__()
+        self.method = method
+
+    @property
+    def count(self) -> int:
+        """Sources."""
+        return self.method.size()
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Who sees a source is measured."""
+        return ("phase", "visibility")
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Nothing is left to gradient steps: places and visibility are those of largest likelihood."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`; places are triangulated anew, which is quick."""
+        self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`."""
+        return _posterior(self.method, tx, rx)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`."""
+        return _left_out(self.method)
+
+    def state(self) -> dict[str, Any]:
+        """The method's."""
+        return {"kind": "rays", "method": self.method.state()}
+
+
+def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
+    """The field whose `state()` this was."""
+    method = ImageSourceGP() if state["kind"] == "sources" else DirectionalGP()
+    method.restore(site, state["method"])
+    return SourceField(method) if isinstance(method, ImageSourceGP) else RayField(method)
+
+
+def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:
+    """A batch as rows of the method's frame, one tone of each antenna."""
+    flat, _ = method.places(batch.tx, batch.rx)
+    assert method.site is not None
+    tones = torch.from_numpy(method.site.tones())
+    count, antennas = batch.target.shape[:2]
+    per = len(flat) // count
+    chosen = batch.index.cpu() % len(tones)  # all tones have their turn
+    target = batch.target[torch.arange(count), :, chosen]  # (B, A)
+    target = target.reshape(-1, 1) if per > 1 else target
+    frequency = tones[chosen].repeat_interleave(per)
+    receiver = torch.arange(count).repeat_interleave(per)
+    return method.frame.inside(Rows(flat + method.frame.middle, frequency, target, receiver))
+
+
+def _detached(scene: Any) -> Any:
+    return replace(scene, planes=scene.planes.detach().clone(), log_amplitude=scene.log_amplitude.detach())
+
+
+def _posterior(method: ImageSourceGP | DirectionalGP, tx: Tensor, rx: Pose) -> Posterior:
+    found = method.predict(tx, rx)
+    assert found.variance is not None and found.confidence is not None
+    return Posterior(found.mean, found.variance, found.mean, 1 - found.confidence)
+
+
+def _left_out(method: ImageSourceGP | DirectionalGP) -> LeftOutRows:
+    left = method.leave_one_out()
+    return LeftOutRows(left.rows, left.residual, torch.full((len(left.rows),), float("nan")))

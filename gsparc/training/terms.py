@@ -1,0 +1,133 @@
+"""Which terms of the field a site calls for, and where its Gaussians come from; every choice is said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from gsparc.data.limits import Checked, choice, setting
+from gsparc.data.schema import Measurements, Site
+from gsparc.field.initial import InitSettings
+
+Switch = bool | Literal["auto"]
+SWITCH = choice("auto", True, False)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True)
+class EffectSettings(Checked):
+    """Switches of terms: `auto`, true or false; off means not computed.
+
+    Attributes:
+        image: rasterized Gaussians emit what arrives, without phase.
+        array: spectra arise in the static receiver's array: Gaussians emit fields, the array images them.
+        moving_array: the same of a receiver that moves, in powers: sources seen through the array's lags.
+        phase: carrier phase from places of sources, for channels.
+        power: distance law and extinction along the path in decibels, for received powers.
+        visibility: who sees which source: occluding boxes and finite mirrors for channels.
+        residual: a process in the target's own correlation on what Gaussians leave.
+    """
+
+    image: Switch = setting("auto", SWITCH)
+    array: Switch = setting("auto", SWITCH)
+    moving_array: Switch = setting("auto", SWITCH)
+    phase: Switch = setting("auto", SWITCH)
+    power: Switch = setting("auto", SWITCH)
+    visibility: Switch = setting("auto", SWITCH)
+    residual: Switch = setting("auto", SWITCH)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is trained.
+
+    Attributes:
+        rasterized: whether Gaussians are rendered; else weights are in closed form.
+        array: of rasterized ones, whether through the static array.
+        parts: initialisers of conditional fields, weighed against each other where there are several.
+        plain: whether a plain process on the target may stand in, or be averaged in.
+        reasons: one line each.
+    """
+
+    rasterized: bool
+    array: bool = False
+    parts: tuple[str, ...] = ()
+    plain: bool = False
+    reasons: tuple[str, ...] = field(default=())
+
+
+def plan(switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int) -> Plan:
+    """The terms for these measurements.
+
+    Args:
+        switches: as configured.
+        init: as configured.
+        data: measurements; targets are not looked at.
+        hidden: units of the emission's networks: a network is trained by rendering.
+
+    Raises:
+        ValueError: a term that is asked for means nothing here.
+    """
+    site, plain = data.site, switches.residual is not False
+    networks = f"emission.hidden={hidden}" if hidden else None
+    placed = f"init={init.name}" if init.name in ("sphere", "uniform") and site.kind != "rssi" else None
+    drawn = networks or placed  # asks for Gaussians that are rendered
+    obstacles = {
+        "array": _no_static_array(site) or (networks and f"{networks} asks for networks"),
+        "moving_array": _no_moving_array(site) or (drawn and f"{drawn} asks for rendered Gaussians"),
+        "phase": _no_phase(data) or (drawn and f"{drawn} asks for rendered Gaussians"),
+        "power": None if site.kind == "rssi" else f"the target is {site.kind}",
+    }
+    on, reasons = {}, []
+    for name, obstacle in obstacles.items():
+        switch = getattr(switches, name)
+        if switch is True and obstacle is not None:
+            raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
+        on[name] = switch is not False and obstacle is None
+        if obstacle is None:
+            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}" + (": as configured" if switch != "auto" else ""))
+    if on["power"]:
+        return Plan(False, parts=("powers",), reasons=tuple(reasons))
+    if on["moving_array"]:
+        return Plan(False, parts=("bearings",), plain=plain, reasons=tuple(reasons))
+    if on["phase"]:
+        named = init.name if init.name != "auto" else None
+        parts = (named,) if named else ("sources", "rays") if data.directions is not None else ("sources",)
+        parts = tuple(str(part) for part in parts)
+        return Plan(False, parts=parts + (("diffuse",) if plain else ()), reasons=tuple(reasons))
+    if site.kind == "csi" and plain and site.wavelength is not None and drawn is None and switches.image is not True:
+        reasons.append(f"effects.phase -> off: {obstacles['phase'] or 'as configured'}; the residual is all there is")
+        return Plan(False, parts=("diffuse",), reasons=tuple(reasons))
+    return Plan(True, array=on["array"], plain=plain, reasons=tuple(reasons))
+
+
+def _no_static_array(site: Site) -> str | None:
+    if site.kind != "spectrum":
+        return f"the target is {site.kind}, not a spectrum"
+    if site.static_end != "rx":
+        return "the receiver moves"
+    return _no_array(site)
+
+
+def _no_moving_array(site: Site) -> str | None:
+    if site.kind != "spectrum":
+        return f"the target is {site.kind}, not a spectrum"
+    if site.static_end != "tx":
+        return "the receiver stands still"
+    return _no_array(site)
+
+
+def _no_array(site: Site) -> str | None:
+    if site.array is None or len(site.array) < 2 or site.wavelength is None:
+        return "the dataset declares no array or no carrier"
+    return None
+
+
+def _no_phase(data: Measurements) -> str | None:
+    site = data.site
+    if site.kind != "csi":
+        return f"the target is {site.kind}, which carries no phase"
+    if site.static_position is None:
+        return "the dataset does not say where the static end is"
+    if site.carrier_hz is None and site.subcarriers_hz is None:
+        return "the dataset declares no frequency"
+    return None

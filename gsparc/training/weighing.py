@@ -1,0 +1,52 @@
+"""Which of several solutions to trust: weights of least squared error on held-out rows."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.optimize import nnls
+from torch import Tensor
+
+ALONE, UNUSED = 0.9, 0.05  # weight above which one predicts alone, and below which it is left out
+SUM_ONE = 1e3  # weight of the row that says that weights add up to one
+
+
+def weights(predicted: list[Tensor], target: Tensor) -> tuple[float, ...]:
+    """Weights in [0, 1] of sum one.
+
+    Least squares over convex combinations, by non-negative least squares with a heavy row for the sum
+    (L. Breiman, "Stacked regressions", Machine Learning 24, 1996).
+
+    Args:
+        predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
+        target: (n, ...).
+    """
+    flat = [_real(one) for one in predicted]
+    wanted = _real(target)
+    scale = float(np.sqrt((wanted**2).sum())) or 1.0
+    design = np.stack(flat, 1) / scale
+    design = np.concatenate([design, np.full((1, len(flat)), SUM_ONE)])
+    found = nnls(design, np.append(wanted / scale, SUM_ONE))[0]
+    found /= found.sum()
+    if found.max() > ALONE:
+        found = (found == found.max()).astype(float)
+    found[found < UNUSED] = 0.0
+    return tuple(float(weight) for weight in found / found.sum())
+
+
+def error(predicted: Tensor, target: Tensor) -> float:
+    """Share of the target's energy that is missed."""
+    missed = (predicted - target).abs().square().sum()
+    return float(missed / target.abs().square().sum().clamp_min(1e-30))
+
+
+def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
+    """Share of the variance that a prediction explains, of complex targets about zero; at most 1."""
+    middle = target.mean(0, keepdim=True) if about_mean else torch.zeros_like(target[:1])
+    whole = (target - middle).abs().square().sum().clamp_min(1e-30)
+    return 1 - float((predicted - target).abs().square().sum() / whole)
+
+
+def _real(values: Tensor) -> np.ndarray:
+    values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
+    return values.detach().double().flatten().numpy()
