@@ -8,9 +8,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gsparc.data.checks.describe import describe, doubtful, read_any
-from gsparc.data.checks.doubts import steps_of
-from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.describe import describe, read_any
+from gsparc.data.checks.doubts import doubts, steps_of
 from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
@@ -44,10 +43,8 @@ def check(
     for note in reading.notes:
         _line(console, f"{'note':<12}{note}")
     levels = link_levels(reading.data)
-    steps: list[tuple[int, LevelStep]] = []
-    if levels is not None:
-        steps = steps_of(levels.position, levels.station, levels.level_db, levels.station_position)
-    for doubt in doubtful(levels, steps):
+    steps = [] if levels is None else steps_of(levels)
+    for doubt in [] if levels is None else doubts(levels, steps):
         _line(console, f"{'doubt':<12}{doubt}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it

@@ -43,10 +43,7 @@ def words(figure: Figure) -> str:
 
 def shown(data, figures):
     levels = link_levels(data)
-    steps = []
-    if levels is not None:
-        steps = steps_of(levels.position, levels.station, levels.level_db, levels.station_position)
-    draw_site(data, "unused.png", levels, steps)
+    draw_site(data, "unused.png", levels, [] if levels is None else steps_of(levels))
     return figures[-1], words(figures[-1])
 
 

@@ -12,9 +12,6 @@ from gsparc.data.campaigns.newrf import is_newrf, read_newrf
 from gsparc.data.campaigns.recognise import campaign_of, is_release, raw_of_campaign
 from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.checks import outliers
-from gsparc.data.checks.doubts import doubts
-from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.errors import DataError
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
@@ -73,19 +70,6 @@ def raw_of(
 
     found = understand_table(path, columns or {}, stations_file)
     return found.raw, found.notes
-
-
-def doubtful(levels: LinkLevels | None, steps: list[tuple[int, LevelStep]] | None = None) -> list[str]:
-    """Doubts about powers in the order of measuring: copies, wild rows, levels that jump, outages.
-
-    Args:
-        levels: None of what is no power.
-        steps: those of `levels`, where they are known already.
-    """
-    if levels is None:
-        return []
-    rows = levels.position, levels.station, levels.level_db, levels.names, levels.rows
-    return doubts(*rows, levels.station_position, steps)
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
