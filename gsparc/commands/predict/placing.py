@@ -10,9 +10,10 @@ from gsparc.data.asked import WORDS, Asked
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
+from gsparc.data.links.stations import station_number
 from gsparc.data.schema import End, Site
 from gsparc.data.tables.places import Places
-from gsparc.methods.predictor import station_number, usual_heights
+from gsparc.methods.predictor import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
 
@@ -95,13 +96,13 @@ def stations_of(asked: Asked, site: Site, wanted: str | None) -> list[tuple[int,
             raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
         return [(row, None) for row in range(len(asked))]
     names = list(stations.name)
-    only = None if wanted is None else station_number(stations, wanted)
+    only = None if wanted is None else station_number(wanted, names, len(names))
     if wanted is not None and only is None:
         raise DataError(f"station={wanted}: no such station{suggest(wanted, names)}")
     if asked.station is None:
         every = range(len(stations)) if only is None else [only]
         return [(row, number) for row in range(len(asked)) for number in every]
-    number_of = {word: station_number(stations, word) for word in np.unique(asked.station).tolist()}
+    number_of = {word: station_number(word, names, len(names)) for word in np.unique(asked.station).tolist()}
     for row, word in enumerate(asked.station.tolist()):
         if number_of[word] is None:
             fault = f"{word!r} is no station of the model{suggest(word, names)}"
