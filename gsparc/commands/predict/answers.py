@@ -67,7 +67,7 @@ def answers(
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
-            asking = predictor if stations is None else predictor.at(int(one))
+            asking = predictor if stations is None else predictor.at(stations.name[one])
         except ValueError as error:
             if named:
                 raise DataError(f"{asked.source}, {asked.rows[row[chosen[0]]]}: {error}") from None
