@@ -96,7 +96,7 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
     for apply in (
         None if selection.stations is None else partial(keep_stations, stations=selection.stations),
         None if selection.runs is None else partial(keep_runs, runs=selection.runs),
-        None if selection.min_rssi_db is None else partial(keep_loud, min_rssi_db=selection.min_rssi_db),
+        None if selection.min_rssi_db is None else partial(keep_above, min_rssi_db=selection.min_rssi_db),
         None if selection.max_rows is None else partial(keep_rows, max_rows=selection.max_rows),
     ):
         if apply is not None:
@@ -157,7 +157,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Select
     return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
 
 
-def keep_loud(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
+def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
     """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
 
     Raises:
