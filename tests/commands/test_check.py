@@ -36,21 +36,21 @@ def test_good_file_is_described(tmp_path, arrays):
 
 
 @pytest.mark.parametrize(
-    ("change", "doubt"),
+    ("change", "warning"),
     [
         ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
         ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
         ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
     ],
 )
-def test_units_in_doubt_are_said_by_check_and_by_training(tmp_path, arrays, change, doubt, caplog):
+def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, change, warning, caplog):
     """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
     kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}
     write_own(tmp_path / "a.npz", kept)
     good, text = _said(tmp_path / "a.npz")
-    assert good and doubt in text
+    assert good and warning in text
     load({"name": "own", "file": str(tmp_path / "a.npz")})
-    assert doubt in caplog.text
+    assert warning in caplog.text
 
 
 def test_receivers_in_one_plane_are_noted(tmp_path, arrays):

@@ -168,7 +168,7 @@ def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position])
     found = []
-    if site.georeference is None:  # degrees are in no doubt
+    if site.georeference is None:  # degrees became metres: no unit to mistake
         found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())

@@ -1,4 +1,4 @@
-"""Levels of powers by place and station, in the order of measuring: what doubts look at."""
+"""Levels of powers by place and station, in the order of measuring: what `plausibility` looks at."""
 
 from __future__ import annotations
 

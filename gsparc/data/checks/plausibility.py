@@ -1,7 +1,7 @@
-"""Doubts about readable measurements: units, columns, copies, outliers, stations that changed or fell silent.
+"""Warnings about readable measurements: units, columns, copies, wild rows, stations that changed or were off.
 
-Pure functions of arrays; each returns lines for a person, none where there is no doubt. Rows are links: what
-one station measured at one place, in the order of measuring; levels are in dB or dBm, NaN for no value.
+Pure functions of arrays; each returns lines for a person, none where nothing looks wrong. Rows are links,
+what one station measured at one place, in the order of measuring; levels are in dB or dBm, NaN for no value.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ WEAK_DB = 6.0  # above the weakest value: heard only just
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
 
 
-def doubts(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
-    """All doubts about levels at places.
+def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+    """All warnings about levels at places.
 
     Args:
         levels: of powers.
@@ -38,15 +38,15 @@ def doubts(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[s
     """
     position, station, level_db = levels.position, levels.station, levels.level_db
     names, rows = levels.names, levels.rows
-    found = position_doubts(position, rows) + level_doubts(level_db)
-    found += direction_doubts(position, station, level_db, levels.station_position)
+    found = position_warnings(position, rows) + level_warnings(level_db)
+    found += direction_warnings(position, station, level_db, levels.station_position)
     found += copies(position, station, level_db, rows)
     found += wild_rows(station, level_db, names, rows)
     found += changed_levels(levels, steps)
     return found + gaps(station, level_db, names, rows)
 
 
-def position_doubts(position: np.ndarray, rows: Sequence[str]) -> list[str]:
+def position_warnings(position: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Positions (n, 2) or (n, 3) that may be degrees or millimetres, do not differ, or lie far off."""
     if not np.ptp(position, axis=0).any():
         return ["all positions are the same, a box of 0 m: is it the moving end's column?"]
@@ -78,7 +78,7 @@ def _units(position: np.ndarray) -> list[str]:
     return []
 
 
-def degree_doubts(latitude: np.ndarray, longitude: np.ndarray, rows: Sequence[str]) -> list[str]:
+def degree_warnings(latitude: np.ndarray, longitude: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Latitudes and longitudes (n,) [deg] that may be swapped, or are no fix at all."""
     beyond = np.flatnonzero(np.abs(latitude) > 90)
     if len(beyond):
@@ -97,7 +97,7 @@ def degree_doubts(latitude: np.ndarray, longitude: np.ndarray, rows: Sequence[st
     return found
 
 
-def level_doubts(level_db: np.ndarray) -> list[str]:
+def level_warnings(level_db: np.ndarray) -> list[str]:
     """Levels (n,) [dB] that may be linear, percent or indices, or hold marks instead of values."""
     values = level_db[np.isfinite(level_db)]
     if len(values) < 2:
@@ -149,7 +149,7 @@ def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
     return found
 
 
-def direction_doubts(
+def direction_warnings(
     position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
 ) -> list[str]:
     """Levels that rise with the distance from their station: losses, or stations in wrong places."""

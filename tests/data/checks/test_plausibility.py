@@ -1,11 +1,11 @@
-"""Doubts about readable measurements: each is said where it should be, and nowhere else."""
+"""Warnings about readable measurements: each is given where it should be, and nowhere else."""
 
 import numpy as np
 import pytest
 from releases import real
 from scipy.spatial.distance import cdist
 
-from gsparc.data.checks import doubts as doubt
+from gsparc.data.checks import plausibility
 from gsparc.data.checks.level_steps import level_steps
 from gsparc.data.checks.link_levels import LinkLevels, link_levels
 from gsparc.data.errors import DataError
@@ -41,9 +41,9 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     )
 
 
-def all_doubts(levels: LinkLevels | None):
+def warnings_of(levels: LinkLevels | None):
     assert levels is not None
-    return doubt.doubts(levels, doubt.steps_of(levels))
+    return plausibility.plausibility_warnings(levels, plausibility.steps_of(levels))
 
 
 def room(seed=0, count=100):
@@ -54,7 +54,7 @@ def room(seed=0, count=100):
 
 def test_a_sound_room_raises_none():
     place, level = room()
-    assert all_doubts(as_links(place, level[:, None], ["a"], np.array([[3, 2, 2.5]]))) == []
+    assert warnings_of(as_links(place, level[:, None], ["a"], np.array([[3, 2, 2.5]]))) == []
 
 
 @pytest.mark.parametrize(
@@ -68,15 +68,15 @@ def test_a_sound_room_raises_none():
     ],
 )
 def test_positions(position, said):
-    found = doubt.position_doubts(position(room()[0]), names_of(100))
+    found = plausibility.position_warnings(position(room()[0]), names_of(100))
     assert len(found) == 1 and said in found[0], found
 
 
 def test_small_tables_far_from_the_origin_are_not_degrees():
     place = np.random.default_rng(0).uniform([3, 1, 0], [4.2, 2.2, 0.5], (50, 3))
-    assert doubt.position_doubts(place, names_of(50)) == []
-    assert doubt.position_doubts(place + np.array([4e5, 5e6, 100]), names_of(50)) == []  # UTM
-    assert doubt.position_doubts(np.round(place), names_of(50)) == []
+    assert plausibility.position_warnings(place, names_of(50)) == []
+    assert plausibility.position_warnings(place + np.array([4e5, 5e6, 100]), names_of(50)) == []  # UTM
+    assert plausibility.position_warnings(np.round(place), names_of(50)) == []
 
 
 @pytest.mark.parametrize(
@@ -93,12 +93,12 @@ def test_small_tables_far_from_the_origin_are_not_degrees():
     ],
 )
 def test_degrees(latitude, longitude, said):
-    found = doubt.degree_doubts(np.array(latitude), np.array(longitude), names_of(3))
+    found = plausibility.degree_warnings(np.array(latitude), np.array(longitude), names_of(3))
     assert len(found) == 1 and said in found[0], found
 
 
 def test_sound_degrees():
-    assert doubt.degree_doubts(np.array([40.7, -33.9]), np.array([-111.8, 151.2]), names_of(2)) == []
+    assert plausibility.degree_warnings(np.array([40.7, -33.9]), np.array([-111.8, 151.2]), names_of(2)) == []
 
 
 @pytest.mark.parametrize(
@@ -115,20 +115,20 @@ def test_sound_degrees():
     ],
 )
 def test_levels(level, said):
-    found = doubt.level_doubts(level(room()[1]))
+    found = plausibility.level_warnings(level(room()[1]))
     assert len(found) == 1 and said in found[0], found
 
 
 def test_whole_decibels_are_sound():
-    assert doubt.level_doubts(np.round(room()[1])) == []
-    assert doubt.level_doubts(np.array([np.nan, np.nan])) == []
+    assert plausibility.level_warnings(np.round(room()[1])) == []
+    assert plausibility.level_warnings(np.array([np.nan, np.nan])) == []
 
 
 def test_losses_rise_with_distance():
     place, level = room()
     station, where = np.zeros(100, int), np.array([[3, 2, 2.5]])
-    assert doubt.direction_doubts(place, station, level, where) == []
-    assert "rise with distance" in doubt.direction_doubts(place, station, -level, where)[0]
+    assert plausibility.direction_warnings(place, station, level, where) == []
+    assert "rise with distance" in plausibility.direction_warnings(place, station, -level, where)[0]
 
 
 def test_copies_and_repeated_measurements():
@@ -139,7 +139,7 @@ def test_copies_and_repeated_measurements():
     level[11] = level[10]
     station = np.zeros(20, int)
     station[11] = 1
-    found = doubt.copies(place, station, level, names_of(20))
+    found = plausibility.copies(place, station, level, names_of(20))
     assert len(found) == 2 and "row 5 of row 3; leave" in found[0]
     assert "1 places were measured more than once" in found[1] and "1.4 dB" in found[1]
 
@@ -147,9 +147,9 @@ def test_copies_and_repeated_measurements():
 def test_a_wild_row_is_named():
     level = walk(0)[1]
     level[123] += 60
-    found = doubt.wild_rows(np.zeros(600, int), level, ["a"], names_of(600))
+    found = plausibility.wild_rows(np.zeros(600, int), level, ["a"], names_of(600))
     assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
-    assert doubt.wild_rows(np.zeros(600, int), walk(0)[1], ["a"], names_of(600)) == []
+    assert plausibility.wild_rows(np.zeros(600, int), walk(0)[1], ["a"], names_of(600)) == []
 
 
 def test_a_step_is_found_at_its_row():
@@ -195,14 +195,14 @@ def test_outages_and_what_was_not_heard():
     level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
     level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
     links = as_links(place, level, ["a", "b", "c"])
-    found = doubt.gaps(links.station, links.level_db, links.names, links.rows)
+    found = plausibility.gaps(links.station, links.level_db, links.names, links.rows)
     assert (
         found[0]
         == "no level in the 60 rows from row 100 to row 159 of station a: an outage; these rows are not used"
     )
     assert "of station b, beside the weakest ones: not heard? then give sensitivity_db (" in found[1]
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
-    silent = doubt.gaps(np.zeros(4, int), np.full(4, np.nan), ["a"], names_of(4))
+    silent = plausibility.gaps(np.zeros(4, int), np.full(4, np.nan), ["a"], names_of(4))
     assert silent == ["no level in any row"]
 
 
@@ -220,14 +220,14 @@ def campus():
 
 def test_a_real_station_that_lost_its_gain(campus):
     """One of twelve changes: 17 dB more from row 350 on, 19 dB less from row 1162 on, where it was off."""
-    found = doubt.changed_levels(campus, doubt.steps_of(campus))
+    found = plausibility.changed_levels(campus, plausibility.steps_of(campus))
     assert len(found) == 2 and all("ebc-nuc1" in line for line in found)
     assert "rises by 17 dB between row 349 and row 350" in found[0]
     assert "falls by 19 dB between row 1161 and row 1461" in found[1]
 
 
 def test_real_outages_are_not_taken_for_silence(campus):
-    found = doubt.gaps(campus.station, campus.level_db, campus.names, campus.rows)
+    found = plausibility.gaps(campus.station, campus.level_db, campus.names, campus.rows)
     assert sum("an outage" in line for line in found) == 8
     assert any("the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found)
     assert any(
@@ -238,12 +238,12 @@ def test_real_outages_are_not_taken_for_silence(campus):
 
 def test_other_real_campaigns_raise_few(campus):
     for name in ("ble-hall-1", "ble-hall-2"):
-        found = all_doubts(real_links(name))
+        found = warnings_of(real_links(name))
         assert len(found) <= 1, found
-    assert doubt.position_doubts(campus.position, campus.rows) == []
-    assert doubt.level_doubts(campus.level_db) == []
+    assert plausibility.position_warnings(campus.position, campus.rows) == []
+    assert plausibility.level_warnings(campus.level_db) == []
     place, station, level, fixed = campus.position, campus.station, campus.level_db, campus.station_position
-    assert doubt.direction_doubts(place, station, level, fixed) == []
+    assert plausibility.direction_warnings(place, station, level, fixed) == []
 
 
 def test_copies_in_a_file_of_links_were_one_row():
@@ -252,7 +252,7 @@ def test_copies_in_a_file_of_links_were_one_row():
     where = np.repeat(np.column_stack([place, np.ones(60)]), 2, axis=0)
     posts = np.array([[*station, 5.0], [0.0, 0, 5]])
     links = {"rx_position": where, "station_position": posts, "station": np.repeat(np.arange(60) % 2, 2)}
-    found = all_doubts(link_levels(from_arrays({**links, "rssi_db": np.repeat(level, 2)})))
+    found = warnings_of(link_levels(from_arrays({**links, "rssi_db": np.repeat(level, 2)})))
     assert found[0].startswith("copies (same place, station and level): row 1 of row 0, row 3 of row 2")
 
 
@@ -260,4 +260,4 @@ def test_a_station_for_each_place_is_no_outage_of_the_others():
     place, level, station = walk(0, 60)
     links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
     posts = np.array([[*station, 5.0], [0.0, 0, 5]])
-    assert not all_doubts(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))
+    assert not warnings_of(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))
