@@ -63,7 +63,7 @@ def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
     if levels is not None:
         lost = [rows for _, rows, _ in wild_of(levels.station, levels.level_db)]
         wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
-        suspicious[cKDTree(place).query(wild)[1]] = True
+        suspicious[cKDTree(place + site.origin).query(wild)[1]] = True
     level, label = _levels(data, which, count)
     names = [data.row_names[i].partition(", station")[0] for i in first[order]]
     return Spots(place[:, :2] + site.origin[:2], level, label, names, far, suspicious)
