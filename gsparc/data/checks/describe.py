@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.campaigns.netcdf import SUFFIXES
 from gsparc.data.campaigns.newrf import is_newrf, read_newrf
-from gsparc.data.campaigns.recognise import campaign_of, is_release, raw_of_campaign
+from gsparc.data.campaigns.recognise import LOADERS, campaign_of
 from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.checks import outliers
 from gsparc.data.errors import DataError
@@ -43,12 +44,12 @@ def read_any(
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
-    if is_release(path):
-        return interpret(raw_of_campaign("techtile", path), path)
+    if path.suffix.lower() in SUFFIXES:  # NetCDF, as Techtile's release is
+        return interpret(LOADERS["techtile"](path), path)
     raw, notes = raw_of(path, columns, stations_file)
     campaign = campaign_of(raw)
     if campaign is not None:
-        raw, notes = raw_of_campaign(campaign, path), (f"this is a file of dataset={campaign}",)
+        raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
     reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
     return Reading(reading.data, (*notes, *reading.notes))
 
