@@ -5,6 +5,7 @@ import pytest
 from rich.console import Console
 
 from gsparc.commands.check import check, main
+from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import write_own
 
@@ -62,6 +63,16 @@ def test_degrees_in_place_of_metres_were_good(tmp_path):
     assert "degrees? then give them as latitude and longitude" in _said(tmp_path / "a.npz")[1].replace(
         "\n", ""
     )
+
+
+def test_a_place_without_a_fix_is_refused(tmp_path):
+    """It was refused for its 11,000 km in metres, which no column of the file holds."""
+    rng = np.random.default_rng(0)
+    fix = {"latitude": rng.uniform(40.76, 40.8, 50), "longitude": rng.uniform(-111.84, -111.8, 50)}
+    fix["latitude"][7] = fix["longitude"][7] = 0
+    arrays = {**fix, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
+    with pytest.raises(DataError, match="row 7: latitude and longitude are 0: no fix"):
+        write_own(tmp_path / "a.npz", arrays)
 
 
 def test_receivers_in_one_plane_are_noted(tmp_path, arrays):

@@ -78,23 +78,14 @@ def _units(position: np.ndarray) -> list[str]:
     return []
 
 
-def degree_warnings(latitude: np.ndarray, longitude: np.ndarray, rows: Sequence[str]) -> list[str]:
-    """Latitudes and longitudes (n,) [deg] that may be swapped, or are no fix at all."""
-    beyond = np.flatnonzero(np.abs(latitude) > 90)
-    if len(beyond):
-        swapped = (np.abs(longitude) <= 90).all()
-        hint = "latitude and longitude are swapped?" if swapped else "expected -90 to 90"
-        return [f"{_some(rows, beyond)}: latitude {latitude[beyond[0]]:.6g} is beyond 90 degrees; {hint}"]
-    found = []
-    none = np.flatnonzero((latitude == 0) & (longitude == 0))
-    if len(none):
-        found.append(f"{_some(rows, none)}: latitude and longitude are 0: no fix; leave them out")
+def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
+    """Latitudes and longitudes (n,) [deg] on Earth that may be swapped."""
+    where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
     if np.median(latitude) < -60:
-        where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
-        found.append(f"the places lie in the Antarctic ({where}): latitude and longitude swapped?")
-    elif np.median(latitude) > 75:
-        found.append(f"the places lie in the Arctic (latitude {np.median(latitude):.6g}): swapped?")
-    return found
+        return [f"the places lie in the Antarctic ({where}): latitude and longitude swapped?"]
+    if np.median(latitude) > 75:
+        return [f"the places lie in the Arctic ({where}): latitude and longitude swapped?"]
+    return []
 
 
 def level_warnings(level_db: np.ndarray) -> list[str]:
