@@ -8,10 +8,9 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gsparc.data.checks.describe import describe, doubtful, read_any
-from gsparc.data.checks.doubts import steps_of
-from gsparc.data.checks.level_steps import LevelStep
+from gsparc.data.checks.describe import describe, read_any
 from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.plausibility import plausibility_warnings, steps_of
 from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
 
@@ -44,11 +43,9 @@ def check(
     for note in reading.notes:
         _line(console, f"{'note':<12}{note}")
     levels = link_levels(reading.data)
-    steps: list[tuple[int, LevelStep]] = []
-    if levels is not None:
-        steps = steps_of(levels.position, levels.station, levels.level_db, levels.station_position)
-    for doubt in doubtful(levels, steps):
-        _line(console, f"{'doubt':<12}{doubt}")
+    steps = [] if levels is None else steps_of(levels)
+    for warning in [] if levels is None else plausibility_warnings(levels, steps):
+        _line(console, f"{'warning':<12}{warning}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
 
@@ -86,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--column", action="append", default=[], metavar="NAME=HEAD", help="of a table: which column is what"
     )
     parser.add_argument("--stations-file", help="of a table: a second one that lists the stations")
-    parser.add_argument("--draw", metavar="FILE.png", help="a map of places, stations and doubts")
+    parser.add_argument("--draw", metavar="FILE.png", help="a map of places, stations and suspicious levels")
     given = parser.parse_args(arguments)
     if given.draw is not None and (len(given.path) > 1 or not given.draw.lower().endswith(".png")):
         parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")

@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.errors import DataError
 from gsparc.data.fields import MEASUREMENTS
 from gsparc.data.instantiate import suggest
+from gsparc.data.links.stations import station_number
 from gsparc.data.raw import Raw, numbered_rows
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
@@ -95,7 +96,7 @@ def select(raw: Raw, selection: Selection, source: str | Path) -> Selected:
     for apply in (
         None if selection.stations is None else partial(keep_stations, stations=selection.stations),
         None if selection.runs is None else partial(keep_runs, runs=selection.runs),
-        None if selection.min_rssi_db is None else partial(keep_loud, min_rssi_db=selection.min_rssi_db),
+        None if selection.min_rssi_db is None else partial(keep_above, min_rssi_db=selection.min_rssi_db),
         None if selection.max_rows is None else partial(keep_rows, max_rows=selection.max_rows),
     ):
         if apply is not None:
@@ -118,7 +119,7 @@ def keep_stations(raw: Raw, stations: Iterable[str | int], source: str | Path) -
     if count is None:
         raise DataError(f"dataset.stations: {source} has no stations; expected station_position")
     names = [str(name) for name in raw.arrays.get("station_name", np.zeros(0, str)).ravel()]
-    numbers = [station_number(w, names, count, f"dataset.stations={w}", source) for w in stations]
+    numbers = [known_station(w, names, count, f"dataset.stations={w}", source) for w in stations]
     chosen = np.unique([part for number in numbers for part in parts_of(number, names)])
     note = f"dataset.stations: {count - len(chosen)} of {count} stations left out"
     arrays = {
@@ -156,7 +157,7 @@ def keep_runs(raw: Raw, runs: Iterable[str | int], source: str | Path) -> Select
     return _kept(raw, np.isin(of_row, wanted), f"dataset.runs={','.join(wanted)}", source)
 
 
-def keep_loud(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
+def keep_above(raw: Raw, min_rssi_db: float, source: str | Path) -> Selected:
     """Powers of at least `min_rssi_db` [dB]; what is below counts as not measured, not as not heard.
 
     Raises:
@@ -261,16 +262,15 @@ def parts_of(number: int, names: Sequence[str]) -> list[int]:
     return [t for t, name in enumerate(names) if t == number or name.startswith(names[number] + FROM_ROW)]
 
 
-def station_number(wanted: str | int, names: Sequence[str], count: int, said: str, source: str | Path) -> int:
-    """Number of the station of a name, or number from 0; the setting `said` is named in errors.
+def known_station(wanted: str | int, names: Sequence[str], count: int, said: str, source: str | Path) -> int:
+    """`station_number`; the setting `said` is named in errors.
 
     Raises:
         DataError: there is none.
     """
-    if str(wanted) in names:
-        return list(names).index(str(wanted))
-    if isinstance(wanted, int) and 0 <= wanted < count:
-        return wanted
+    number = station_number(wanted, names, count)
+    if number is not None:
+        return number
     if isinstance(wanted, int) or not names:
         raise DataError(f"{said}: {source} has stations 0 to {count - 1}")
     raise DataError(f"{said}: no station {wanted} in {source}{suggest(wanted, names)}")

@@ -16,7 +16,7 @@ from gsparc.data.splits import Split
 from gsparc.evaluation.scores import Scores, score
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, Method
-from gsparc.methods.per_station import for_links, taught
+from gsparc.methods.per_station import for_links, trained_stations
 from gsparc.methods.registry import method_class
 
 log = logging.getLogger(__name__)
@@ -38,17 +38,17 @@ def fitting(data: Measurements, split: Split) -> tuple[str, ...]:
         site.kind == "csi"
         and carrier
         and site.static_end is not None
-        and _all_taught("complex_gp", data, split)
+        and _all_trained("complex_gp", data, split)
     ):
         return (*names, "complex_gp")
     return names
 
 
-def _all_taught(name: str, data: Measurements, split: Split) -> bool:
-    """Whether the training rows tell of every station that is asked for."""
+def _all_trained(name: str, data: Measurements, split: Split) -> bool:
+    """Whether every station of test rows has training rows enough."""
     if data.station is None:
         return True
-    return not any(taught(method_class(name)(), data, fold)[1].any() for fold in split.folds)
+    return not any(trained_stations(method_class(name)(), data, fold)[1].any() for fold in split.folds)
 
 
 @dataclass(frozen=True)

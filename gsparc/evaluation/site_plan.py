@@ -1,4 +1,4 @@
-"""Where measurements were taken, from above, and what is doubtful about them."""
+"""Where measurements were taken, from above, and what looks wrong about them."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ import numpy as np
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
-from gsparc.data.checks.doubts import wild_of
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.checks.outliers import outliers, too_far
+from gsparc.data.checks.plausibility import wild_of
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
-MOST_MARKS = 8  # doubtful places that are named
+MOST_MARKS = 8  # suspicious places that are named
 INCHES = 6.5  # longer side of the map
 PLAIN = ("receiver", "transmitter")  # in the legend
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
@@ -37,7 +37,7 @@ class Spots:
         label: what the level is.
         rows: (n,) what messages call the first row at each.
         far: (n,) bool, too far from all others to be drawn among them.
-        doubtful: (n,) bool, rows of outliers and of levels far from those around.
+        suspicious: (n,) bool, rows of outliers and of levels far from those around.
     """
 
     place: np.ndarray
@@ -45,28 +45,28 @@ class Spots:
     label: str
     rows: list[str]
     far: np.ndarray
-    doubtful: np.ndarray
+    suspicious: np.ndarray
 
 
 def spots(data: Measurements, levels: LinkLevels | None) -> Spots:
-    """Places of the moving end (of the receiver where both move), the levels there and what is doubtful."""
+    """Places of the moving end (of the receiver where both move), the levels there and what looks wrong."""
     site = data.site
     of_row = data.moving[:, -3:]
     place, first, which = np.unique(of_row, axis=0, return_index=True, return_inverse=True)
     order = np.argsort(first)  # as measured: later ones are drawn above
     which = np.argsort(order)[which.reshape(-1)]
     place, count = place[order], len(place)
-    far, doubtful = np.zeros((2, count), bool)
+    far, suspicious = np.zeros((2, count), bool)
     far[which[too_far(data.moving)]] = True
     for rows in outliers(data).values():
-        doubtful[which[rows]] = True
+        suspicious[which[rows]] = True
     if levels is not None:
         lost = [rows for _, rows, _ in wild_of(levels.station, levels.level_db)]
         wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
-        doubtful[cKDTree(place).query(wild)[1]] = True
+        suspicious[cKDTree(place + site.origin).query(wild)[1]] = True
     level, label = _levels(data, which, count)
     names = [data.row_names[i].partition(", station")[0] for i in first[order]]
-    return Spots(place[:, :2] + site.origin[:2], level, label, names, far, doubtful)
+    return Spots(place[:, :2] + site.origin[:2], level, label, names, far, suspicious)
 
 
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
@@ -103,7 +103,7 @@ def draw_site(
         data: measurements of any kind.
         path: PNG file.
         levels: `link_levels` of powers.
-        steps: `doubts.steps_of` the levels.
+        steps: `plausibility.steps_of` the levels.
     """
     found = spots(data, levels)
     low, high = _view(data, found)
@@ -191,7 +191,7 @@ def _draw_map(
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", **_labels(data))
     axis.ticklabel_format(useOffset=False, style="plain")
     _draw_stations(axis, data, jumping)
-    _draw_doubts(axis, found, low, high)
+    _draw_suspicious(axis, found, low, high)
 
 
 def _size(place: np.ndarray, extent: float) -> float:
@@ -216,11 +216,11 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
         _say(axis, name, where, "red" if number in jumping else "black")
 
 
-def _draw_doubts(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
-    near, far = np.flatnonzero(found.doubtful & ~found.far), np.flatnonzero(found.far)
+def _draw_suspicious(axis: Any, found: Spots, low: np.ndarray, high: np.ndarray) -> None:
+    near, far = np.flatnonzero(found.suspicious & ~found.far), np.flatnonzero(found.far)
     if len(near):
         marks = {"s": 90, "facecolors": "none", "edgecolors": "red", "linewidths": 1.5}
-        label = f"level in doubt ({len(near)} place{'s' * (len(near) > 1)})"
+        label = f"suspicious level ({len(near)} place{'s' * (len(near) > 1)})"
         axis.scatter(*found.place[near].T, label=label, zorder=3, **marks)
     if len(far):
         edge = np.clip(

@@ -21,6 +21,8 @@ from gsparc.ops import Pose
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
 
+StationModels = Literal["each", "together"]
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -72,14 +74,14 @@ class FitContext:
         config_yaml: the whole configuration, stored in every checkpoint.
 
     Raises:
-        ValueError: a budget that is no time, or a batch without rows.
+        ValueError: a budget that is no time, an unknown clock or `stations`, or a batch without rows.
     """
 
     run_dir: Path = Path()
     seed: int = 0
     budget_s: float | None = None
     budget_clock: Clock = "wall"
-    stations: Literal["each", "together"] = "each"
+    stations: StationModels = "each"
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16
@@ -94,6 +96,8 @@ class FitContext:
             raise ValueError(f"budget_s={self.budget_s!r}: a positive number of seconds is needed, or null")
         if self.budget_clock not in get_args(Clock):
             raise ValueError(f"budget_clock={self.budget_clock!r}: one of wall, processor is needed")
+        if self.stations not in get_args(StationModels):
+            raise ValueError(f"stations={self.stations!r}: one of each, together is needed")
         if type(self.batch_size) is not int or self.batch_size < 1:
             raise ValueError(
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"

@@ -40,8 +40,8 @@ def for_links(make: Callable[[], Method], data: Measurements) -> Method:
     return method
 
 
-def taught(method: Method, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Stations (T,) bool with training rows enough for `method`, and those that are asked for without."""
+def trained_stations(method: Method, data: Measurements, fold: Fold) -> tuple[np.ndarray, np.ndarray]:
+    """Stations (T,) bool with training rows enough for `method`, and those of test rows without."""
     assert data.station is not None and data.site.stations is not None
     count = len(data.site.stations)
     rows = fold.train if method.uses_censored else heard(data, fold.train)
@@ -90,7 +90,7 @@ class PerStation(Method):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
         self._shape = tuple(data.target.shape[1:])
-        known, unheard = taught(self.wrapped, data, fold)
+        known, unheard = trained_stations(self.wrapped, data, fold)
         numbers = [int(t) for t in np.flatnonzero(known)]
         if together:
             numbers = [UNHEARD]

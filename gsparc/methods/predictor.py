@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.schema import End, Kind, Site, Stations
+from gsparc.data.links.stations import station_number
+from gsparc.data.schema import End, Kind, Site
 from gsparc.methods import checkpoint
 from gsparc.methods.confidence import Trusted, kept
 from gsparc.methods.method import Method, Prediction
@@ -74,7 +75,7 @@ class Predictor:
         stations = self.site.stations
         if stations is None:
             raise ValueError(f"at: {self.site.name} has one static end, and no stations")
-        number = station_number(stations, station)
+        number = station_number(station, stations.name, len(stations))
         if number is None:
             raise ValueError(f"at: no station {station!r}; there are {', '.join(stations.name)}")
         # The copy itself: two stations at one place, with different carriers, cannot be told apart by it.
@@ -353,14 +354,6 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
 
     chosen, point = within(method, stored, budget_ms)
     return Predictor(chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence)
-
-
-def station_number(stations: Stations, wanted: str | int) -> int | None:
-    """Which of `stations` a name or, where none is called so, a number is; None for none of them."""
-    for known in (list(stations.name), [str(number) for number in range(len(stations))]):
-        if str(wanted) in known:
-            return known.index(str(wanted))
-    return None
 
 
 def usual_heights(site: Site) -> dict[End, float]:

@@ -5,6 +5,7 @@ import pytest
 from rich.console import Console
 
 from gsparc.commands.check import check, main
+from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import write_own
 
@@ -36,21 +37,42 @@ def test_good_file_is_described(tmp_path, arrays):
 
 
 @pytest.mark.parametrize(
-    ("change", "doubt"),
+    ("change", "warning"),
     [
         ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
         ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
         ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
     ],
 )
-def test_units_in_doubt_are_said_by_check_and_by_training(tmp_path, arrays, change, doubt, caplog):
+def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, change, warning, caplog):
     """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
     kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}
     write_own(tmp_path / "a.npz", kept)
     good, text = _said(tmp_path / "a.npz")
-    assert good and doubt in text
+    assert good and warning in text
     load({"name": "own", "file": str(tmp_path / "a.npz")})
-    assert doubt in caplog.text
+    assert warning in caplog.text
+
+
+def test_degrees_in_place_of_metres_were_good(tmp_path):
+    """They were looked for among coordinates about the middle of the site."""
+    rng = np.random.default_rng(0)
+    place = np.column_stack([rng.uniform(40.76, 40.8, 50), rng.uniform(-111.84, -111.8, 50), np.ones(50)])
+    arrays = {"rx_position": place, "tx_position": np.array([40.77, -111.8, 9.0])}
+    write_own(tmp_path / "a.npz", {**arrays, "rssi_db": rng.uniform(-90, -60, 50)})
+    assert "degrees? then give them as latitude and longitude" in _said(tmp_path / "a.npz")[1].replace(
+        "\n", ""
+    )
+
+
+def test_a_place_without_a_fix_is_refused(tmp_path):
+    """It was refused for its 11,000 km in metres, which no column of the file holds."""
+    rng = np.random.default_rng(0)
+    fix = {"latitude": rng.uniform(40.76, 40.8, 50), "longitude": rng.uniform(-111.84, -111.8, 50)}
+    fix["latitude"][7] = fix["longitude"][7] = 0
+    arrays = {**fix, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
+    with pytest.raises(DataError, match="row 7: latitude and longitude are 0: no fix"):
+        write_own(tmp_path / "a.npz", arrays)
 
 
 def test_receivers_in_one_plane_are_noted(tmp_path, arrays):

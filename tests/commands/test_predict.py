@@ -141,6 +141,16 @@ def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
         predict(town, few, station="roof-0")
 
 
+def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
+    """They were asked by their index, which is the name of another."""
+    place = walk()
+    arrays = {"rx_position": place, "station_position": POSTS, "station_name": np.array(["1", "2", "3"])}
+    model = fitted({**arrays, "rssi_db": powers(place)}, tmp_path)
+    predict(model, write_table(tmp_path / "a.csv", "xyz", place[:4].tolist()))
+    found = column(read(tmp_path / "a.predicted.csv"), "rssi_db").reshape(4, 3)
+    assert np.abs(found - powers(place)[:4]).max() < 0.1
+
+
 def test_a_station_with_too_few_rows_is_left_out_or_refused(tmp_path, caplog):
     place = walk()
     arrays = {

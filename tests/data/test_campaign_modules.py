@@ -24,7 +24,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule, load
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw, read_raw
-from gsparc.data.selection import keep_loud
+from gsparc.data.selection import keep_above
 
 MAKERS = {"techtile": techtile_arrays, "powder": powder_arrays, "ble": ble_arrays}
 EVERY = pytest.mark.parametrize("name", MAKERS)
@@ -136,7 +136,7 @@ def test_faults_below_a_level_are_no_links(tmp_path):
 
 
 def test_powers_of_an_unknown_transmitter():
-    raw = keep_loud(Raw({"rx_position": PLANE, "rssi_db": np.linspace(-90, -10, 50)}), -75, "plane").raw
+    raw = keep_above(Raw({"rx_position": PLANE, "rssi_db": np.linspace(-90, -10, 50)}), -75, "plane").raw
     data = interpret(raw, "plane").data
     assert data.site.static_position is None and data.site.static_end == "tx" and np.isnan(data.tx).all()
     assert len(data) == len(raw.arrays["rssi_db"])
@@ -169,5 +169,5 @@ def test_measured_campus():
 
 def test_measured_plane():
     path = real("real/techtile-power-reci-rf-1.npz")
-    data = interpret(keep_loud(read_raw(path), -75, path).raw, path).data
+    data = interpret(keep_above(read_raw(path), -75, path).raw, path).data
     assert len(data) == 20309 and data.site.static_position is None

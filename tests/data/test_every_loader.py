@@ -98,13 +98,13 @@ def said(door: str, path: Path) -> dict[str, str]:
 
 
 @EVERY
-def test_the_sound_one_has_no_doubts(tmp_path, door):
+def test_the_sound_one_raises_no_warning(tmp_path, door):
     assert not {"units?", "outliers?"} & set(said(door, DOORS[door](tmp_path, lambda places: places)))
 
 
 @EVERY
 @pytest.mark.parametrize("factor,unit", [(1e3, "millimetres"), (1e-3, "kilometres")])
-def test_places_in_another_unit_are_doubted(tmp_path, door, factor, unit):
+def test_places_in_another_unit_raise_a_warning(tmp_path, door, factor, unit):
     if door == "argos" and factor < 1:
         return  # a city in kilometres is a room in metres
     found = said(door, DOORS[door](tmp_path, lambda places: factor * places))

@@ -13,7 +13,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.selection import (
     Selection,
-    keep_loud,
+    keep_above,
     keep_rows,
     keep_runs,
     keep_stations,
@@ -101,19 +101,19 @@ def test_runs_may_be_numbers():
 
 
 def test_low_powers_of_single_links_are_rows_left_out():
-    kept = keep_loud(plain(), -50, "file")
+    kept = keep_above(plain(), -50, "file")
     assert kept.raw.arrays["rssi_db"].min() == -50 and len(kept.raw.arrays["rx_position"]) == 11
     assert kept.notes == ("dataset.min_rssi_db=-50: 29 of 40 rows left out",)
     linear = Raw(
         {"rx_position": plain().arrays["rx_position"], "rssi": 10 ** (plain().arrays["rssi_db"] / 10)}
     )
-    assert len(keep_loud(linear, -50.0001, "file").raw.arrays["rssi"]) == 11
+    assert len(keep_above(linear, -50.0001, "file").raw.arrays["rssi"]) == 11
 
 
 def test_low_powers_of_a_wide_file_are_not_measured():
     raw = wide()
     level = float(np.nanquantile(raw.arrays["rssi_db"], 0.1))
-    kept = keep_loud(raw, level, "file").raw.arrays
+    kept = keep_above(raw, level, "file").raw.arrays
     with np.errstate(invalid="ignore"):
         assert np.array_equal(kept["mask"], raw.arrays["rssi_db"] >= level)
     assert np.array_equal(kept["rssi_db"], raw.arrays["rssi_db"], equal_nan=True)
@@ -123,7 +123,7 @@ def test_a_fault_is_not_a_signal_below_the_sensitivity():
     """NaN stays for the reader to take as not heard; what was left out is masked."""
     raw = Raw({**wide().arrays, "sensitivity_db": np.array(-100.0)})
     level = float(np.nanquantile(raw.arrays["rssi_db"], 0.1))
-    mask = keep_loud(raw, level, "file").raw.arrays["mask"]
+    mask = keep_above(raw, level, "file").raw.arrays["mask"]
     unheard = np.isnan(raw.arrays["rssi_db"])
     assert mask[unheard].all() and not mask[raw.arrays["rssi_db"] < level].any()
 
@@ -131,7 +131,7 @@ def test_a_fault_is_not_a_signal_below_the_sensitivity():
 def test_a_place_that_nobody_heard_loud_enough_is_left_out():
     raw = wide()
     raw.arrays["rssi_db"][4] = -200
-    kept = keep_loud(raw, -150, "file")
+    kept = keep_above(raw, -150, "file")
     assert len(kept.raw.arrays["rssi_db"]) == 14 and kept.raw.arrays["mask"].shape == (14, 4)
     assert kept.notes[0].endswith("4 links left out") and kept.notes[1].endswith("1 of 15 rows left out")
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from PIL import Image
 from releases import real
 
-from gsparc.data.checks.doubts import steps_of
 from gsparc.data.checks.link_levels import link_levels
+from gsparc.data.checks.plausibility import steps_of
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays
 from gsparc.evaluation import site_plan
@@ -43,10 +43,7 @@ def words(figure: Figure) -> str:
 
 def shown(data, figures):
     levels = link_levels(data)
-    steps = []
-    if levels is not None:
-        steps = steps_of(levels.position, levels.station, levels.level_db, levels.station_position)
-    draw_site(data, "unused.png", levels, steps)
+    draw_site(data, "unused.png", levels, [] if levels is None else steps_of(levels))
     return figures[-1], words(figures[-1])
 
 
@@ -59,7 +56,7 @@ def test_levels_are_means_over_what_was_heard():
     assert np.allclose(found.place, place[:, :2])  # world coordinates, in the order of measuring
     expected = np.full(10, -70.0)
     expected[3] = -75
-    assert np.allclose(found.level_db, expected, atol=1e-4) and not found.doubtful.any()
+    assert np.allclose(found.level_db, expected, atol=1e-4) and not found.suspicious.any()
     assert found.label == "received power, mean of the stations heard [dB]"
 
 
@@ -77,9 +74,9 @@ def test_rows_that_are_wrong_are_marked(figures):
     level[40] = -150
     data = from_arrays({"rx_position": place, "tx_position": np.array([3.0, 3, 5]), "rssi_db": level})
     found = spots(data, link_levels(data))
-    assert np.flatnonzero(found.far).tolist() == [17] and found.doubtful[40]
+    assert np.flatnonzero(found.far).tolist() == [17] and found.suspicious[40]
     figure, said = shown(data, figures)
-    assert "row 17 at (5000, 300)" in said and "row 40" in said and "level in doubt (1 place)" in said
+    assert "row 17 at (5000, 300)" in said and "row 40" in said and "suspicious level (1 place)" in said
     assert figure.axes[0].get_xlim()[1] < 40  # the map is of the others
     assert figure.axes[0].get_aspect() == 1
 

@@ -92,6 +92,15 @@ def test_a_station_never_heard_is_asked_with_both_ends(town, tmp_path):
         fit_and_score(gsparc_like, town, split, in_folders(FitContext(tmp_path)))
 
 
+def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
+    fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
+    method = for_links(method_class("mean"), town)
+    method.fit(town, fold, FitContext(tmp_path, stations="together"))
+    assert len(dict(method)) == 1 and len(torch.unique(method.answer(town.batch(fold.test)).mean)) == 1
+    with pytest.raises(ValueError, match="stations='togehter': one of each, together is needed"):
+        FitContext(tmp_path, stations="togehter")
+
+
 def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
     walk = np.random.default_rng(0).uniform(0, 9, (40, 3))
     data = from_arrays({"tx_position": walk, "rx_position": walk[::-1] + 1, "rssi_db": -walk[:, 0]})

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.data.asked import Asked
 from gsparc.data.errors import DataError
+from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import End
 from gsparc.methods.method import Prediction
 from gsparc.methods.predictor import Predictor
@@ -40,7 +40,7 @@ class Answers:
 
 def answers(
     predictor: Predictor,
-    asked: Asked,
+    queries: QueryPlaces,
     world: dict[End, np.ndarray],
     pairs: list[tuple[int, int | None]],
     named: bool,
@@ -50,11 +50,11 @@ def answers(
 
     Args:
         predictor: of the model.
-        asked: for messages.
+        queries: for messages.
         world: (n, 3) [m] by end.
         pairs: (row, number of the station) of each prediction.
         named: whether somebody asked for these stations; then one without a model is refused.
-        accept: raises where predictions of a shape are not wanted; asked after the first ones.
+        accept: raises where predictions of a shape are not wanted; called after the first ones.
 
     Raises:
         DataError: a station that was asked for had too few training rows, or none has a model.
@@ -67,10 +67,10 @@ def answers(
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
-            asking = predictor if stations is None else predictor.at(int(one))
+            asking = predictor if stations is None else predictor.at(stations.name[one])
         except ValueError as error:
             if named:
-                raise DataError(f"{asked.source}, {asked.rows[row[chosen[0]]]}: {error}") from None
+                raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
             silent.append(f"left out: {error}")
             continue
         for start in range(0, len(chosen), CHUNK):

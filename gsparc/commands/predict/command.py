@@ -14,7 +14,7 @@ from gsparc.commands.predict.answers import Answers, answers
 from gsparc.commands.predict.files import check_fits, decibels, target, write
 from gsparc.commands.predict.placing import far_outside, in_world, stations_of, with_heights
 from gsparc.commands.settings import RunSettings, plain
-from gsparc.data.asked import Asked, read_asked
+from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods.predictor import Predictor, load
@@ -35,7 +35,7 @@ def predict(
 
     Args:
         predictor: of the model.
-        places: see `read_asked`.
+        places: see `read_query_places`.
         out: *.csv or *.npz; None: beside the places.
         station: name or number of the only one to predict.
         columns: of a table of places, by quantity, where a guess will not do.
@@ -50,15 +50,15 @@ def predict(
     site, places = predictor.site, Path(places)
     path = target(None if out is None else str(out), places, overwrite)
     moving: tuple[End, ...] = ("tx", "rx") if site.static_end is None else (site.moving_end,)
-    asked = with_heights(read_asked(places, moving, columns or {}), site)
-    for note in _notes(asked, site):
+    queries = with_heights(read_query_places(places, moving, columns or {}), site)
+    for note in _notes(queries, site):
         log.info("%s: %s", places, note)
-    world = in_world(asked, site)
-    pairs = stations_of(asked, site, station)
-    named = station is not None or asked.station is not None
+    world = in_world(queries, site)
+    pairs = stations_of(queries, site, station)
+    named = station is not None or queries.station is not None
     far, margin = far_outside(world, site)
     found, left_out = answers(
-        predictor, asked, world, pairs, named, lambda shape: check_fits(path, site.kind, shape)
+        predictor, queries, world, pairs, named, lambda shape: check_fits(path, site.kind, shape)
     )
     for line in left_out:
         log.warning(line)
@@ -66,11 +66,11 @@ def predict(
         log.warning(
             "%s: %d of %d places lie more than %.3g m outside the box of the training places, the first in "
             "%s: expect little of the predictions there",
-            places, int(far.sum()), len(far), margin, asked.rows[int(np.argmax(far))],
+            places, int(far.sum()), len(far), margin, queries.rows[int(np.argmax(far))],
         )  # fmt: skip
-    write(path, asked, found, site.kind)
+    write(path, queries, found, site.kind)
     return {
-        "predict/places": len(asked),
+        "predict/places": len(queries),
         "predict/predictions": len(found),
         "predict/far_outside": int(far.sum()),
         "predict/stations": 0 if found.station is None else len(np.unique(found.station)),
@@ -83,11 +83,11 @@ def predict(
     }
 
 
-def _notes(asked: Asked, site: Site) -> list[str]:
-    notes, origin = list(asked.notes), site.georeference
-    if origin is not None and not any(where.degrees for where in asked.ends.values()):
+def _notes(queries: QueryPlaces, site: Site) -> list[str]:
+    notes, origin = list(queries.notes), site.georeference
+    if origin is not None and not any(where.degrees for where in queries.ends.values()):
         notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
-    if asked.station is not None and site.stations is None:
+    if queries.station is not None and site.stations is None:
         notes.append("not used: stations; the model has none")
     return notes
 

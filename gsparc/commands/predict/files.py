@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.commands.predict.answers import Answers
-from gsparc.data.asked import Asked
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file
+from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import Kind
 from gsparc.evaluation.intervals import in_decibels
 from gsparc.evaluation.summary import write_samples
@@ -47,9 +47,9 @@ def check_fits(path: Path, kind: Kind, shape: tuple[int, ...]) -> None:
         raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
 
 
-def write(path: Path, asked: Asked, found: Answers, kind: Kind) -> None:
+def write(path: Path, queries: QueryPlaces, found: Answers, kind: Kind) -> None:
     """Write all predictions, whole or not at all."""
-    columns = {**_places(asked, found), **_levels(found, kind)}
+    columns = {**_places(queries, found), **_levels(found, kind)}
     if path.suffix.lower() == ".npz":
         arrays = columns if kind == "rssi" else {**columns, kind: found.mean}
         with whole_file(path) as partial, partial.open("wb") as file:
@@ -72,11 +72,11 @@ def decibels(found: Answers) -> tuple[np.ndarray, np.ndarray | None]:
     return level, None if found.variance is None else spread
 
 
-def _places(asked: Asked, found: Answers) -> dict[str, np.ndarray]:
+def _places(queries: QueryPlaces, found: Answers) -> dict[str, np.ndarray]:
     """Coordinates as they were given, and the station."""
-    columns = {} if asked.name is None else {"row_name": asked.name[found.place]}
-    for end, where in asked.ends.items():
-        before = "" if len(asked.ends) == 1 else f"{end}_"
+    columns = {} if queries.name is None else {"row_name": queries.name[found.place]}
+    for end, where in queries.ends.items():
+        before = "" if len(queries.ends) == 1 else f"{end}_"
         axes = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
         for axis, values in zip(axes, where.all().T, strict=True):
             columns[before + axis] = values[found.place]

@@ -6,35 +6,36 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.asked import WORDS, Asked
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import suggest
+from gsparc.data.links.stations import station_number
+from gsparc.data.query_places import WORDS, QueryPlaces
 from gsparc.data.schema import End, Site
 from gsparc.data.tables.places import Places
-from gsparc.methods.predictor import station_number, usual_heights
+from gsparc.methods.predictor import usual_heights
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
 
 
-def with_heights(asked: Asked, site: Site) -> Asked:
+def with_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
     """Places without a height at the one at which that end was measured, with a note.
 
     Raises:
         DataError: it was measured at several heights, or the model does not say at which.
     """
-    ends, notes = dict(asked.ends), list(asked.notes)
+    ends, notes = dict(queries.ends), list(queries.notes)
     known = usual_heights(site)
-    for end, where in asked.ends.items():
+    for end, where in queries.ends.items():
         if where.height is not None:
             continue
         if end not in known:
             say = f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it in the file"
-            raise DataError(f"{asked.source}: no height, and the {WORDS[end]} {_heights(site, end)}; {say}")
-        height = np.full(len(asked), known[end])
+            raise DataError(f"{queries.source}: no height, and the {WORDS[end]} {_heights(site, end)}; {say}")
+        height = np.full(len(queries), known[end])
         ends[end] = replace(where, height=height)
         notes.append(f"no height of the {WORDS[end]}: taken as {known[end]:g} m, as when it was measured")
-    return replace(asked, ends=ends, notes=tuple(notes))
+    return replace(queries, ends=ends, notes=tuple(notes))
 
 
 def _heights(site: Site, end: End) -> str:
@@ -44,20 +45,20 @@ def _heights(site: Site, end: End) -> str:
     return f"was measured at heights from {low:g} to {high:g} m"
 
 
-def in_world(asked: Asked, site: Site) -> dict[End, np.ndarray]:
+def in_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     """World positions (n, 3) [m] by end of places with heights.
 
     Raises:
         DataError: degrees where the model knows none, or a place that no measurement in metres can have.
     """
-    return {end: _in_world(asked, where, site) for end, where in asked.ends.items()}
+    return {end: _in_world(queries, where, site) for end, where in queries.ends.items()}
 
 
-def _in_world(asked: Asked, where: Places, site: Site) -> np.ndarray:
+def _in_world(queries: QueryPlaces, where: Places, site: Site) -> np.ndarray:
     origin = site.georeference
     if where.degrees and origin is None:
         fault = f"places in degrees, but {site.name} was measured in metres about an unknown origin"
-        raise DataError(f"{asked.source}: {fault}; give x, y and z [m]")
+        raise DataError(f"{queries.source}: {fault}; give x, y and z [m]")
     across = origin.from_degrees(*where.across.T) if where.degrees and origin is not None else where.across
     assert where.height is not None
     world = np.column_stack([across, where.height])
@@ -65,7 +66,7 @@ def _in_world(asked: Asked, where: Places, site: Site) -> np.ndarray:
     if len(wrong):
         place = ", ".join(f"{value:g}" for value in where.all()[wrong[0]])
         fault = f"({place}) is more than {FARTHEST / 1e3:.0f} km from the origin"
-        raise DataError(f"{asked.source}, {asked.rows[wrong[0]]}: {fault}; expected metres, or degrees")
+        raise DataError(f"{queries.source}, {queries.rows[wrong[0]]}: {fault}; expected metres, or degrees")
     return world
 
 
@@ -78,11 +79,11 @@ def far_outside(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, f
     return ((place < low - margin) | (place > high + margin)).any(axis=1), margin
 
 
-def stations_of(asked: Asked, site: Site, wanted: str | None) -> list[tuple[int, int | None]]:
+def stations_of(queries: QueryPlaces, site: Site, wanted: str | None) -> list[tuple[int, int | None]]:
     """(row of the places, number of a station) of each prediction; None where the model has no stations.
 
     Args:
-        asked: a row about the station it names; where none are named, about every station.
+        queries: a row about the station it names; where none are named, about every station.
         site: of the model.
         wanted: name or number of the only station to predict; None: all.
 
@@ -93,21 +94,23 @@ def stations_of(asked: Asked, site: Site, wanted: str | None) -> list[tuple[int,
     if stations is None:
         if wanted is not None:
             raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
-        return [(row, None) for row in range(len(asked))]
+        return [(row, None) for row in range(len(queries))]
     names = list(stations.name)
-    only = None if wanted is None else station_number(stations, wanted)
+    only = None if wanted is None else station_number(wanted, names, len(names))
     if wanted is not None and only is None:
         raise DataError(f"station={wanted}: no such station{suggest(wanted, names)}")
-    if asked.station is None:
+    if queries.station is None:
         every = range(len(stations)) if only is None else [only]
-        return [(row, number) for row in range(len(asked)) for number in every]
-    number_of = {word: station_number(stations, word) for word in np.unique(asked.station).tolist()}
-    for row, word in enumerate(asked.station.tolist()):
+        return [(row, number) for row in range(len(queries)) for number in every]
+    number_of = {
+        word: station_number(word, names, len(names)) for word in np.unique(queries.station).tolist()
+    }
+    for row, word in enumerate(queries.station.tolist()):
         if number_of[word] is None:
             fault = f"{word!r} is no station of the model{suggest(word, names)}"
-            raise DataError(f"{asked.source}, column of stations, {asked.rows[row]}: {fault}")
-    pairs = [(row, number_of[word]) for row, word in enumerate(asked.station.tolist())]
+            raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
+    pairs = [(row, number_of[word]) for row, word in enumerate(queries.station.tolist())]
     pairs = [pair for pair in pairs if only is None or pair[1] == only]
     if not pairs:
-        raise DataError(f"station={wanted}: no row of {asked.source} is about it; leave out one of the two")
+        raise DataError(f"station={wanted}: no row of {queries.source} is about it; leave out one of the two")
     return pairs

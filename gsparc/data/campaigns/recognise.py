@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from gsparc.data.campaigns.ble import raw_of_ble
-from gsparc.data.campaigns.netcdf import SUFFIXES
 from gsparc.data.campaigns.powder import raw_of_powder
 from gsparc.data.campaigns.techtile import raw_of_techtile
 from gsparc.data.raw import Raw
@@ -28,17 +27,3 @@ def campaign_of(raw: Raw) -> str | None:
         flat = held["mobile_position"].ndim == 2 and held["mobile_position"].shape[1] == PLANE
         return "powder" if flat else "ble"
     return None
-
-
-def is_release(path: Path) -> bool:
-    """Whether this is a NetCDF file, as Techtile's release is."""
-    return path.suffix.lower() in SUFFIXES
-
-
-def raw_of_campaign(name: str, path: Path) -> Raw:
-    """The arrays of a file of `dataset=name`, named as in docs/own-data.md.
-
-    Raises:
-        DataError: something in it is missing or wrong.
-    """
-    return LOADERS[name](path)

@@ -8,13 +8,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.data.campaigns.netcdf import SUFFIXES
 from gsparc.data.campaigns.newrf import is_newrf, read_newrf
-from gsparc.data.campaigns.recognise import campaign_of, is_release, raw_of_campaign
+from gsparc.data.campaigns.recognise import LOADERS, campaign_of
 from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.checks import outliers
-from gsparc.data.checks.doubts import doubts
-from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.errors import DataError
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
@@ -46,12 +44,12 @@ def read_any(
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
-    if is_release(path):
-        return interpret(raw_of_campaign("techtile", path), path)
+    if path.suffix.lower() in SUFFIXES:  # NetCDF, as Techtile's release is
+        return interpret(LOADERS["techtile"](path), path)
     raw, notes = raw_of(path, columns, stations_file)
     campaign = campaign_of(raw)
     if campaign is not None:
-        raw, notes = raw_of_campaign(campaign, path), (f"this is a file of dataset={campaign}",)
+        raw, notes = LOADERS[campaign](path), (f"this is a file of dataset={campaign}",)
     reading = read_newrf(raw, path) if is_newrf(raw) else interpret(raw, path)
     return Reading(reading.data, (*notes, *reading.notes))
 
@@ -73,19 +71,6 @@ def raw_of(
 
     found = understand_table(path, columns or {}, stations_file)
     return found.raw, found.notes
-
-
-def doubtful(levels: LinkLevels | None, steps: list[tuple[int, LevelStep]] | None = None) -> list[str]:
-    """Doubts about powers in the order of measuring: copies, wild rows, levels that jump, outages.
-
-    Args:
-        levels: None of what is no power.
-        steps: those of `levels`, where they are known already.
-    """
-    if levels is None:
-        return []
-    rows = levels.position, levels.station, levels.level_db, levels.names, levels.rows
-    return doubts(*rows, levels.station_position, steps)
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
@@ -184,7 +169,7 @@ def suspicious_values(data: Measurements) -> list[str]:
     """Values that are readable but implausible: millimetres, radians, linear powers given as dB."""
     site, ends = data.site, np.concatenate([data.tx, data.rx_position])
     found = []
-    if site.georeference is None:  # degrees are in no doubt
+    if site.georeference is None:  # degrees became metres: no unit to mistake
         found = _units(ends[np.isfinite(ends).all(axis=1)]) or _units(data.moving[:, :3])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())

@@ -1,4 +1,4 @@
-"""Levels of powers by place and station, in the order of measuring: what doubts look at."""
+"""Levels of powers by place and station, in the order of measuring: what `plausibility` looks at."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ class LinkLevels:
     """One row for every measurement, and for every place and station without one.
 
     Attributes:
-        position: (n, 3) of the moving end, *local* [m].
+        position: (n, 3) of the moving end, in the world [m].
         station: (n,) int64.
         level_db: (n,) [dB], NaN where there is no value.
         rows: (n,) what messages call the row of the file.
         names: (T,) of the stations.
-        station_position: (T, 3), *local* [m]; None where it is not known.
+        station_position: (T, 3), in the world [m]; None where it is not known.
     """
 
     position: np.ndarray
@@ -55,5 +55,6 @@ def link_levels(data: Measurements) -> LinkLevels | None:
     of_file = [called[i].partition(", station")[0] for i in of_row]
     known = None if site.static_position is None else site.static_position[None]
     known = known if stations is None else stations.position
+    known = None if known is None else known + site.origin
     names = ["the station"] if stations is None else list(stations.name)
-    return LinkLevels(data.moving[of_row], of_link, levels, of_file, names, known)
+    return LinkLevels(data.moving[of_row] + site.origin, of_link, levels, of_file, names, known)

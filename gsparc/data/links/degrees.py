@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.data.checks.plausibility import degree_warnings
 from gsparc.data.links.georeference import Georeference, bad_degrees
 from gsparc.data.own_checks import Checker
 
@@ -35,6 +36,7 @@ def in_metres(check: Checker) -> Georeference | None:
                 arrays[f"{name}_height"] = np.array(0.0)
                 check.notes.append(f"no {name}_height: taken as 0 m")
             del arrays[f"{prefix}latitude"], arrays[f"{prefix}longitude"]
+    check.notes += degree_warnings(*places[""])
     check.notes.append(
         f"positions are metres east and north of {origin.latitude:g}, {origin.longitude:g} degrees"
     )
@@ -54,6 +56,10 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
         if fault:
             check.refuse(names[0], f"row {row}: {fault}")
             break
+    none = (latitude == 0) & (longitude == 0)
+    if none.any() and not none.all():
+        row = int(none.argmax())
+        check.refuse(names[0], f"row {row}: latitude and longitude are 0: no fix; leave the row out")
     return latitude, longitude
 
 

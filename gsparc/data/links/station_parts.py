@@ -14,13 +14,13 @@ from gsparc.data.fields import MEASUREMENTS
 from gsparc.data.raw import Raw
 from gsparc.data.selection import (
     FROM_ROW,
+    known_station,
     measured_links,
     parts_of,
     per_station,
     refuse_columns,
     row_count,
     station_count,
-    station_number,
 )
 
 
@@ -67,7 +67,7 @@ def _split(raw: Raw, station: str, first: int, source: str | Path) -> Raw:
     if not 0 < first < rows:
         raise DataError(f"{said}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
     names = [str(name) for name in raw.arrays.get("station_name", np.arange(count)).ravel()]
-    number = station_number(station, names, count, said, source)
+    number = known_station(station, names, count, said, source)
     last = parts_of(number, names)[-1]  # later steps divide the part after earlier ones
     arrays = {
         name: np.concatenate([array, array[number : number + 1]])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,20 @@ from gsparc.data.schema import End, Links, Stations
 
 OTHER: dict[End, End] = {"rx": "tx", "tx": "rx"}
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
+
+
+def station_number(wanted: str | int, names: Sequence[str], count: int) -> int | None:
+    """Which of `count` stations a name or, where none is called so, a number from 0 means; None for none.
+
+    Args:
+        wanted: name or number.
+        names: (count,) of the stations; empty where they have none.
+        count: number of stations.
+    """
+    for known in (list(names), [str(number) for number in range(count)]):
+        if str(wanted) in known:
+            return known.index(str(wanted))
+    return None
 
 
 def numbered(places: np.ndarray) -> np.ndarray:

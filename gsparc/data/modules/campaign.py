@@ -53,13 +53,13 @@ class Campaign(DataModule):
         """
 
     def load(self) -> Measurements:
-        """Read, select and interpret; what is left out and what is doubtful is logged."""
+        """Read, select and interpret; what is left out and what looks wrong is logged."""
         raw = self.raw()
         selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         said = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
         for note in (*said, *selected.notes, *reading.notes):
             log.warning("%s: %s", self.file, note)
-        for doubt in suspicious_values(reading.data):
-            log.warning("%s: units? %s", self.file, doubt)
+        for hint in suspicious_values(reading.data):
+            log.warning("%s: units? %s", self.file, hint)
         return reading.data

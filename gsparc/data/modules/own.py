@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 
 class Own(Campaign):
-    """A file of the schema in docs/own-data.md, or a table; doubtful units are warned of.
+    """A file of the schema in docs/own-data.md, or a table; suspicious units are warned of.
 
     Args:
         file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.

@@ -253,7 +253,7 @@ def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers()
     np.testing.assert_allclose(level_db[data.censored], np.array(expected)[data.censored], atol=1e-3)
 
 
-def test_powers_of_zero_are_doubted():
+def test_powers_of_zero_raise_a_warning():
     """They are learned as -300 dB, which nobody said."""
     powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
     data = read({**town(rssi_db=None), "rssi": powers}).data

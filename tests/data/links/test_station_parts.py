@@ -85,6 +85,11 @@ def test_a_step_that_cannot_be_is_one_line(steps, said):
         split_stations(wide(), steps, "file")
 
 
+def test_a_station_with_a_name_was_unknown_by_its_number():
+    by_name, by_number = (split_stations(wide(), {who: (5,)}, "file").arrays for who in ("b", "1"))
+    assert by_name["station_name"].tolist() == by_number["station_name"].tolist()
+
+
 def test_steps_without_stations_are_refused():
     one = Raw({"rx_position": np.zeros((4, 3)), "tx_position": np.ones(3), "rssi_db": np.zeros(4)}, {}, {})
     with pytest.raises(DataError, match="has no stations"):

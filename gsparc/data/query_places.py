@@ -24,7 +24,7 @@ GUESSED = (*(f"{end}{axis}" for end in ("", "rx_", "tx_") for axis in AXES), "st
 
 
 @dataclass(frozen=True)
-class Asked:
+class QueryPlaces:
     """Places in the order of their file.
 
     Attributes:
@@ -47,7 +47,9 @@ class Asked:
         return len(self.rows)
 
 
-def read_asked(path: str | Path, moving: Sequence[End], columns: Mapping[str, object] = NOTHING) -> Asked:
+def read_query_places(
+    path: str | Path, moving: Sequence[End], columns: Mapping[str, object] = NOTHING
+) -> QueryPlaces:
     """Read places of the ends that move.
 
     Args:
@@ -73,7 +75,7 @@ def read_asked(path: str | Path, moving: Sequence[End], columns: Mapping[str, ob
         raise DataError(first + (f" (and {more} more)" if more else "")) from None
 
 
-def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, object]) -> Asked:
+def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
     sheet, notes = sheet_of(path)
     problems = Problems(path)
     chosen, guessed = choose(sheet, columns, problems, only=GUESSED)
@@ -95,7 +97,7 @@ def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, obj
     station = _words(sheet, chosen, "station", problems)
     problems.raise_if_any()
     name = sheet.words(chosen["row_name"][0].head or "") if "row_name" in chosen else None
-    return _checked(Asked(str(path), ends, sheet.rows, station, name, (*notes, *guessed)))
+    return _checked(QueryPlaces(str(path), ends, sheet.rows, station, name, (*notes, *guessed)))
 
 
 def _missing(sheet: Sheet, end: End, both: bool) -> str:
@@ -118,7 +120,7 @@ def _words(sheet: Sheet, chosen: Chosen, role: str, problems: Problems) -> np.nd
     return words
 
 
-def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> Asked:
+def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> QueryPlaces:
     ends: dict[End, Places] = {}
     for end in moving:
         alone = len(moving) == 1
@@ -148,7 +150,7 @@ def _of_arrays(raw: Raw, source: str, moving: Sequence[End]) -> Asked:
     rows = tuple(f"row {i}" for i in range(next(iter(count.values()))))
     if not rows:
         raise DataError(f"{source}: no rows; expected a place or more")
-    return _checked(Asked(source, ends, rows, _stations(raw, source, len(rows))))
+    return _checked(QueryPlaces(source, ends, rows, _stations(raw, source, len(rows))))
 
 
 def _same(raw: Raw, source: str, pair: Sequence[str]) -> Sequence[str]:
@@ -194,18 +196,18 @@ def _stations(raw: Raw, source: str, count: int) -> np.ndarray | None:
     return station.astype(str)
 
 
-def _checked(asked: Asked) -> Asked:
+def _checked(queries: QueryPlaces) -> QueryPlaces:
     """Refuse places with a coordinate that is not finite, and degrees that are not on Earth."""
-    for end, where in asked.ends.items():
+    for end, where in queries.ends.items():
         names = ("latitude", "longitude", "height") if where.degrees else ("x", "y", "z")
         values = where.all()
         wrong = np.argwhere(~np.isfinite(values))
         if len(wrong):
             row, axis = wrong[0]
             fault = f"{names[axis]} of the {WORDS[end]} is {values[row, axis]}; expected a finite number"
-            raise DataError(f"{asked.source}, {asked.rows[row]}: {fault}")
+            raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
         if where.degrees and bad_degrees(*where.across.T) is not None:
             faults = (bad_degrees(latitude, longitude) for latitude, longitude in where.across)
             row, fault = next((i, fault) for i, fault in enumerate(faults) if fault is not None)
-            raise DataError(f"{asked.source}, {asked.rows[row]}: {fault}")
-    return asked
+            raise DataError(f"{queries.source}, {queries.rows[row]}: {fault}")
+    return queries

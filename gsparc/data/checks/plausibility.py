@@ -1,7 +1,7 @@
-"""Doubts about readable measurements: units, columns, copies, outliers, stations that changed or fell silent.
+"""Warnings about readable measurements: units, columns, copies, wild rows, stations that changed or were off.
 
-Pure functions of arrays; each returns lines for a person, none where there is no doubt. Rows are links: what
-one station measured at one place, in the order of measuring; levels are in dB or dBm, NaN for no value.
+Pure functions of arrays; each returns lines for a person, none where nothing looks wrong. Rows are links,
+what one station measured at one place, in the order of measuring; levels are in dB or dBm, NaN for no value.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, level_steps
+from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.checks.outliers import too_far
 
 NAMED = 5  # rows or stations in a line
@@ -28,36 +29,24 @@ WEAK_DB = 6.0  # above the weakest value: heard only just
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
 
 
-def doubts(
-    position: np.ndarray,
-    station: np.ndarray | None,
-    level_db: np.ndarray,
-    names: Sequence[str],
-    rows: Sequence[str],
-    station_position: np.ndarray | None = None,
-    steps: list[tuple[int, LevelStep]] | None = None,
-) -> list[str]:
-    """All doubts about levels at places.
+def plausibility_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+    """All warnings about levels at places.
 
     Args:
-        position: (n, 2) or (n, 3) of the moving end [m].
-        station: (n,) which station each row is of; None where there is one only.
-        level_db: (n,) [dB], NaN where there is no value.
-        names: of the stations.
-        rows: what messages call each row.
-        station_position: (T, 2) or (T, 3) [m]; None where it is not known.
-        steps: `steps_of` them, where they are known already.
+        levels: of powers.
+        steps: `steps_of` them.
     """
-    station = np.zeros(len(level_db), np.int64) if station is None else station
-    found = position_doubts(position, rows) + level_doubts(level_db)
-    found += direction_doubts(position, station, level_db, station_position)
-    found += copies(position, station, level_db, names, rows)
+    position, station, level_db = levels.position, levels.station, levels.level_db
+    names, rows = levels.names, levels.rows
+    found = position_warnings(position, rows) + level_warnings(level_db)
+    found += direction_warnings(position, station, level_db, levels.station_position)
+    found += copies(position, station, level_db, rows)
     found += wild_rows(station, level_db, names, rows)
-    found += changed_levels(position, station, level_db, names, rows, station_position, steps)
+    found += changed_levels(levels, steps)
     return found + gaps(station, level_db, names, rows)
 
 
-def position_doubts(position: np.ndarray, rows: Sequence[str]) -> list[str]:
+def position_warnings(position: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Positions (n, 2) or (n, 3) that may be degrees or millimetres, do not differ, or lie far off."""
     if not np.ptp(position, axis=0).any():
         return ["all positions are the same, a box of 0 m: is it the moving end's column?"]
@@ -89,26 +78,17 @@ def _units(position: np.ndarray) -> list[str]:
     return []
 
 
-def degree_doubts(latitude: np.ndarray, longitude: np.ndarray, rows: Sequence[str]) -> list[str]:
-    """Latitudes and longitudes (n,) [deg] that may be swapped, or are no fix at all."""
-    beyond = np.flatnonzero(np.abs(latitude) > 90)
-    if len(beyond):
-        swapped = (np.abs(longitude) <= 90).all()
-        hint = "latitude and longitude are swapped?" if swapped else "expected -90 to 90"
-        return [f"{_some(rows, beyond)}: latitude {latitude[beyond[0]]:.6g} is beyond 90 degrees; {hint}"]
-    found = []
-    none = np.flatnonzero((latitude == 0) & (longitude == 0))
-    if len(none):
-        found.append(f"{_some(rows, none)}: latitude and longitude are 0: no fix; leave them out")
+def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
+    """Latitudes and longitudes (n,) [deg] on Earth that may be swapped."""
+    where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
     if np.median(latitude) < -60:
-        where = f"latitude {np.median(latitude):.6g}, longitude {np.median(longitude):.6g}"
-        found.append(f"the places lie in the Antarctic ({where}): latitude and longitude swapped?")
-    elif np.median(latitude) > 75:
-        found.append(f"the places lie in the Arctic (latitude {np.median(latitude):.6g}): swapped?")
-    return found
+        return [f"the places lie in the Antarctic ({where}): latitude and longitude swapped?"]
+    if np.median(latitude) > 75:
+        return [f"the places lie in the Arctic ({where}): latitude and longitude swapped?"]
+    return []
 
 
-def level_doubts(level_db: np.ndarray) -> list[str]:
+def level_warnings(level_db: np.ndarray) -> list[str]:
     """Levels (n,) [dB] that may be linear, percent or indices, or hold marks instead of values."""
     values = level_db[np.isfinite(level_db)]
     if len(values) < 2:
@@ -160,7 +140,7 @@ def _marks(values: np.ndarray) -> list[tuple[float, bool]]:
     return found
 
 
-def direction_doubts(
+def direction_warnings(
     position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
 ) -> list[str]:
     """Levels that rise with the distance from their station: losses, or stations in wrong places."""
@@ -182,9 +162,7 @@ def direction_doubts(
     return []
 
 
-def copies(
-    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, names: Sequence[str], rows: Sequence[str]
-) -> list[str]:
+def copies(position: np.ndarray, station: np.ndarray, level_db: np.ndarray, rows: Sequence[str]) -> list[str]:
     """Rows of one place and station: copies where the value is the same, repeated measurements where not."""
     known = np.flatnonzero(np.isfinite(level_db))
     if len(known) < 2:
@@ -251,18 +229,10 @@ def wild_of(station: np.ndarray, level_db: np.ndarray) -> list[tuple[int, np.nda
     return found
 
 
-def changed_levels(
-    position: np.ndarray,
-    station: np.ndarray,
-    level_db: np.ndarray,
-    names: Sequence[str],
-    rows: Sequence[str],
-    station_position: np.ndarray | None = None,
-    steps: list[tuple[int, LevelStep]] | None = None,
-) -> list[str]:
+def changed_levels(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
     """Stations whose level changes at a row though the places do not explain it (`level_steps`)."""
-    found = []
-    for t, step in steps_of(position, station, level_db, station_position) if steps is None else steps:
+    names, rows, found = levels.names, levels.rows, []
+    for t, step in steps:
         who = f"station {names[t]}" if len(names) > 1 else "the level"
         verb = "rises" if step.change_db > 0 else "falls"
         before, after = rows[step.last], rows[step.first]
@@ -277,17 +247,15 @@ def changed_levels(
     return found
 
 
-def steps_of(
-    position: np.ndarray, station: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None
-) -> list[tuple[int, LevelStep]]:
-    """Stations and their steps, which name rows of these arrays."""
+def steps_of(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
+    """Stations and their steps, which name rows of `levels`."""
     found = []
-    stations = np.unique(station)
+    stations = np.unique(levels.station)
     blocks = int(np.clip(20 * MOST_BLOCKS / len(stations), 200, MOST_BLOCKS)) if len(stations) else 0
     for t in stations:
-        used = np.flatnonzero(station == t)
-        where = None if station_position is None else station_position[t]
-        for step in level_steps(position[used], level_db[used], where, blocks):
+        used = np.flatnonzero(levels.station == t)
+        where = None if levels.station_position is None else levels.station_position[t]
+        for step in level_steps(levels.position[used], levels.level_db[used], where, blocks):
             found.append((int(t), replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return found
 
