@@ -30,7 +30,11 @@ class ContributionPruning(L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Prune when the schedule says so."""
         model = module.model
-        if module.conditional or not isinstance(model.response, PathResponse) or trainer.global_step % self.interval:
+        if (
+            module.conditional
+            or not isinstance(model.response, PathResponse)
+            or trainer.global_step % self.interval
+        ):
             return
         data = trainer.datamodule  # type: ignore[attr-defined]
         batch = data.measurements.batch(data.fold.train).to(module.device)

@@ -91,7 +91,7 @@ def evaluate(
     facts |= timing.machine_facts()
     facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock)
     first = methods[0]
-    facts |= {"model/name": first.name, "model/num_gaussians": first.size(), "model/effects": first.effects}
+    facts |= {"model/name": first.name, "model/effects": first.effects, **first.facts()}
     facts |= dataset_facts(data) | split_facts(split) | timing.peak_memory()
     return Evaluation(facts, _columns(scores, others, data))
 

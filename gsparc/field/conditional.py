@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.schema import Batch, Measurements
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.ops import Pose
 
 
@@ -58,9 +58,11 @@ class ConditionalField(nn.Module, ABC):
     `parameters()` are what gradient steps move; `condition` sets everything else.
 
     Attributes:
+        site: what the dataset declares; set where the field is made.
         rates: Adam's rate by the beginning of a parameter's name; what is not named has `RATE`.
     """
 
+    site: Site
     RATE: ClassVar[float] = 0.01  # of logarithms of lengths and variances
     rates: ClassVar[dict[str, float]] = {}
 
@@ -121,6 +123,11 @@ class StackedField(ConditionalField):
     def terms(self) -> tuple[str, ...]:
         """Terms of any member."""
         return tuple(dict.fromkeys(term for member in self._fields() for term in member.terms))
+
+    @property
+    def heaviest(self) -> ConditionalField:
+        """The member of largest weight."""
+        return self._fields()[int(np.argmax(self.weights))]
 
     def _fields(self) -> list[ConditionalField]:
         return list(self.members)  # type: ignore[arg-type]
@@ -197,9 +204,7 @@ class CompletedField(ConditionalField):
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """The sum; the variance errs high by what the residual explains."""
         found, more = self.field(tx, rx), self.residual(tx, rx)
-        return Posterior(
-            found.mean + self.weight * more.mean, found.variance, found.explained, found.unknown
-        )
+        return Posterior(found.mean + self.weight * more.mean, found.variance, found.explained, found.unknown)
 
     def left_out(self) -> LeftOutRows:
         """The sum of both."""

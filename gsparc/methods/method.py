@@ -119,6 +119,7 @@ class Method(ABC):
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
     uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
+    has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
 
     @abstractmethod
@@ -144,6 +145,16 @@ class Method(ABC):
     def size(self) -> int:
         """Number of Gaussians, sources or stored training samples."""
         return 0
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """What `summary.json` says of a fitted model, None where it means nothing here."""
+        return {
+            "model/num_gaussians": self.size() if self.has_gaussians else None,
+            "model/init": None,
+            "model/steps": None,
+            "model/variance_explained": None,
+            "time/init_s": None,
+        }
 
 
 @dataclass(frozen=True)

@@ -189,8 +189,25 @@ class PerStation(Method):
         """That of all copies."""
         return sum(copy.size() for copy in self._copies.values())
 
+    def facts(self) -> dict[str, float | int | str | None]:
+        """Sums over the copies of what counts or costs, and means of shares; the initialisers of all."""
+        found = [copy.facts() for copy in self._copies.values()]
+        if not found:
+            return self.wrapped.facts()
+        return {name: _over([one[name] for one in found], name) for name in found[0]}
+
     def __iter__(self) -> Iterator[tuple[int, Method]]:
         return iter(self._copies.items())
+
+
+def _over(values: list[Any], name: str) -> float | int | str | None:
+    """A fact of all copies."""
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    if isinstance(known[0], str):
+        return ", ".join(dict.fromkeys(known))
+    return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
 
 
 def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hydra.utils import get_class, instantiate
+from hydra.utils import get_class, get_method, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.instantiate import refuse_foreign, suggest, targets
@@ -33,7 +33,7 @@ METHODS = {
     "directional_gp": "gsparc.multipath.directional_gp.DirectionalGP",
     "array": "gsparc.array.method.ArrayField",
     "moving_array": "gsparc.array.moving.method.MovingArrayField",
-    "gsparc": "gsparc.auto.method.Gsparc",
+    "gsparc": "gsparc.training.gsparc.Gsparc",
 }
 
 INITIALISERS = {  # of a splatted field, by the coherent term they are for
@@ -45,6 +45,24 @@ INITIALISERS = {  # of a splatted field, by the coherent term they are for
 def initialiser(name: str) -> Any:
     """The initialiser (`gsparc.field.initial.Initialiser`) called `name`."""
     return get_class(INITIALISERS[name])()
+
+
+CONDITIONAL = "gsparc.multipath.initialise.{}", "gsparc.multipath.source_field.restored"
+FIELDS = {  # initialisers of fields whose weights are in closed form, and what reads them back
+    "sources": CONDITIONAL,
+    "rays": CONDITIONAL,
+    "diffuse": CONDITIONAL,
+}
+
+
+def field_initialiser(name: str) -> Any:
+    """The initialiser `(data, rows, init, clutter, context) -> (field, report)` called `name`."""
+    return get_method(FIELDS[name][0].format(name))
+
+
+def field_restored(name: str) -> Any:
+    """The function `(site, state) -> field` that reads back what the initialiser `name` made."""
+    return get_method(FIELDS[name][1])
 
 
 def method_class(name: str) -> type[Method]:

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
+import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.field.conditional import CompletedField, ConditionalField
+from gsparc.field.conditional import CompletedField, ConditionalField, residuals
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport
+from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.multipath.source_field import RayField, SourceField
+from gsparc.multipath.source_field import DiffuseField, RayField, SourceField
+
+LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
 
 def sources(
@@ -25,7 +30,7 @@ def sources(
         max_sources=init.max_sources, order=init.order, clutter=clutter, edges=init.edges, seed=context.seed,
     )  # fmt: skip
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
-    return SourceField(method), report
+    return _completed(SourceField(method), data, report)
 
 
 def rays(
@@ -35,3 +40,32 @@ def rays(
     method = DirectionalGP(rows=init.rows, seed=context.seed)
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     return RayField(method), report
+
+
+def diffuse(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """No Gaussians: waves from everywhere."""
+    began, field = time.monotonic(), DiffuseField(ComplexGP())
+    field.condition(data, rows)
+    return field, FitReport(time.monotonic() - began)
+
+
+def _completed(
+    field: ConditionalField, data: Measurements, report: FitReport
+) -> tuple[ConditionalField, FitReport]:
+    """With a process on what the sources leave, where leaving rows out says that it pays."""
+    if data.target[0].size > 1:
+        return field, report
+    began = time.monotonic()
+    left = field.left_out()
+    residual = DiffuseField(ComplexGP())
+    residual.condition(residuals(field, data), left.rows)
+    missed = torch.from_numpy(data.target[left.rows]).flatten() - left.mean.flatten()
+    predicted = residual.left_out().mean.flatten()
+    overlap = float((predicted.conj() * missed).real.sum())
+    weight = min(max(overlap / max(float(predicted.abs().square().sum()), 1e-30), 0.0), 1.0)
+    gain = 1 - float((missed - weight * predicted).abs().square().sum() / missed.abs().square().sum())
+    note = f"a process explains {max(gain, 0):.0%} of what the sources leave, left out one by one"
+    report = replace(report, seconds=report.seconds + time.monotonic() - began, notes=(*report.notes, note))
+    return (CompletedField(field, residual, weight) if gain >= LEAST_GAIN else field), report

@@ -18,10 +18,15 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
 from gsparc.methods.method import FitContext
+from gsparc.ops import Pose
+from gsparc.multipath.complex_gp import ComplexGP
+from gsparc.multipath.diffraction import subtract_edges
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import correlations, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.multipath.rows import Rows
+from gsparc.multipath.phased_gp import PhasedPosterior
+from gsparc.multipath.query import Query
+from gsparc.multipath.rows import Rows, gather
 
 
 class SourceField(ConditionalField):
@@ -65,7 +70,7 @@ class SourceField(ConditionalField):
             density = leave_one_out_density(covariance + noise * torch.eye(len(rows)), rows.target)
             each.append(density * self.method.weights[number])
         summed = torch.stack(each).sum(0)
-        return torch.zeros(len(batch)).index_reduce(0, rows.receiver, summed, "mean", include_self=False)
+        return summed.view(len(batch), -1).mean(1)
 
     def _scene(self, number: int) -> Any:
         """The scene of a search with the parameters as they are."""
@@ -79,7 +84,12 @@ class SourceField(ConditionalField):
             replace(member.phased, scene=_detached(self._scene(number)))
             for number, member in enumerate(self.method.members)
         ]
-        self.method.condition(data, rows, scenes)
+        method = self.method
+        held = method.frame.inside(gather(data, rows, method.row_limit, method.seed))
+        if len(method.edges):
+            held = subtract_edges(held, method.edges, scenes[0].scene.transmitter)
+        method.members = [PhasedPosterior(held, scene, method.noise_floor) for scene in scenes]
+        method.query = Query(method.members)
 
     @torch.no_grad()
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
@@ -139,16 +149,71 @@ class RayField(ConditionalField):
         return {"kind": "rays", "method": self.method.state()}
 
 
+class DiffuseField(ConditionalField):
+    """Waves from all around, without Gaussians: the plain process.
+
+    Args:
+        method: fitted, or to be conditioned.
+    """
+
+    def __init__(self, method: ComplexGP) -> None:
+        super().__init__()
+        self.method = method
+
+    @property
+    def count(self) -> int:
+        """None."""
+        return 0
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """The residual alone."""
+        return ("residual",)
+
+    def loss(self, batch: Batch) -> Tensor:
+        """Nothing is left to gradient steps."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`."""
+        self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
+        self.rows, self.target = rows, torch.from_numpy(np.asarray(data.target[rows]))
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`."""
+        found = self.method.predict(tx, rx)
+        assert found.variance is not None and found.confidence is not None
+        return Posterior(found.mean, found.variance, None, 1 - found.confidence)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`."""
+        left = self.method.leave_one_out()
+        mean = self.target - left.residual.reshape(self.target.shape).to(self.target.dtype)
+        return LeftOutRows(self.rows, mean, torch.full((len(self.rows),), float("nan")))
+
+    def state(self) -> dict[str, Any]:
+        """The method's."""
+        return {"kind": "diffuse", "method": self.method.state()}
+
+
 def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
     """The field whose `state()` this was."""
-    method = ImageSourceGP() if state["kind"] == "sources" else DirectionalGP()
+    makers = {
+        "sources": (ImageSourceGP, SourceField),
+        "rays": (DirectionalGP, RayField),
+        "diffuse": (ComplexGP, DiffuseField),
+    }
+    make, wrap = makers[state["kind"]]
+    method = make()
     method.restore(site, state["method"])
-    return SourceField(method) if isinstance(method, ImageSourceGP) else RayField(method)
+    return wrap(method)
 
 
 def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:
     """A batch as rows of the method's frame, one tone of each antenna."""
-    flat, _ = method.places(batch.tx, batch.rx)
+    flat, _ = method._places(batch.tx, batch.rx)
     assert method.site is not None
     tones = torch.from_numpy(method.site.tones())
     count, antennas = batch.target.shape[:2]
@@ -172,5 +237,9 @@ def _posterior(method: ImageSourceGP | DirectionalGP, tx: Tensor, rx: Pose) -> P
 
 
 def _left_out(method: ImageSourceGP | DirectionalGP) -> LeftOutRows:
+    """Of one channel per receiver."""
     left = method.leave_one_out()
-    return LeftOutRows(left.rows, left.residual, torch.full((len(left.rows),), float("nan")))
+    rows = method.members[0].rows if isinstance(method, ImageSourceGP) else method.rows
+    scale = (method.frame.carrier_hz / rows.frequency).float()[:, None] * method.frame.scale
+    mean = (rows.target * scale - left.residual)[:, :, None]
+    return LeftOutRows(left.rows, mean, torch.full((len(left.rows),), float("nan")))

@@ -41,6 +41,7 @@ class GSRF(TrainedPeer):
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
     rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
+    has_gaussians = True
     name: str = "gsrf"
     count: int = 500
     degree: int = 3

@@ -47,6 +47,7 @@ class SwiftWRF(TrainedPeer):
     rates: ClassVar[dict[str, float]] = {
         "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
     }  # fmt: skip
+    has_gaussians = True
     name: str = "swiftwrf"
     count: int = 300
     width: int = 64

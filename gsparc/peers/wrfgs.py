@@ -39,6 +39,7 @@ class WRFGSPlus(TrainedPeer):
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
     rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
+    has_gaussians = True
     name: str = "wrfgs"
     count: int = 500
     width: int = 64

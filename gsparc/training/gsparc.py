@@ -7,8 +7,9 @@ steps of gradient refine it as long as validation gains.
 
 from __future__ import annotations
 
+import copy
 import logging
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.conditional import ConditionalField, Posterior, StackedField, learns
+from gsparc.field.conditional import CompletedField, ConditionalField, Posterior, StackedField, learns
 from gsparc.field.initial import InitSettings
-from gsparc.field.response import ResponseSettings
-from gsparc.methods.method import Differentiable, FitContext, FitReport, HasPaths, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
+from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import field_initialiser, field_restored, method_class
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
 from gsparc.ops import Pose
@@ -41,8 +42,22 @@ TRIAL_S, TRIAL_SHARE = 10.0, 0.2  # of a search whose worth is weighed on held-o
 TRIAL = {"searches": 1, "search_rows": 200, "max_sources": 8, "edges": False}
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
+HOPELESS = 0.9  # share of the energy that a short fit misses, from which on a long one promises nothing
 LEAST_HELD = 4  # rows, for weights to mean anything
 OPEN_ENDED = ("sources", "bearings")  # initialisers that take what seconds they are given
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a short fit predicts of held-out rows.
+
+    Attributes:
+        error: share of the energy that it misses.
+        ratio: of that to what it misses of its own rows, left out one by one; at least 1.
+    """
+
+    error: float
+    ratio: float
 
 
 class Gsparc(LearnedField):
@@ -62,6 +77,7 @@ class Gsparc(LearnedField):
         self.field: ConditionalField | None = None
         self.plan: Plan | None = None
         self.explained: float | None = None
+        self.started = ""  # initialisers of what was fitted
         self._beside: tuple[Method, float] | None = None
 
     @property
@@ -98,6 +114,7 @@ class Gsparc(LearnedField):
             self.settings.field.count, self.effects, self.init.name, total_steps(context),
         )  # fmt: skip
         report = super().fit(data, fold, context)
+        self.started = self.choices.init if self.choices is not None else ""
         if self._beside is not None:
             method, weight = self._beside
             known = np.sort(np.concatenate([fold.train, fold.val]))
@@ -137,38 +154,45 @@ class Gsparc(LearnedField):
             "no end" if context.budget_s is None else f"{context.budget_s:g} s",
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
-        parts, shares, limited = self._weigh(chosen.parts, data, fold, context, budget)
-        members, notes = [], []
-        for part in parts:
+        trials, limited = self._try(chosen.parts, data, fold, context, budget)
+        self.started = "+".join(trials)
+        members: dict[str, ConditionalField] = {}
+        notes: list[str] = []
+        for part in sorted(trials, key=OPEN_ENDED.__contains__):  # what takes all that is left comes last
             left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
             within = replace(context, budget_s=left if part in OPEN_ENDED else None)
-            field, report = self._initialise(part, data, known, within)
+            members[part], report = self._initialise(part, data, known, within)
             limited = less_repeatable(limited, report.limited_by)
-            members.append(field)
             notes += report.notes
-        self.field = members[0] if len(members) == 1 else StackedField(members, shares)
+        self.field = self._stacked(members, trials, data)
         self.field.site = data.site
         self.init_s = budget.counted.wall
         self.steps = self._take_steps(data, fold, context, budget)
         self.field.condition(data, known)
         seconds = budget.counted.wall
-        log.info("initialisers %.1f s, %d gradient steps kept, %.1f s in all", self.init_s, self.steps, seconds)
+        log.info(
+            "initialisers %.1f s, %d gradient steps kept, %.1f s in all", self.init_s, self.steps, seconds
+        )
         return FitReport(seconds, tuple(notes), limited)
 
     def _initialise(
         self, part: str, data: Measurements, rows: np.ndarray, context: FitContext
     ) -> tuple[ConditionalField, FitReport]:
         clutter = self.switches.visibility is not False
-        return field_initialiser(part)(data, rows, self.init, clutter, context)
+        field, report = field_initialiser(part)(data, rows, self.init, clutter, context)
+        if self.switches.residual is False and isinstance(field, CompletedField):
+            field = field.field
+        return field, report
 
-    def _weigh(
+    def _try(
         self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
-    ) -> tuple[list[str], list[float], Clock | None]:
-        """The parts that held-out rows ask for, their weights, and the clock that limited a trial."""
+    ) -> tuple[dict[str, Trial], Clock | None]:
+        """What each part predicts of held-out rows after a short fit, hopeless ones left out, and what
+        limited that."""
         forced = self.switches.phase is True or self.init.name in parts
         if len(parts) == 1 or len(fold.val) < LEAST_HELD or (forced and len(parts) == 2):
-            return [parts[0]], [1.0], None
-        batch, predicted, limited = data.batch(fold.val), [], None
+            return {parts[0]: Trial(0.0, 1.0)}, None
+        batch, limited, found = data.batch(fold.val), None, {}
         target = _comparable(batch.target, data.site)
         for part in parts:
             short = replace(self.init, **TRIAL) if part in OPEN_ENDED else self.init
@@ -180,38 +204,63 @@ class Gsparc(LearnedField):
                 if forced:
                     raise
                 log.info("init=%s is left out: %s", part, error)
-                predicted.append(None)
                 continue
             limited = less_repeatable(limited, report.limited_by)
-            predicted.append(_comparable(field(batch.tx, batch.rx).mean, data.site))
-        usable = [n for n, one in enumerate(predicted) if one is not None]
-        found = weighing.weights([predicted[n] for n in usable], target)
-        for n, weight in zip(usable, found, strict=True):
+            missed = weighing.error(_comparable(field(batch.tx, batch.rx).mean, data.site), target)
+            own = missed
+            if data.target[0].size == 1:
+                left = field.left_out()
+                own = weighing.error(
+                    *(_comparable(v, data.site) for v in (left.mean, _rows(data, left.rows)))
+                )
+            found[part] = Trial(missed, max(missed / max(own, 1e-30), 1.0))
             log.info(
-                "held-out rows: %s misses %.3f of the energy, weight %.2f",
-                parts[n], weighing.error(predicted[n], target), weight,
+                "held-out rows: %s misses %.3f of the energy, %.1f times what it promises", part, missed,
+                found[part].ratio,
             )  # fmt: skip
-        kept = [(parts[n], weight) for n, weight in zip(usable, found, strict=True) if weight > 0]
-        return [part for part, _ in kept], [weight for _, weight in kept], limited
+        best = min(found, key=lambda part: found[part].error)
+        return {part: t for part, t in found.items() if part == best or t.error < HOPELESS}, limited
 
-    def _take_steps(
-        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
-    ) -> int:
+    def _stacked(
+        self, members: dict[str, ConditionalField], trials: dict[str, Trial], data: Measurements
+    ) -> ConditionalField:
+        """The members weighed by what each left out, its error raised by what held-out rows showed."""
+        if len(members) == 1:
+            return next(iter(members.values()))
+        if data.target[0].size > 1:
+            best = min(members, key=lambda part: trials[part].error)
+            return members[best]
+        left = {part: field.left_out() for part, field in members.items()}
+        rows = next(iter(left.values())).rows
+        predicted = []
+        for part, one in left.items():
+            order = np.argsort(one.rows)[np.searchsorted(one.rows, rows, sorter=np.argsort(one.rows))]
+            target, mean = _rows(data, rows), one.mean[order]
+            missed = _comparable(target, data.site) - _comparable(mean, data.site)
+            predicted.append(_comparable(target, data.site) - trials[part].ratio ** 0.5 * missed)
+        found = weighing.weights(predicted, _comparable(_rows(data, rows), data.site))
+        log.info("weights: %s", ", ".join(f"{part} {w:.2f}" for part, w in zip(members, found, strict=True)))
+        kept = [(field, weight) for field, weight in zip(members.values(), found, strict=True) if weight > 0]
+        return kept[0][0] if len(kept) == 1 else StackedField(*zip(*kept, strict=True))
+
+    def _take_steps(self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget) -> int:
         """Gradient steps under Lightning, as many as validation gains by; their number."""
         field = self.field
         assert field is not None
         if not len(fold.val):
             log.info("gradient steps: none, there are no validation rows to say whether they pay")
             return 0
-        field.condition(data, fold.train)
-        batch = data.batch(fold.val)
-        target, found = _comparable(batch.target, data.site), field(batch.tx, batch.rx)
-        about_mean = data.site.kind != "csi"
-        if found.explained is not None:
+        if field.count:
+            field.condition(data, fold.train)
+            batch = data.batch(fold.val)
+            target, found = _comparable(batch.target, data.site), field(batch.tx, batch.rx)
+            assert found.explained is not None
             own = _comparable(found.explained, data.site)
-            self.explained = weighing.explained(own, target, about_mean)
+            self.explained = weighing.explained(own, target, data.site.kind != "csi")
         if not learns(field) or budget.over(1 - STEPS_SHARE / 2):
-            log.info("gradient steps: none, %s", "no seconds are left" if learns(field) else "nothing to move")
+            log.info(
+                "gradient steps: none, %s", "no seconds are left" if learns(field) else "nothing to move"
+            )
             return 0
         folder = context.run_dir / "steps"
         module = GaussianModule(field, self.loss, self.rates, total_steps(context), folder)
@@ -239,3 +288,171 @@ class Gsparc(LearnedField):
         process, weight = self._beside
         other = process.predict(tx, rx)
         return replace(own, mean=torch.lerp(own.mean, other.mean, weight))
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `Differentiable`; of rasterized Gaussians, without a process beside them."""
+        if self.field is not None:
+            raise ValueError(f"{self.name}: its mean has no gradients by position")
+        return super().mean_at(tx, rx)
+
+    def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
+        """See `HasPaths`; of the heaviest member, without the residual."""
+        method = self._method()
+        if not isinstance(method, HasPaths):
+            raise ValueError("its channels are not made of paths")
+        return method.paths(tx, rx)
+
+    def trainer_options(self) -> bool:
+        """See `TrainsByGradient`."""
+        return True
+
+    def _method(self) -> Method | None:
+        """The method inside the heaviest member, where there is one."""
+        field = self.field
+        if isinstance(field, StackedField):
+            field = field.heaviest
+        if isinstance(field, CompletedField):
+            field = field.field
+        return getattr(field, "method", None)
+
+    # -- reductions --------------------------------------------------------------------------------
+
+    def knobs(self) -> tuple[str, ...]:
+        """See `Reducible`; `hybrid=false` is the Gaussians alone."""
+        if self.field is None:
+            own = super().knobs()
+            return own if self._beside is None else (*own, "hybrid")
+        method = self._method()
+        own = () if method is None or isinstance(self.field, StackedField) else knobs(method)
+        return (*own, "hybrid") if isinstance(self.field, CompletedField) else own
+
+    def contributions(self, data: Measurements, rows: Any) -> dict[str, Tensor]:
+        """See `Reducible`."""
+        if self.field is None:
+            return super().contributions(data, rows)
+        method = self._method()
+        return {} if method is None else contributions(method, data, rows)
+
+    def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Reducible`."""
+        own = {knob: value for knob, value in settings.items() if knob != "hybrid"}
+        keep, method = settings.get("hybrid", True), self._method()
+        if self.field is None:
+            twin = copy.copy(self)
+            twin._beside = None
+            found = LearnedField.reduced(twin, own, measured)
+            return Averaged(found, *self._beside) if keep and self._beside is not None else found
+        if method is None or isinstance(self.field, StackedField):
+            return self
+        found = reduced(method, own, measured)
+        return Summed(found, self.field) if keep and isinstance(self.field, CompletedField) else found
+
+    # -- storing -----------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """Field, process beside it, and what was found out."""
+        beside = None
+        if self._beside is not None:
+            method, weight = self._beside
+            beside = {"name": method.name, "state": method.state(), "weight": weight}
+        return {
+            "inner": super().state() if self.field is None else None,
+            "field": None if self.field is None else self.field.state(),
+            "beside": beside,
+            "facts": {"explained": self.explained, "steps": self.steps, "init_s": self.init_s},
+            "init": self.started,
+            "array": self.settings.response.array,
+        }
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`.
+
+        Raises:
+            ValueError: an earlier version's, in which another method had been chosen.
+        """
+        if state.get("chosen") is not None:
+            raise ValueError(
+                f"model=gsparc of an earlier version, which had chosen {state['chosen']} here; train again"
+            )
+        self.site, self.field, self._beside = site, None, None
+        response = replace(self.settings.response, array=bool(state.get("array", False)))
+        self.settings = replace(self.settings, response=response)
+        if state.get("field") is not None:
+            self.field = restored(site, state["field"])
+        else:
+            super().restore(site, state["inner"])
+        if state.get("beside") is not None:
+            method = method_class(state["beside"]["name"])()
+            method.restore(site, state["beside"]["state"])
+            self._beside = method, float(state["beside"]["weight"])
+        facts = state.get("facts", {})
+        self.explained, self.steps = facts.get("explained"), int(facts.get("steps", 0))
+        self.init_s, self.started = float(facts.get("init_s", 0.0)), str(state.get("init", ""))
+
+    def size(self) -> int:
+        """Number of Gaussians."""
+        return super().size() if self.field is None else self.field.count
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """See `Method.facts`."""
+        return {
+            **super().facts(),
+            "model/init": self.started,
+            "model/steps": self.steps,
+            "model/variance_explained": self.explained,
+            "time/init_s": self.init_s,
+        }
+
+
+class Averaged(View):
+    """A reduced field averaged with the process beside the whole one."""
+
+    def __init__(self, inner: Method, process: Method, weight: float) -> None:
+        super().__init__(inner)
+        self.process, self.weight = process, weight
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        found = self.inner.predict(tx, rx)
+        return replace(found, mean=torch.lerp(found.mean, self.process.predict(tx, rx).mean, self.weight))
+
+
+class Summed(View):
+    """A reduced field with the residual of the whole one."""
+
+    def __init__(self, inner: Method, whole: CompletedField) -> None:
+        super().__init__(inner)
+        self.residual, self.weight = whole.residual, whole.weight
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        found = self.inner.predict(tx, rx)
+        return replace(found, mean=found.mean + self.weight * self.residual(tx, rx).mean)
+
+
+def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
+    """The field whose `state()` this was."""
+    if "members" in state:
+        found: ConditionalField = StackedField(
+            [restored(site, m) for m in state["members"]], state["weights"]
+        )
+    elif "residual" in state:
+        parts = (restored(site, state[name]) for name in ("field", "residual"))
+        found = CompletedField(*parts, float(state["weight"]))
+    else:
+        found = field_restored(str(state["kind"]))(site, state)
+    found.site = site
+    return found
+
+
+def _rows(data: Measurements, rows: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.asarray(data.target[rows]))
+
+
+def _comparable(values: Tensor, site: Site) -> Tensor:
+    """Values in the unit that errors are counted in: powers in decibels."""
+    return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
+
+
+def _joined(parts: list[Tensor | None]) -> Tensor | None:
+    return None if parts[0] is None else torch.cat(parts)  # type: ignore[arg-type]

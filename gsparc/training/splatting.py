@@ -61,6 +61,7 @@ class LearnedField(Method):
         guesses: settings the source of this configuration does not give, one line each.
     """
 
+    has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_budget = True
     _limited_by: Clock | None = None

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from gsparc.data.limits import Checked, choice, setting
+from gsparc.data.limits import Checked, setting, switch
 from gsparc.data.schema import Measurements, Site
 from gsparc.field.initial import InitSettings
 
 Switch = bool | Literal["auto"]
-SWITCH = choice("auto", True, False)  # type: ignore[arg-type]
+SWITCH = switch("auto")
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,10 @@ def plan(switches: EffectSettings, init: InitSettings, data: Measurements, hidde
             raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
         on[name] = switch is not False and obstacle is None
         if obstacle is None:
-            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}" + (": as configured" if switch != "auto" else ""))
+            reasons.append(
+                f"effects.{name} -> {'on' if on[name] else 'off'}"
+                + (": as configured" if switch != "auto" else "")
+            )
     if on["power"]:
         return Plan(False, parts=("powers",), reasons=tuple(reasons))
     if on["moving_array"]:
@@ -94,8 +97,16 @@ def plan(switches: EffectSettings, init: InitSettings, data: Measurements, hidde
         parts = (named,) if named else ("sources", "rays") if data.directions is not None else ("sources",)
         parts = tuple(str(part) for part in parts)
         return Plan(False, parts=parts + (("diffuse",) if plain else ()), reasons=tuple(reasons))
-    if site.kind == "csi" and plain and site.wavelength is not None and drawn is None and switches.image is not True:
-        reasons.append(f"effects.phase -> off: {obstacles['phase'] or 'as configured'}; the residual is all there is")
+    if (
+        site.kind == "csi"
+        and plain
+        and site.wavelength is not None
+        and drawn is None
+        and switches.image is not True
+    ):
+        reasons.append(
+            f"effects.phase -> off: {obstacles['phase'] or 'as configured'}; the residual is all there is"
+        )
         return Plan(False, parts=("diffuse",), reasons=tuple(reasons))
     return Plan(True, array=on["array"], plain=plain, reasons=tuple(reasons))
 

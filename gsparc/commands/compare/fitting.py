@@ -152,7 +152,7 @@ def fill(prepared: Prepared) -> Filled:
         "time/train_cpu_s": statistics.fmean(found.train_cpu_s),
         "time/score_s": found.score_s,
         "model/name": prepared.cell.method,
-        "model/num_gaussians": found.methods[0].size(),
+        **found.methods[0].facts(),
         "model/effects": found.methods[0].effects,
         "model/notes": "; ".join(found.notes),
         "problem/drawn": prepared.problem.draw is not None,
