@@ -12,12 +12,14 @@ OLD_NAMES: dict[str, str] = {  # classes, by import path
     "gsparc.bearings.field.BearingField": "gsparc.array.moving.method.MovingArrayField",
     "gsparc.bearings.field.TrendSettings": "gsparc.array.moving.power_gp.TrendSettings",
     "gsparc.bearings.sources.SearchSettings": "gsparc.array.moving.triangulate.SearchSettings",
-    "gsparc.best.Gsparc": "gsparc.auto.method.Gsparc",
+    "gsparc.auto.method.Gsparc": "gsparc.training.gsparc.Gsparc",
+    "gsparc.best.Gsparc": "gsparc.training.gsparc.Gsparc",
     "gsparc.coherent.complex_gp.ComplexGP": "gsparc.multipath.complex_gp.ComplexGP",
     "gsparc.coherent.directed.DirectedSources": "gsparc.multipath.directional_gp.DirectionalGP",
     "gsparc.coherent.vsgp.VirtualSourceGP": "gsparc.multipath.image_source_gp.ImageSourceGP",
     "gsparc.confidence.ConfidenceSettings": "gsparc.field.confidence.ConfidenceSettings",
-    "gsparc.effects.EffectSettings": "gsparc.auto.decide.EffectSettings",
+    "gsparc.auto.decide.EffectSettings": "gsparc.training.terms.EffectSettings",
+    "gsparc.effects.EffectSettings": "gsparc.training.terms.EffectSettings",
     "gsparc.emission.EmissionSettings": "gsparc.field.emission.EmissionSettings",
     "gsparc.encoding.EncodingSettings": "gsparc.field.encoding.EncodingSettings",
     "gsparc.field.FieldSettings": "gsparc.field.gaussians.FieldSettings",
@@ -38,17 +40,27 @@ OLD_NAMES: dict[str, str] = {  # classes, by import path
     "gsparc.uplink.method.UplinkField": "gsparc.multipath.uplink.method.UplinkField",
     "gsparc.uplink.search.SearchSettings": "gsparc.multipath.uplink.search.SearchSettings",
 }
-OLD_KEYS = {  # settings of models
-    "directed_model": "directional_model",
-    "bearing_model": "moving_array_model",
-    "furniture": "clutter",
-}
+OLD_KEYS = {"furniture": "clutter"}  # settings of models
+FIELD = "gsparc.training.gsparc.Gsparc"
+CHOSEN = (  # settings of the models that it chose among
+    *("phase_model", "phase_probe", "array_model", "moving_array_model", "directional_model"),
+    *("bearing_model", "directed_model"),
+)
 
 
 def renamed(node: Any) -> Any:
     """A configuration (plain containers) of an earlier version in today's names."""
     if isinstance(node, dict):
-        return {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+        found = {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+        return _one_field(found) if found.get("_target_") == FIELD and "phase_model" in found else found
     if isinstance(node, list):
         return [renamed(value) for value in node]
     return OLD_NAMES.get(node, node) if isinstance(node, str) else node
+
+
+def _one_field(node: dict[str, Any]) -> dict[str, Any]:
+    """Settings of `model=gsparc` from when it chose among other methods: those of its own field."""
+    found = {key: value for key, value in node.items() if key not in CHOSEN}
+    array = found["effects"].get("array") == "splat"
+    found["effects"] = {"_target_": found["effects"]["_target_"], "array": array}
+    return found

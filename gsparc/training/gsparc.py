@@ -375,7 +375,7 @@ class Gsparc(LearnedField):
                 f"model=gsparc of an earlier version, which had chosen {state['chosen']} here; train again"
             )
         self.site, self.field, self._beside = site, None, None
-        response = replace(self.settings.response, array=bool(state.get("array", False)))
+        response = replace(self.settings.response, array=bool(state.get("array", self.switches.array is True)))
         self.settings = replace(self.settings, response=response)
         if state.get("field") is not None:
             self.field = restored(site, state["field"])

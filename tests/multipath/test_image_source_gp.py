@@ -11,7 +11,6 @@ from rooms import WAVELENGTH, furnished, nmse, shoebox
 from shoeboxes import as_arrays
 
 from gsparc import load
-from gsparc.auto.decide import probe_phase
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.methods import checkpoint
@@ -258,10 +257,8 @@ def learned_and_true_visibility(method, told, data, index, most=6):
 
 
 def test_zero_training_channels_are_refused(tmp_path):
-    """The library's words about a matrix that is not positive definite came; `auto` takes the plain field."""
+    """The library's words about a matrix that is not positive definite came."""
     _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
     silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
     with pytest.raises(ValueError, match="every training channel is zero"):
         ImageSourceGP(**QUICK).fit(silent, fold, FitContext(tmp_path))
-    decision = probe_phase(ImageSourceGP(**QUICK), method_class("gp")(), silent, fold, 0)
-    assert not decision.on and "silent" in decision.reason

@@ -9,7 +9,6 @@ import pytest
 from clocks import WoundClock
 from invented import divide, invent
 
-from gsparc.auto.decide import decide_array
 from gsparc.commands.study.kinds import Measured, Positions
 from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.commands.study.study import Study, Variant
@@ -48,8 +47,7 @@ class Quick(Slow):
 
 class Impossible(Mean):
     def fit(self, data, fold, context):
-        decide_array(True, data.site, None)
-        raise AssertionError
+        raise ValueError("model.effects.array=true is not possible: no array")
 
 
 class NeedsUplink(Quick):

@@ -1,0 +1,64 @@
+"""Steps that do not pay are not taken: the best validation is kept, and training ends when none is better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from campaigns import brief, compose, spectra
+from contexts import short
+
+from gsparc.data.load import load, split_for
+from gsparc.methods.registry import build
+
+COLD = ("init=sphere", "model.effects.residual=false", "model.refit=false")
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    file = spectra(tmp_path_factory.mktemp("own") / "own.npz")
+    data = load({"name": "own", "file": str(file)})
+    return file, data, split_for({"name": "random"}, data).folds[0]
+
+
+def fitted(measured, folder, *more, steps=40, **context):
+    file, data, fold = measured
+    method = build(compose(*brief(file, *COLD, *more)).model)
+    method.fit(data, fold, short(folder, steps, validate_every=5, **context))
+    return method
+
+
+def held_out(method, measured):
+    _, data, fold = measured
+    batch = data.batch(fold.val)
+    return float((method.predict(batch.tx, batch.rx).mean - batch.target).square().mean())
+
+
+def test_steps_that_pay_are_kept(measured, tmp_path):
+    before = fitted(measured, tmp_path / "none", steps=1)
+    after = fitted(measured, tmp_path / "some")
+    assert after.steps >= 10 and held_out(after, measured) < 0.9 * held_out(before, measured)
+
+
+def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
+    """A rate at which every step overshoots."""
+    wild = tuple(f"model.optimizer.{name}=50.0" for name in ("emission", "opacities", "scales"))
+    caplog.set_level("INFO")
+    method = fitted(measured, tmp_path / "wild", *wild)
+    start = fitted(measured, tmp_path / "start", "model.keep_best=false", steps=1)
+    assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
+    assert "none kept" in caplog.text and "40 taken" not in caplog.text
+
+
+def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):
+    wild = tuple(f"model.optimizer.{name}=50.0" for name in ("emission", "opacities", "scales"))
+    assert fitted(measured, tmp_path / "wild", *wild, "model.refit=true").steps == 0
+    assert fitted(measured, tmp_path / "tame", "model.refit=true").steps >= 10
+
+
+def test_a_resumed_run_ends_with_the_same_parameters(measured, tmp_path):
+    whole = fitted(measured, tmp_path / "whole", every=10)
+    again = fitted(measured, tmp_path / "again", every=10, resume=tmp_path / "whole" / "last.ckpt")
+    first, second = whole.fitted().state_dict(), again.fitted().state_dict()
+    same = [np.allclose(a, second[key]) for key, a in first.items() if isinstance(a, torch.Tensor)]
+    assert all(same) and again.steps == whole.steps
