@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.methods.method import LeftOut, Prediction, PredictsVariance
-from gsparc.multipath.rows import Rows, query_elements
+from gsparc.multipath.rows import Rows, query_elements, static_array
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
 
@@ -55,13 +55,20 @@ class FramedMethod(PredictsVariance):
         return self.site
 
     def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
-        """Antennas of the moving end (B E, 3) float64 in the frame, and B."""
+        """Antennas of the moving end (B E, 3) float64 in the frame, and B.
+
+        With E antennas of the static end (B E, 6): see `Rows.places`.
+        """
         site = self._fitted()
         if site.moving_end == "rx":
             places = query_elements(site, rx, len(tx), self.antennas)
-        else:
-            places = tx.cpu().double()[:, None]
-        return places.reshape(-1, 3) - self.frame.middle, len(places)
+            return places.reshape(-1, 3) - self.frame.middle, len(places)
+        places = tx.cpu().double() - self.frame.middle
+        array = static_array(site, self.antennas)
+        if array is None:
+            return places, len(places)
+        each = torch.repeat_interleave(places, len(array), 0)
+        return torch.cat([each, torch.from_numpy(array).repeat(len(places), 1)], 1), len(places)
 
     def _stored(self, mean: Tensor, tones: Tensor) -> Tensor:
         """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
@@ -113,13 +120,9 @@ def frame_of(site: Site, rows: Rows) -> Frame:
     return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 
-def refuse(site: Site, name: str, antennas: int = 1) -> None:
+def refuse(site: Site, name: str) -> None:
     """`ValueError`, in the name of a method, for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
         raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
-    if site.static_end == "rx" and antennas > 1:
-        raise ValueError(
-            f"{name}: in {site.name} the transmitter moves before {antennas} antennas; take one of them"
-        )

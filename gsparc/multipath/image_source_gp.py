@@ -30,15 +30,17 @@ from gsparc.multipath.diffraction import (
 )
 from gsparc.multipath.ensemble import at_noise_floor, ensemble_weights, search_many
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse
+from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import MeanQuery, Query
-from gsparc.multipath.rows import Rows, elements, gather
+from gsparc.multipath.rows import Rows, gather, measured_places, ranges_at
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
 from gsparc.ops import Pose
-from gsparc.physics.waves import ranges, wave, wave_over_band
+from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.waves import wave, wave_over_band
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +54,7 @@ ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each searc
 
 
 class ImageSourceGP(FramedMethod):
-    """Image-source Gaussian process for a moving receiver, or a moving transmitter and one antenna.
+    """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
@@ -103,7 +105,7 @@ class ImageSourceGP(FramedMethod):
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
-        refuse(data.site, self.name, data.target.shape[1])
+        refuse(data.site, self.name)
         known = np.concatenate([fold.train, fold.val])
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
         budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
@@ -198,7 +200,8 @@ class ImageSourceGP(FramedMethod):
 
     def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        aligned = self._remove_offsets(data, known, self._transmitter()[None], torch.ones(1, self.antennas))
+        direct = Scene(self._transmitter(), torch.zeros(0, 4).double(), ((),), torch.zeros(1), 0.0)
+        aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
             now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
@@ -208,17 +211,19 @@ class ImageSourceGP(FramedMethod):
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
                 gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains
-                aligned = self._remove_offsets(data, known, phased.scene.sources, gains)
+                aligned = self._remove_offsets(data, known, phased.scene, gains)
         return aligned
 
     def _remove_offsets(
-        self, data: Measurements, known: np.ndarray, sources: Tensor, gains: Tensor
+        self, data: Measurements, known: np.ndarray, scene: Scene, gains: Tensor
     ) -> Measurements:
-        """Targets of the known rows without their offsets against sources of constant gains."""
+        """Targets of the known rows without their offsets against a scene's sources of constant gains."""
         frequency = data.site.tones()
-        places = elements(data.site, data.moving[known], data.rx_rotation[known], self.antennas)
-        flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
-        waves = wave_over_band(ranges(flat, sources), torch.from_numpy(frequency))
+        places = torch.from_numpy(measured_places(data, known).copy())
+        places[..., :3] -= self.frame.middle
+        turned = orientations(scene.planes, scene.words)
+        away = ranges_at(places.flatten(0, 1), scene.sources, turned)
+        waves = wave_over_band(away, torch.from_numpy(frequency))
         if gains.shape[1] == 1 or places.shape[1] > 1:
             gains = gains[:, :1]
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
@@ -244,7 +249,7 @@ class ImageSourceGP(FramedMethod):
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         if len(self.edges):
-            stack = stack + self.edges.over_band(flat, tones, self.members[0].scene.transmitter)
+            stack = stack + self.edges.over_band(flat[:, :3], tones, self._static_ends(flat))
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
         return self._prediction(self._stored(mean, tones), variance, prior)
@@ -258,22 +263,28 @@ class ImageSourceGP(FramedMethod):
             the carrier [Hz].
         """
         flat, count = self._places(tx, rx)
-        transmitter, carrier = self.members[0].scene.transmitter, self.frame.carrier_hz
-        middle = flat.view(count, -1, 3).mean(1)
+        carrier = self.frame.carrier_hz
+        middle = flat[:, :3].reshape(count, -1, 3).mean(1)
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
-        away = ranges(flat, self.query.pack.sources)
+        away = self.query.pack.ranges(flat)
         gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
         towards = self.query.pack.sources - middle[:, None]
         if len(self.edges):
-            length, met = diffracted(flat, self.edges, transmitter)
+            places, transmitter = flat[:, :3], self._static_ends(flat)
+            length, met = diffracted(places, self.edges, transmitter)
             hertz = torch.full((len(flat),), carrier, dtype=torch.float64)
-            waves = edge_wave(flat, self.edges.point, self.edges.axis, transmitter, hertz)
+            waves = edge_wave(places, self.edges.point, self.edges.axis, transmitter, hertz)
             gain = torch.cat([gain, waves.T[..., None] * self.edges.gain[:, None]])
             away = torch.cat([away, length], 1)
             # elements differ in diffraction points: their mean
             met = met.view(count, -1, len(self.edges), 3).mean(1)
             towards = torch.cat([towards, met - middle[:, None]], 1)
         return self._stored_paths(gain.movedim(0, -1), away, towards)
+
+    def _static_ends(self, flat: Tensor) -> Tensor:
+        """The static end (3,), or the antenna (m, 3) of each of queries (m, 6)."""
+        transmitter = self.members[0].scene.transmitter
+        return transmitter if flat.shape[1] == 3 else transmitter + flat[:, 3:]
 
     def leave_one_out(self) -> LeftOut:
         """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""

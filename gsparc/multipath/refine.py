@@ -89,7 +89,8 @@ def _likelihood(
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its gradient: `d nll = trace(G dK)`, `G = R K^-1 - alpha alpha^H`."""
     transmitter, planes = (v.detach().requires_grad_() for v in values[:2])
-    waves = steering(rows, images(transmitter, planes, scene.words)) * scene.visible_share(rows.position)
+    sources = images(rows.static_ends(transmitter), planes, scene.words)
+    waves = steering(rows, sources) * scene.visible_share(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
     n = len(rows)
@@ -131,7 +132,7 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, start: KernelVisibili
         optimizer.zero_grad()
         for k, source in enumerate(scene.sources):
             weight = (slope.conj() * scaled[:, k, None] * scaled[:, k].conj()).real
-            (weight * KernelVisibility.of(value).correlation(rows.position, source)).sum().backward()
+            (weight * KernelVisibility.of(value).correlation(rows.places, source)).sum().backward()
         ((value - centre).square().sum() / SPREAD**2).backward()
         optimizer.step()
     return replace(scene, visibility=KernelVisibility.of(value.detach()).plain())

@@ -45,7 +45,8 @@ def _likelihood(
     """Negative log likelihood and its derivatives by transmitter, planes, amplitudes, noise, phases."""
     words, n = phased.scene.words, len(rows)
     transmitter, planes, phase = (values[i].detach().requires_grad_() for i in (0, 1, 4))
-    waves = steering(rows, images(transmitter, planes, words)) * torch.polar(torch.ones(()), phase)
+    sources = images(rows.static_ends(transmitter), planes, words)
+    waves = steering(rows, sources) * torch.polar(torch.ones(()), phase)
     waves = waves * phased.scene.visible_share(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
@@ -102,7 +103,7 @@ def learn_visibility(
         loss = ((value - centre) / width).square().sum() / 2
         for k, source in enumerate(scene.sources):
             along, across = (_folded(slope, z, n) for z in stacked(scaled[:, k]))
-            correlation = KernelVisibility.of(value).correlation(rows.position, source)
+            correlation = KernelVisibility.of(value).correlation(rows.places, source)
             gain = (1 - share) * (along * correlation).sum() + share * (across * correlation).sum()
             loss = loss + gain / 2
         optimizer.zero_grad()

@@ -55,7 +55,7 @@ class Residual:
         scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
         varying, kernel = torch.zeros(2, n, 2, n), replace(scene.visibility, constant=0.0)
         for k, source in enumerate(scene.sources):
-            correlation = kernel.correlation(self.rows.position, source)
+            correlation = kernel.correlation(self.rows.places, source)
             add_source(varying, scaled[:, k], phased.quadrature, correlation)
         across = stacked(scaled)[1]
         return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
