@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
+from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 
 TRIED = 1.5  # factor between two candidates of the noise variance
@@ -91,7 +92,7 @@ class Residual:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
-        self._lower = torch.linalg.cholesky(covariance)
+        self._lower = cholesky(covariance)
         self._determinant = float(self._lower.diagonal().double().log().sum())
 
     @staticmethod
@@ -113,18 +114,18 @@ class Residual:
     def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
         """Log likelihood lost without each source's constant part (K,) [nats]."""
         columns = self.columns(visible_share, log_amplitude)
-        inner = columns.T @ columns + torch.eye(columns.shape[1])
+        inner, seen = _inner(columns, self.white)
         inverse = torch.linalg.inv(inner)
-        mean = inverse @ (columns.T @ self.white)
-        spread = inverse.diagonal()
-        return 0.5 * (mean.square() / spread + spread.log())
+        mean, spread = inverse @ seen, inverse.diagonal()
+        return (0.5 * (mean.square() / spread + spread.log())).float()
 
     def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
         """Scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
-        lower = torch.linalg.cholesky(columns.T @ columns + torch.eye(columns.shape[1]))
-        mean = torch.cholesky_solve((columns.T @ self.white)[:, None], lower)[:, 0]
-        projection = torch.linalg.solve_triangular(lower, columns.T, upper=False)
+        inner, seen = _inner(columns, self.white)
+        lower = torch.linalg.cholesky(inner)
+        mean = torch.cholesky_solve(seen[:, None], lower)[:, 0].float()
+        projection = torch.linalg.solve_triangular(lower, columns.T.double(), upper=False).float()
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
@@ -183,8 +184,18 @@ class CandidateScorer:
         return (along * gain.real + across * gain.imag) / 2, gain
 
 
+def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
+    """`I + C^T C` (K, K) and `C^T y` (K,), float64, of whitened columns (2 n, K) and targets (2 n,).
+
+    Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
+    """
+    exact = columns.double()
+    return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
+
+
 def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
-    inner = columns.T @ columns + torch.eye(columns.shape[1])
+    inner, seen = _inner(columns, white)
     lower = torch.linalg.cholesky(inner)
-    fit = torch.linalg.solve_triangular(lower, (columns.T @ white)[:, None], upper=False)
-    return determinant + lower.diagonal().log().sum() + 0.5 * (white.square().sum() - fit.square().sum())
+    fit = torch.linalg.solve_triangular(lower, seen[:, None], upper=False)
+    explained = white.double().square().sum() - fit.square().sum()
+    return determinant + lower.diagonal().log().sum() + 0.5 * explained
