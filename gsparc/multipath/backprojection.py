@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import Factor, steering
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.worker import ask
 from gsparc.physics.waves import LIGHT, NEAR_M
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
@@ -65,6 +66,7 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
         parts = [(torch.nonzero(rows.element == e).flatten(), each) for e, each in enumerate(candidates)]
     scores = []
     for start in range(0, candidates.shape[-2], BLOCK):
+        ask()
         real, imag, power = 0.0, 0.0, 0.0
         for mine, points in parts:
             block = (points[start : start + BLOCK] - middle).float()
@@ -134,6 +136,7 @@ def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[floa
     leaves = [value.clone().requires_grad_() for value in values]
     optimizer = torch.optim.Adam(leaves, betas=(0.8, 0.95))
     for rate in rates:
+        ask()
         optimizer.param_groups[0]["lr"] = rate
         optimizer.zero_grad()
         (-scores(*leaves).log().sum()).backward()

@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from gsparc.multipath.backprojection import ascend, score_waves
 from gsparc.multipath.gp_likelihood import Factor, Posterior, Scene
-from gsparc.multipath.refine import refine
+from gsparc.multipath.refine import Late, never, refine
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import NEAR_M, reduced_phase
 
@@ -148,7 +148,7 @@ def propose(
 
 
 def find_edges(
-    rows: Rows, scene: Scene, box: Tensor, generator: torch.Generator, noise_floor: float
+    rows: Rows, scene: Scene, box: Tensor, generator: torch.Generator, noise_floor: float, late: Late = never
 ) -> Edges:
     """Edges one by one, as long as the marginal likelihood accepts another; sources are refined in between.
 
@@ -158,9 +158,10 @@ def find_edges(
         box: (2, 3) float64 [m] where edges may pass.
         generator: of the candidates.
         noise_floor: known variance of the noise, in units of the rows' power.
+        late: asked before each; no more are looked for when it says so.
     """
     edges, residual = Edges.none(), rows
-    while len(edges) < MOST:
+    while len(edges) < MOST and not late():
         factor = Posterior(residual, scene, noise_floor).factor
         found = propose(residual, factor, scene.transmitter, box, generator)
         if found is None:

@@ -6,14 +6,17 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.methods.method import LeftOut, Prediction, PredictsVariance
 from gsparc.multipath.rows import Rows, query_elements, static_array
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
+
+SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 
 
 @dataclass(frozen=True)
@@ -126,3 +129,17 @@ def refuse(site: Site, name: str) -> None:
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
         raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
+
+
+def refuse_turning(data: Measurements) -> None:
+    """`ValueError` where a static receiver of several antennas turns between measurements."""
+    antennas = data.target.shape[1]
+    if static_array(data.site, antennas) is None:
+        return
+    turned = np.abs(data.rx_rotation - data.rx_rotation[:1]).max(axis=(1, 2)) > SAME_ROTATION
+    if turned.any():
+        row = int(np.flatnonzero(turned)[0])
+        raise ValueError(
+            f"{data.site.name}: row {row}: the static receiver of {antennas} antennas is turned otherwise "
+            "than in row 0; give the rows of each rotation as a file of their own"
+        )

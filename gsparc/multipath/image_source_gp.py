@@ -7,6 +7,7 @@ import logging
 import math
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -28,8 +29,8 @@ from gsparc.multipath.diffraction import (
     fit_edge_gains,
     subtract_edges,
 )
-from gsparc.multipath.ensemble import at_noise_floor, ensemble_weights, search_many
-from gsparc.multipath.frame import FramedMethod, frame_of, refuse
+from gsparc.multipath.ensemble import affordable_rows, at_noise_floor, ensemble_weights, search_many
+from gsparc.multipath.frame import FramedMethod, frame_of, refuse, refuse_turning
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
@@ -47,7 +48,7 @@ log = logging.getLogger(__name__)
 SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
 MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
 MAX_EDGE_ERROR = 0.8  # leave-one-out error with edges over that without, above which edges are dropped
-EDGE_BUDGET = 0.2  # least share of the budget for the search with edges
+EDGE_BUDGET = 0.2  # share of the budget kept for edges and the search beside them
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
@@ -104,11 +105,28 @@ class ImageSourceGP(FramedMethod):
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
+        """Search on `train` and `val` together: the number of sources is chosen by likelihood.
+
+        Raises:
+            ValueError: the data are not channels, or their phase means nothing.
+            KeyboardInterrupt: by the user; the message names the file to go on from.
+        """
         refuse(data.site, self.name)
+        refuse_turning(data)
         known = np.concatenate([fold.train, fold.val])
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
+        try:
+            return self._fit(data, known, context, cache)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(cache.interrupted()) from None
+
+    def _fit(
+        self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
+    ) -> FitReport:
         budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
+        searching = budget
+        if self.look_for_edges:
+            searching = context.time_budget((1 - EDGE_BUDGET) * budget.seconds, cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
@@ -117,16 +135,22 @@ class ImageSourceGP(FramedMethod):
         held = self.frame.inside(everything)
         notes = []
         if self.offsets != "none":
-            data = self._without_offsets(data, known, budget)
+            data = self._without_offsets(data, known, searching)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
         row_sets = self._row_sets(data, known, self.searches)
-        found = self._search(row_sets, self.settings, budget, self.clutter, cache)
-        if self.look_for_edges:
+        found = self._search(row_sets, self.settings, searching, self.clutter, cache)
+        budget.limited |= searching.limited
+        if self.look_for_edges and not at_noise_floor([found[0].left_out], self.noise_floor, least=1):
             found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
+        affordable = affordable_rows(row_sets[0], found, self.noise_floor, budget)
+        if affordable < len(held):
+            budget.limited = True
+            notes.append(f"{self.name}: {affordable} of {len(held)} rows in the final process: time is short")
+            held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
@@ -173,12 +197,12 @@ class ImageSourceGP(FramedMethod):
         """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
         scene, rows = found[0].phased.scene, row_sets[0]
         transmitter, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
-        edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor)
+        late = partial(budget.over, 1 - EDGE_BUDGET / 2)
+        edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor, late)
         if not len(edges):
             return found, held
         log.info("%d edges; searching again on the residual", len(edges))
-        remaining = max(budget.seconds - budget.spent, EDGE_BUDGET * budget.seconds)
-        more = TimeBudget(remaining, budget.clock)
+        more = TimeBudget(max(budget.seconds - budget.spent, 0.0), budget.clock)
         row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
         with_edges = self._search(row_sets, self.settings, more, self.clutter, cache, "beside edges")
         budget.limited |= more.limited

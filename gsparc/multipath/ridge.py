@@ -5,8 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-# Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, as |K_ij| is at most the mean of
-# its two variances; sums over sources round that many times.
+from gsparc.multipath.worker import ask
+
+# Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
+# covariance is at most its trace; entries that are sums are rounded several times.
 ROUNDING = torch.finfo(torch.float32).eps
 RIDGES = (0.01, 0.1, 1.0, 16.0)  # of that bound, tried in turn
 
@@ -15,8 +17,8 @@ def cholesky(covariance: Tensor) -> Tensor:
     """Lower factor (n, n) of a covariance; in float64 and with a ridge where it has none without.
 
     Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is
-    positive definite on paper and, rounded, has eigenvalues of either sign up to `ROUNDING trace(K)`. A ridge of
-    that size mends it, and is noise that the data cannot tell from rounding; float64 adds none of its own.
+    positive definite on paper and, rounded, has eigenvalues of either sign up to `ROUNDING trace(K)`. A ridge
+    of that size mends it, and is noise that the data cannot tell from rounding; float64 rounds no more.
 
     Args:
         covariance: (n, n) real or complex, Hermitian.
@@ -27,6 +29,7 @@ def cholesky(covariance: Tensor) -> Tensor:
     Raises:
         ValueError: it has no factor with the largest ridge either.
     """
+    ask()
     lower, failed = torch.linalg.cholesky_ex(covariance)
     if not failed:
         return lower
@@ -39,8 +42,9 @@ def cholesky(covariance: Tensor) -> Tensor:
         lower, failed = torch.linalg.cholesky_ex(exact)
         if not failed:
             return lower.to(covariance.dtype)
+    most = RIDGES[-1] * ROUNDING * len(covariance)
     raise ValueError(
-        f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with "
-        f"{RIDGES[-1] * ROUNDING * len(covariance):.1e} of its mean variance as noise, which rounding explains: "
+        f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {most:.1e} of its mean "
+        "variance as noise, more than rounding explains: "
         "look for rows that are not finite (gsparc check FILE)"
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from gsparc.multipath.backprojection import Effort, pick_apart, score, search_box
 from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
-from gsparc.multipath.refine import learn_visibility, refine
+from gsparc.multipath.refine import Late, learn_visibility, never, refine
 from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogonal_walls, prune, reassign
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.source_types import box_of
@@ -75,13 +74,14 @@ class Search:
         settings: how.
         seed: of the candidates.
         late: asked after every round; no other starts when it says so.
+        over: asked after every step; what was found so far is the result when it says so.
     """
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
-        late: Callable[[], bool] = lambda: False,
+        late: Late = never, over: Late = never,
     ) -> None:  # fmt: skip
-        self.rows, self.settings, self.late = rows, settings, late
+        self.rows, self.settings, self.late, self.over = rows, settings, late, over
         self.generator = torch.Generator().manual_seed(seed)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
@@ -109,11 +109,11 @@ class Search:
                 break
             self._refine(s.steps)
             if free or number % 2:
-                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength)
+                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength, late=self.over)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, s.prune)
+                self.scene = prune(self.rows, self.scene, s.prune, self.over)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
@@ -133,21 +133,21 @@ class Search:
         self._refine(20)
         self._find_walls()
         self._reassign(orthogonal_walls(self.scene))
-        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength)
+        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
         self._add_words()
         self._refine(s.steps)
-        self.scene = prune(self.rows, self.scene, s.prune)
+        self.scene = prune(self.rows, self.scene, s.prune, self.over)
         self._learn_visibility(10)
         self._refine(s.final_steps)
         return self.scene
 
     def _refine(self, steps: int) -> None:
-        self.scene = refine(self.rows, self.scene, steps)
+        self.scene = refine(self.rows, self.scene, steps, late=self.over)
 
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.words) >= self.settings.learn_visibility_from:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
+            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
 
     def _add_words(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
@@ -240,7 +240,7 @@ class Search:
 
     def _reassign(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
-        if walls is None:
+        if walls is None or self.over():
             return
         before = self.scene
         self.scene = reassign(before, walls)

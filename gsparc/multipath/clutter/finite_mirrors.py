@@ -19,6 +19,7 @@ from gsparc.multipath.clutter.boxes import evolve
 from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.worker import ask
 from gsparc.physics.mirror_planes import Word, reflect
 from gsparc.physics.waves import LIGHT, NEAR_M, wave
 
@@ -185,6 +186,7 @@ def _raster(
     low, cells = (room @ along.T).amin(0), _cells(room, along)
     tables = []
     for arriving, met in _sources(rows, transmitter, candidates, known):
+        ask()
         cell = ((met @ along.T - low) / CELL).floor().long()
         inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
         index = (cell[..., 0] * cells[1] + cell[..., 1]).clamp(0, cells[0] * cells[1] - 1)

@@ -18,6 +18,7 @@ from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.worker import ask
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
@@ -155,6 +156,7 @@ class CandidateScorer:
         """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
         scores = []
         for part in candidates.split(BLOCK):
+            ask()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
             scores.append(self.score(torch.complex(*change)))
@@ -189,6 +191,7 @@ def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
 
     Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
     """
+    ask()
     exact = columns.double()
     return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
 

@@ -160,9 +160,10 @@ class _ClutterSearcher:
             for move in (self._mirrors, self._patches, self._boxes, self._words):
                 if not late():
                     move()
-            self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
-            self._drop()
-            self._refactor(self.phased)
+            if not late():
+                self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
+                self._drop()
+                self._refactor(self.phased)
             if not late():
                 self._relocate_boxes()
                 self._descend(10)
