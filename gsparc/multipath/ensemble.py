@@ -144,6 +144,12 @@ def _search(
     return Member(phased, error)
 
 
+def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
+    """A search's result on rows that have changed a little."""
+    phased = refine_phase.refine(rows, member.phased, 20, noise_floor)
+    return Member(phased, _left_out(rows, phased, noise_floor))
+
+
 def _left_out(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:
     """NMSE of the rows, each receiver predicted from the others."""
     error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()

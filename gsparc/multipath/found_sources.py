@@ -17,7 +17,7 @@ class FoundSources:
     """N sources of one or more searches; a channel is their sum `g exp(-j 2 pi f r / c) / r carrier / f`.
 
     The range r of antenna a of the static end (from its position, site axes) is that to `positions +
-    rotations a`; searches are averaged, not summed.
+    rotations a`, and its channel that sum over `factors`; searches are averaged, not summed.
 
     Attributes:
         positions: (N, 3) float64 [m], local.
@@ -25,6 +25,7 @@ class FoundSources:
             where antennas of the static end do not matter.
         member: (N,) int64, the search that found each; the best is 0.
         weights: (M,) float32 of sum 1, of the searches in the average.
+        factors: (A,) complex64, what channels of each antenna were multiplied by.
         strengths: (N,) float32, prior standard deviation of a gain [stored unit m].
         gains: (N, R) complex64, posterior mean of the gain's constant part [stored unit m].
     """
@@ -33,6 +34,7 @@ class FoundSources:
     rotations: np.ndarray | None
     member: np.ndarray
     weights: np.ndarray
+    factors: np.ndarray
     strengths: np.ndarray
     gains: np.ndarray
 
@@ -53,6 +55,7 @@ def found_sources(method: ImageSourceGP) -> FoundSources:
         rotations=None if static_array(method.site, method.antennas) is None else turned,
         member=np.repeat(np.arange(len(scenes)), counts),
         weights=method.weights.numpy(),
+        factors=method.factors.numpy(),
         strengths=scale * torch.cat([scene.log_amplitude.exp() for scene in scenes]).numpy(),
         gains=scale * torch.cat([member.mean_gains for member in method.members]).numpy(),
     )

@@ -29,7 +29,14 @@ from gsparc.multipath.diffraction import (
     fit_edge_gains,
     subtract_edges,
 )
-from gsparc.multipath.ensemble import affordable_rows, at_noise_floor, ensemble_weights, search_many
+from gsparc.multipath.element_factors import direct_path, element_factors
+from gsparc.multipath.ensemble import (
+    affordable_rows,
+    at_noise_floor,
+    ensemble_weights,
+    refined,
+    search_many,
+)
 from gsparc.multipath.frame import FramedMethod, frame_of, refuse, refuse_turning
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
@@ -67,6 +74,8 @@ class ImageSourceGP(FramedMethod):
         clutter: search for occluding boxes and finite mirrors, shared by all sources.
         edges: search for diffracting edges; kept when the likelihood gains.
         seed: of everything random.
+
+    Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
 
     Raises:
         ValueError: the data are not channels, or their phase means nothing.
@@ -133,7 +142,12 @@ class ImageSourceGP(FramedMethod):
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
         held = self.frame.inside(everything)
-        notes = []
+        notes: list[str] = []
+        self.factors = torch.ones(self.antennas, dtype=torch.complex64)
+        if held.array is not None and self.offsets == "none":
+            start = self._row_sets(data, known, 1)[0]
+            data = self._calibrated(data, start, direct_path(start, self._transmitter()))
+            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
         if self.offsets != "none":
             data = self._without_offsets(data, known, searching)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
@@ -143,6 +157,21 @@ class ImageSourceGP(FramedMethod):
         row_sets = self._row_sets(data, known, self.searches)
         found = self._search(row_sets, self.settings, searching, self.clutter, cache)
         budget.limited |= searching.limited
+        if held.array is not None and self.offsets == "none":
+            more = self._calibrated(data, row_sets[0], found[0].phased.scene)
+            if more is not data:
+                data, row_sets = more, self._row_sets(more, known, self.searches)
+                held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+                found = [
+                    refined(rows, member, self.noise_floor)
+                    for rows, member in zip(row_sets, found, strict=False)
+                ]
+            if (self.factors != 1).any():
+                turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
+                notes.append(
+                    f"{self.name}: factors of the {self.antennas} antennas estimated, "
+                    f"phases up to {turned:.0f} degrees from the first's"
+                )
         if self.look_for_edges and not at_noise_floor([found[0].left_out], self.noise_floor, least=1):
             found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
@@ -170,6 +199,14 @@ class ImageSourceGP(FramedMethod):
             notes.append(f"{self.name}: clutter: {these}")
         limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
+
+    def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
+        """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
+        factors = element_factors(rows, scene, self.noise_floor)
+        if factors is None:
+            return data
+        self.factors = self.factors * factors
+        return replace(data, target=data.target * factors.numpy()[:, None])
 
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
@@ -276,7 +313,7 @@ class ImageSourceGP(FramedMethod):
             stack = stack + self.edges.over_band(flat[:, :3], tones, self._static_ends(flat))
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        return self._prediction(self._stored(mean, tones), variance, prior)
+        return self._prediction(self._stored(mean, tones) / self.factors[:, None], variance, prior)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums: one per source of every search, with the search's weight, and edges.
@@ -303,7 +340,8 @@ class ImageSourceGP(FramedMethod):
             # elements differ in diffraction points: their mean
             met = met.view(count, -1, len(self.edges), 3).mean(1)
             towards = torch.cat([towards, met - middle[:, None]], 1)
-        return self._stored_paths(gain.movedim(0, -1), away, towards)
+        gains, *rest = self._stored_paths(gain.movedim(0, -1), away, towards)
+        return gains / self.factors[:, None], *rest
 
     def _static_ends(self, flat: Tensor) -> Tensor:
         """The static end (3,), or the antenna (m, 3) of each of queries (m, 6)."""
@@ -360,6 +398,7 @@ class ImageSourceGP(FramedMethod):
             **self._frame_state(self.members[0].rows),
             "weights": self.weights,
             "noise_floor": self.noise_floor,
+            "factors": self.factors,
             "edges": [*vars(self.edges).values()],
             "scenes": [member.phased.state() for member in self.members],
         }
@@ -368,6 +407,8 @@ class ImageSourceGP(FramedMethod):
         """See `Method.restore`."""
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
+        ones = torch.ones(self.antennas, dtype=torch.complex64)  # models of earlier versions have none
+        self.factors = state.get("factors", ones)
         self.edges = Edges(*state["edges"]) if "edges" in state else Edges.none()
         scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
         self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]

@@ -80,6 +80,7 @@ def fitted(tmp_path_factory):
 def test_four_antennas_at_a_hundred_places(fitted):
     method, data, fold = fitted
     assert _error(method, data, fold.test) < 0.02
+    assert (method.factors == 1).all()
     true = [CENTRE]
     for _, (axis, wall) in WALLS[1:]:
         image = CENTRE.copy()
@@ -191,6 +192,19 @@ def test_rotated_array_and_tones(tmp_path):
     turned = replace(data, rx_rotation=np.where(rows == 3, np.eye(3), data.rx_rotation))
     with pytest.raises(ValueError, match="row 3: the static receiver of 2 antennas is turned"):
         method.fit(turned, fold, FitContext(tmp_path))
+
+
+def test_antennas_with_phases_of_their_own(tmp_path):
+    """Cables of unknown length: no source was found."""
+    data, fold = _uplink(100)
+    factors = np.array([1.0, 0.8 * np.exp(2.0j), 1.2 * np.exp(-1.0j), np.exp(0.5j)])
+    turned = replace(data, target=(data.target * factors[:, None]).astype(np.complex64))
+    method = ImageSourceGP(**QUICK)
+    report = method.fit(turned, fold, FitContext(tmp_path))
+    assert _error(method, turned, fold.test) < 0.02
+    left = method.factors.numpy() * factors
+    assert np.allclose(left, left[0], rtol=0.05)
+    assert any("factors of the 4 antennas" in note for note in report.notes)
 
 
 def test_antennas_of_unknown_places_are_outputs_of_their_own():
