@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import Factor, steering
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.worker import ask
 from gsparc.physics.waves import LIGHT, NEAR_M
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
@@ -32,8 +33,15 @@ class Detections:
     amplitude: Tensor
 
 
+# Positions (m, 3) of sources to those of their antennas (E, m, 3) [m].
+Spread = Callable[[Tensor], Tensor]
+
+
 def score(rows: Rows, candidates: Tensor, factor: Factor) -> tuple[Tensor, Tensor]:
-    """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have."""
+    """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
+
+    Where the static end has E antennas, candidates are the images of each, (E, m, 3).
+    """
     return score_waves(steering(rows, candidates), factor)
 
 
@@ -46,22 +54,34 @@ def score_waves(waves: Tensor, factor: Factor) -> tuple[Tensor, Tensor]:
 
 
 def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
-    """`|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building."""
+    """`|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building.
+
+    Candidates are (m, 3), or (E, m, 3) as in `score`.
+    """
     middle = rows.position.mean(0)
-    places, points = (rows.position - middle).float(), (candidates - middle).float()
-    length = places.square().sum(1)
     per_metre = (rows.frequency / LIGHT).float()
-    real, imag = alpha.real.contiguous(), alpha.imag.contiguous()
+    if rows.element is None:
+        parts = [(slice(None), candidates)]
+    else:
+        parts = [(torch.nonzero(rows.element == e).flatten(), each) for e, each in enumerate(candidates)]
     scores = []
-    for block in points.split(BLOCK):
-        squared = torch.addmm(length, block, places.T, alpha=-2).add_(block.square().sum(1)[:, None])
-        distance = squared.clamp_min_(NEAR_M**2).sqrt_()
-        cycles = distance * per_metre
-        phase = cycles.sub_(cycles.round()).mul_(2 * math.pi)
-        loss = distance.reciprocal_()
-        cosine, sine = phase.cos().mul_(loss), phase.sin_().mul_(loss)
-        matched = (cosine @ real - sine @ imag).square() + (cosine @ imag + sine @ real).square()
-        scores.append(matched.sum(1) / loss.square_().sum(1))
+    for start in range(0, candidates.shape[-2], BLOCK):
+        ask()
+        real, imag, power = 0.0, 0.0, 0.0
+        for mine, points in parts:
+            block = (points[start : start + BLOCK] - middle).float()
+            places = (rows.position[mine] - middle).float()
+            squared = torch.addmm(places.square().sum(1), block, places.T, alpha=-2)
+            distance = squared.add_(block.square().sum(1)[:, None]).clamp_min_(NEAR_M**2).sqrt_()
+            cycles = distance * per_metre[mine]
+            phase = cycles.sub_(cycles.round()).mul_(2 * math.pi)
+            loss = distance.reciprocal_()
+            cosine, sine = phase.cos().mul_(loss), phase.sin_().mul_(loss)
+            here, across = alpha.real[mine], alpha.imag[mine]
+            real = real + cosine @ here - sine @ across
+            imag = imag + cosine @ across + sine @ here
+            power = power + loss.square_().sum(1)
+        scores.append((real.square() + imag.square()).sum(1) / power)
     return torch.cat(scores)
 
 
@@ -92,17 +112,21 @@ def search_box(
     limit: int,
     generator: torch.Generator,
     effort: Effort = Effort(),
+    spread: Spread = lambda points: points,
 ) -> Detections:
-    """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart."""
+    """The best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
+
+    `spread` gives the images of the static end's antennas, as `score` takes them.
+    """
     drawn = torch.rand(effort.candidates, 3, generator=generator, dtype=torch.float64)
     candidates = box[0] + (box[1] - box[0]) * drawn
-    rough = quick_score(rows, candidates, factor.alpha)
+    rough = quick_score(rows, spread(candidates), factor.alpha)
     candidates = candidates[rough.topk(min(effort.exact, len(rough))).indices]
-    exact = torch.cat([score(rows, part, factor)[0] for part in candidates.split(512)])
+    exact = torch.cat([score(rows, spread(part), factor)[0] for part in candidates.split(512)])
     best = candidates[exact.topk(min(effort.polished, len(exact))).indices]
     rates = [effort.step_m * (1 - 0.8 * step / effort.steps) for step in range(effort.steps)]
-    (polished,) = ascend([best], lambda position: score(rows, position, factor)[0], rates)
-    scores, amplitude = score(rows, polished, factor)
+    (polished,) = ascend([best], lambda position: score(rows, spread(position), factor)[0], rates)
+    scores, amplitude = score(rows, spread(polished), factor)
     chosen = pick_apart(polished, scores, min_distance, limit)
     return Detections(polished[chosen], scores[chosen], amplitude[chosen])
 
@@ -112,6 +136,7 @@ def ascend(values: list[Tensor], scores: Callable[..., Tensor], rates: list[floa
     leaves = [value.clone().requires_grad_() for value in values]
     optimizer = torch.optim.Adam(leaves, betas=(0.8, 0.95))
     for rate in rates:
+        ask()
         optimizer.param_groups[0]["lr"] = rate
         optimizer.zero_grad()
         (-scores(*leaves).log().sum()).backward()

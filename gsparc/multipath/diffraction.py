@@ -17,7 +17,7 @@ from torch.nn.functional import normalize
 
 from gsparc.multipath.backprojection import ascend, score_waves
 from gsparc.multipath.gp_likelihood import Factor, Posterior, Scene
-from gsparc.multipath.refine import refine
+from gsparc.multipath.refine import Late, never, refine
 from gsparc.multipath.rows import Rows
 from gsparc.physics.waves import NEAR_M, reduced_phase
 
@@ -53,7 +53,10 @@ class Edges:
         return len(self.point)
 
     def field(self, places: Tensor, frequency_hz: Tensor, transmitter: Tensor) -> Tensor:
-        """Field of the edges (n, R) complex64 at places (n, 3) [m] and frequencies (n,) [Hz]."""
+        """Field of the edges (n, R) complex64 at places (n, 3) [m] and frequencies (n,) [Hz].
+
+        `transmitter` is (3,), or (n, 3) for each place.
+        """
         if not len(self):
             return torch.zeros(len(places), 1, dtype=torch.complex64)
         return edge_wave(places, self.point, self.axis, transmitter, frequency_hz) @ self.gain
@@ -74,7 +77,7 @@ def diffracted(places: Tensor, edges: Edges, transmitter: Tensor) -> tuple[Tenso
 def _unfolded(places: Tensor, point: Tensor, axis: Tensor, transmitter: Tensor) -> tuple[Tensor, ...]:
     """Length of the straight line, distance of the place and of both ends from the edge, and along it."""
     along_rx, across_rx = _cylindrical(places, point, axis)
-    along_tx, across_tx = _cylindrical(transmitter[None], point, axis)
+    along_tx, across_tx = _cylindrical(transmitter.reshape(-1, 3), point, axis)
     across = across_rx + across_tx
     length = ((along_rx - along_tx).square() + across.square() + NEAR_M**2).sqrt()
     return length, across_rx, across, along_rx, along_tx
@@ -95,7 +98,7 @@ def edge_wave(
     Args:
         places: (n, 3) float64 [m].
         point, axis: (K, 3) float64 of the edges.
-        transmitter: (3,) float64 [m].
+        transmitter: (3,) float64 [m], or (n, 3) for each place.
         frequency_hz: (n,) float64 [Hz].
     """
     length, across_rx, across = _unfolded(places, point, axis, transmitter)[:3]
@@ -118,7 +121,8 @@ def propose(
     """
 
     def waves(point: Tensor, axis: Tensor) -> Tensor:
-        return edge_wave(rows.position, point, axis, transmitter, rows.frequency)
+        static = rows.static_end_of_each(transmitter)
+        return edge_wave(rows.position, point, axis, static, rows.frequency)
 
     def scores(point: Tensor, axis: Tensor) -> Tensor:
         return score_waves(waves(point, normalize(axis, dim=1)), factor)[0]
@@ -144,7 +148,7 @@ def propose(
 
 
 def find_edges(
-    rows: Rows, scene: Scene, box: Tensor, generator: torch.Generator, noise_floor: float
+    rows: Rows, scene: Scene, box: Tensor, generator: torch.Generator, noise_floor: float, late: Late = never
 ) -> Edges:
     """Edges one by one, as long as the marginal likelihood accepts another; sources are refined in between.
 
@@ -154,9 +158,10 @@ def find_edges(
         box: (2, 3) float64 [m] where edges may pass.
         generator: of the candidates.
         noise_floor: known variance of the noise, in units of the rows' power.
+        late: asked before each; no more are looked for when it says so.
     """
     edges, residual = Edges.none(), rows
-    while len(edges) < MOST:
+    while len(edges) < MOST and not late():
         factor = Posterior(residual, scene, noise_floor).factor
         found = propose(residual, factor, scene.transmitter, box, generator)
         if found is None:
@@ -170,13 +175,15 @@ def find_edges(
 
 def subtract_edges(rows: Rows, edges: Edges, transmitter: Tensor) -> Rows:
     """The rows minus the field of the edges."""
-    return replace(rows, target=rows.target - edges.field(rows.position, rows.frequency, transmitter))
+    static = rows.static_end_of_each(transmitter)
+    return replace(rows, target=rows.target - edges.field(rows.position, rows.frequency, static))
 
 
 def fit_edge_gains(rows: Rows, point: Tensor, axis: Tensor, scene: Scene, noise_floor: float) -> Edges:
     """Gains by generalised least squares beside the scene's sources: `(W^H K^-1 W)^-1 W^H K^-1 y`."""
     factor = Posterior(rows, scene, noise_floor).factor
-    waves = edge_wave(rows.position, point, axis, scene.transmitter, rows.frequency)
+    static = rows.static_end_of_each(scene.transmitter)
+    waves = edge_wave(rows.position, point, axis, static, rows.frequency)
     white = factor.root @ waves
     gram = white.mH @ white
     gram.diagonal().add_(1e-6 * gram.diagonal().real.mean())

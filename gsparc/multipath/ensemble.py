@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from functools import partial
 
 import torch
@@ -17,13 +18,18 @@ from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.search import Search, SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
+from gsparc.multipath.worker import Ended, ended_by
 
 log = logging.getLogger(__name__)
 
 QUADRATURE = 0.4  # initial `PhasedScene.quadrature`
 SHARPNESS = 4  # weight of a search = (leave-one-out error)^-4: 1.5 times the error weighs a fifth
 CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
-LAST_START, ROUNDS_END = 0.6, 0.8  # of the budget: no search starts, no search adds sources after
+# Of the budget: no search starts, none adds sources, none goes on after; the rest is for the final process.
+LAST_START, ROUNDS_END, SEARCH_END = 0.6, 0.8, 0.9
+FINAL_SHARE = 0.1  # least share of the budget for the final process
+PROGRESS_S = 10.0  # [s] between two words about progress
+COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
 def search_many(
@@ -39,7 +45,7 @@ def search_many(
 ) -> list[Member]:
     """One search per set of rows, best first; at least one, others while the budget lasts.
 
-    No further search starts once two have reached the noise floor.
+    Once two have reached the noise floor no further search starts, and those under way end without a result.
 
     Args:
         row_sets: rows of each search, unit mean power, about the middle of the scene.
@@ -47,52 +53,129 @@ def search_many(
         settings: of every search.
         seed: of the first search; the others count on.
         noise_floor: known variance of the noise, in units of the rows' power.
-        budget: of all together; see `LAST_START` and `ROUNDS_END`.
+        budget: of all together; see `LAST_START`, `ROUNDS_END` and `SEARCH_END`.
         clutter: search for occluding boxes and finite mirrors, too.
         cache: of finished searches, under the name of `stage`.
         stage: distinguishes searches of one fit.
+
+    Raises:
+        KeyboardInterrupt: by the user, within a step of each search.
     """
-    threads = torch.get_num_threads()
     errors: list[float] = []
+    stopped = threading.Event()
+
+    def unwanted() -> bool:
+        return stopped.is_set() or at_noise_floor(errors, noise_floor)
 
     def search(number: int) -> Member | None:
         if done := cache.find(f"{stage} {number}"):
+            errors.append(done.left_out)
             return done
-        if at_noise_floor(errors, noise_floor) or (number > 0 and budget.over(LAST_START)):
+        if unwanted() or (number > 0 and budget.over(LAST_START)):
             return None
-        rows = row_sets[number]
-        scene = Search(rows, transmitter, settings, seed + number, partial(budget.over, ROUNDS_END)).run()
-        phased = PhasedScene.of(rows, scene, QUADRATURE)
-        phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor)
-        phased = refine_phase.refine(rows, phased, 20, noise_floor)
-        if clutter and phased.quadrature < 1:
-            generator = torch.Generator().manual_seed(seed + number)
-            phased = find_clutter(rows, phased, generator, late=budget.over, noise_floor=noise_floor)
-        error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
-        left_out = float(error.abs().square().sum() / rows.target.abs().square().sum())
+        try:
+            with ended_by(unwanted):
+                member = _search(
+                    row_sets[number], transmitter, settings, seed + number, noise_floor, budget, clutter
+                )
+        except Ended:
+            return None
+        scene = member.phased.scene
         log.info(
             "search %d of %d: %d sources over %d planes, error %.3f, %.0f of %.0f s",
-            number + 1, len(row_sets), len(scene.words), len(scene.planes), left_out,
+            number + 1, len(row_sets), len(scene.words), len(scene.planes), member.left_out,
             budget.spent, budget.seconds,
         )  # fmt: skip
-        member = Member(phased, left_out)
-        errors.append(left_out)
+        errors.append(member.left_out)
         cache.put(f"{stage} {number}", member, budget.limited_by)
         return member
 
+    threads = torch.get_num_threads()
     # Parallel searches scale better than threaded factorisations of a few hundred rows.
     torch.set_num_threads(1)
+    pool = ThreadPoolExecutor(max(1, min(threads, len(row_sets))))
     try:
-        with ThreadPoolExecutor(max(1, min(threads, len(row_sets)))) as pool:
-            found = [member for member in pool.map(search, range(len(row_sets))) if member is not None]
+        running = [pool.submit(search, number) for number in range(len(row_sets))]
+        _watch(running, budget)
+        found = [member for each in running if (member := each.result()) is not None]
     finally:
+        stopped.set()
+        pool.shutdown(cancel_futures=True)  # waits for the step of each search
         torch.set_num_threads(threads)
     return sorted(found, key=lambda member: member.left_out)
 
 
-def at_noise_floor(left_out: Sequence[float], noise_floor: float) -> bool:
-    """Whether two searches have reached the noise floor."""
-    return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) > 1
+def _watch(running: list[Future[Member | None]], budget: TimeBudget) -> None:
+    """Wait for the searches; say every `PROGRESS_S` how long they may still take."""
+    waiting = set(running)
+    while waiting:
+        done, waiting = wait(waiting, PROGRESS_S, FIRST_EXCEPTION)
+        if any(each.exception() for each in done):
+            return
+        if waiting:
+            finished = sum(each.done() and each.result() is not None for each in running)
+            left = max(SEARCH_END * budget.seconds - budget.spent, 0.0)
+            log.info(
+                "%d of %d searches finished, %.0f of %.0f s, at most about %.0f s left",
+                finished, len(running), budget.spent, budget.seconds, left,
+            )  # fmt: skip
+
+
+def _search(
+    rows: Rows,
+    transmitter: Tensor,
+    settings: SearchSettings,
+    seed: int,
+    noise_floor: float,
+    budget: TimeBudget,
+    clutter: bool,
+) -> Member:
+    """One search, its phases, and the clutter that the noise does not hide."""
+    over = partial(budget.over, SEARCH_END)
+    scene = Search(rows, transmitter, settings, seed, partial(budget.over, ROUNDS_END), over).run()
+    phased = PhasedScene.of(rows, scene, QUADRATURE)
+    phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor, over)
+    phased = refine_phase.refine(rows, phased, 20, noise_floor, late=over)
+    error = _left_out(rows, phased, noise_floor)
+    if clutter and phased.quadrature < 1 and not at_noise_floor([error], noise_floor, 1) and _compact(rows):
+        generator = torch.Generator().manual_seed(seed)
+        phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
+        error = _left_out(rows, phased, noise_floor)
+    return Member(phased, error)
+
+
+def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
+    """A search's result on rows that have changed a little."""
+    phased = refine_phase.refine(rows, member.phased, 20, noise_floor)
+    return Member(phased, _left_out(rows, phased, noise_floor))
+
+
+def _left_out(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:
+    """NMSE of the rows, each receiver predicted from the others."""
+    error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
+    return float(error.abs().square().sum() / rows.target.abs().square().sum())
+
+
+def _compact(rows: Rows) -> bool:
+    """Whether the static end's antennas are near enough to be occluded alike."""
+    return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
+
+
+def at_noise_floor(left_out: Sequence[float], noise_floor: float, least: int = 2) -> bool:
+    """Whether `least` searches have reached the noise floor."""
+    return sum(error < max(CONVERGED_ERROR, 2 * noise_floor) for error in left_out) >= least
+
+
+def affordable_rows(rows: Rows, found: list[Member], noise_floor: float, budget: TimeBudget) -> int:
+    """Rows of final processes that fit into the rest of the budget; all of one search at least.
+
+    A covariance of n rows takes n^3; that of a search's rows is timed.
+    """
+    started = budget.spent
+    assert PhasedPosterior(rows, found[0].phased, noise_floor).factor
+    each = max(budget.spent - started, 1e-6)
+    rest = max(budget.seconds - budget.spent, FINAL_SHARE * budget.seconds)
+    return max(int(len(rows) * (rest / (each * len(found))) ** (1 / 3)), len(rows))
 
 
 def ensemble_weights(members: list[Member]) -> Tensor:

@@ -6,14 +6,17 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.schema import Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.methods.method import LeftOut, Prediction, PredictsVariance
-from gsparc.multipath.rows import Rows, query_elements
+from gsparc.multipath.rows import Rows, query_elements, static_array
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
+
+SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,20 @@ class FramedMethod(PredictsVariance):
         return self.site
 
     def _places(self, tx: Tensor, rx: Pose) -> tuple[Tensor, int]:
-        """Antennas of the moving end (B E, 3) float64 in the frame, and B."""
+        """Antennas of the moving end (B E, 3) float64 in the frame, and B.
+
+        With E antennas of the static end (B E, 6): see `Rows.places`.
+        """
         site = self._fitted()
         if site.moving_end == "rx":
             places = query_elements(site, rx, len(tx), self.antennas)
-        else:
-            places = tx.cpu().double()[:, None]
-        return places.reshape(-1, 3) - self.frame.middle, len(places)
+            return places.reshape(-1, 3) - self.frame.middle, len(places)
+        places = tx.cpu().double() - self.frame.middle
+        array = static_array(site, self.antennas)
+        if array is None:
+            return places, len(places)
+        each = torch.repeat_interleave(places, len(array), 0)
+        return torch.cat([each, torch.from_numpy(array).repeat(len(places), 1)], 1), len(places)
 
     def _stored(self, mean: Tensor, tones: Tensor) -> Tensor:
         """Channels (B, A, K) in stored units, of normalised ones (B E, R, K)."""
@@ -113,13 +123,23 @@ def frame_of(site: Site, rows: Rows) -> Frame:
     return Frame(rows.position.mean(0), max(math.sqrt(float(power)), 1e-30), carrier)
 
 
-def refuse(site: Site, name: str, antennas: int = 1) -> None:
+def refuse(site: Site, name: str) -> None:
     """`ValueError`, in the name of a method, for data that sources with carrier phase cannot explain."""
     if site.kind != "csi":
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
         raise ValueError(f"{name}: {site.name} does not say where its static end is; take model=complex_gp")
-    if site.static_end == "rx" and antennas > 1:
+
+
+def refuse_turning(data: Measurements) -> None:
+    """`ValueError` where a static receiver of several antennas turns between measurements."""
+    antennas = data.target.shape[1]
+    if static_array(data.site, antennas) is None:
+        return
+    turned = np.abs(data.rx_rotation - data.rx_rotation[:1]).max(axis=(1, 2)) > SAME_ROTATION
+    if turned.any():
+        row = int(np.flatnonzero(turned)[0])
         raise ValueError(
-            f"{name}: in {site.name} the transmitter moves before {antennas} antennas; take one of them"
+            f"{data.site.name}: row {row}: the static receiver of {antennas} antennas is turned otherwise "
+            "than in row 0; give the rows of each rotation as a file of their own"
         )

@@ -63,9 +63,17 @@ class Scene:
             return torch.ones(1, 1)
         return visible_share(self.unfolding.paths(places), self.clutter, self.planes).T
 
+    def images(self, rows: Rows) -> Tensor:
+        """Images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
+        return images(rows.static_ends(self.transmitter), self.planes, self.words)
+
+    def unobstructed(self, rows: Rows) -> Tensor:
+        """Waves (n, K) complex64 of the sources at every row, without clutter."""
+        return steering(rows, self.images(rows))
+
     def waves(self, rows: Rows) -> Tensor:
-        """Waves (n, K) complex64 of the sources at every row, attenuated by clutter."""
-        return steering(rows, self.sources) * self.visible_share(rows.position)
+        """The same, attenuated by clutter."""
+        return self.unobstructed(rows) * self.visible_share(rows.position)
 
     def with_words(self, words: list[Word], amplitude: Tensor) -> Scene:
         """More sources, with amplitudes (k,)."""
@@ -88,13 +96,25 @@ class Scene:
 
 
 def steering(rows: Rows, sources: Tensor) -> Tensor:
-    """Spherical waves (n, K) complex64 of sources (K, 3) float64 [m] at every row."""
+    """Spherical waves (n, K) complex64 of sources at every row.
+
+    Args:
+        rows: n of them.
+        sources: (K, 3) float64 [m], or (E, K, 3) when the rows are of E antennas of the static end.
+
+    Raises:
+        ValueError: the images of the antennas are missing.
+    """
+    if rows.element is not None:
+        if sources.dim() != 3:
+            raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
+        sources = sources.index_select(0, rows.element)  # (n, K, 3)
     return wave(ranges(rows.position, sources), rows.frequency[:, None])
 
 
 def correlations(rows: Rows, sources: Tensor, kernel: KernelVisibility) -> Tensor:
     """Visibility correlations (K, n, n) float32."""
-    return torch.stack([kernel.correlation(rows.position, source) for source in sources])
+    return torch.stack([kernel.correlation(rows.places, source) for source in sources])
 
 
 def add_covariance(real: Tensor, imag: Tensor, scaled: Tensor, correlation: Tensor) -> None:
@@ -170,7 +190,7 @@ class Posterior:
         real, imag = torch.zeros(n, n), torch.zeros(n, n)
         scaled = self.waves * self.scene.log_amplitude.exp()
         for k, source in enumerate(self.scene.sources):
-            correlation = self.scene.visibility.correlation(self.rows.position, source)
+            correlation = self.scene.visibility.correlation(self.rows.places, source)
             add_covariance(real, imag, scaled[:, k], correlation)
         real.diagonal().add_(torch.tensor(self.scene.log_noise).exp() + self.noise_floor)
         return torch.complex(real, imag)
@@ -190,6 +210,6 @@ class Posterior:
         scaled = self.waves[:, k] * self.scene.log_amplitude[k].exp()
         n = len(self.rows)
         real, imag = torch.zeros(n, n), torch.zeros(n, n)
-        correlation = self.scene.visibility.correlation(self.rows.position, self.scene.sources[k])
+        correlation = self.scene.visibility.correlation(self.rows.places, self.scene.sources[k])
         add_covariance(real, imag, scaled, correlation)
         return Factor.of(self.covariance - torch.complex(real, imag), self.rows.target).nll

@@ -7,6 +7,7 @@ import logging
 import math
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -28,31 +29,40 @@ from gsparc.multipath.diffraction import (
     fit_edge_gains,
     subtract_edges,
 )
-from gsparc.multipath.ensemble import at_noise_floor, ensemble_weights, search_many
-from gsparc.multipath.frame import FramedMethod, frame_of, refuse
+from gsparc.multipath.element_factors import direct_path, element_factors
+from gsparc.multipath.ensemble import (
+    affordable_rows,
+    at_noise_floor,
+    ensemble_weights,
+    refined,
+    search_many,
+)
+from gsparc.multipath.frame import FramedMethod, frame_of, refuse, refuse_turning
+from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.query import MeanQuery, Query
-from gsparc.multipath.rows import Rows, elements, gather
+from gsparc.multipath.rows import Rows, gather, measured_places, ranges_at
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
 from gsparc.multipath.source_types import SourceKind, box_of, kinds
 from gsparc.ops import Pose
-from gsparc.physics.waves import ranges, wave, wave_over_band
+from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.waves import wave, wave_over_band
 
 log = logging.getLogger(__name__)
 
 SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
 MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
 MAX_EDGE_ERROR = 0.8  # leave-one-out error with edges over that without, above which edges are dropped
-EDGE_BUDGET = 0.2  # least share of the budget for the search with edges
+EDGE_BUDGET = 0.2  # share of the budget kept for edges and the search beside them
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
 
 
 class ImageSourceGP(FramedMethod):
-    """Image-source Gaussian process for a moving receiver, or a moving transmitter and one antenna.
+    """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:
         searches: how many, with different seeds; their predictions are averaged.
@@ -64,6 +74,8 @@ class ImageSourceGP(FramedMethod):
         clutter: search for occluding boxes and finite mirrors, shared by all sources.
         edges: search for diffracting edges; kept when the likelihood gains.
         seed: of everything random.
+
+    Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
 
     Raises:
         ValueError: the data are not channels, or their phase means nothing.
@@ -102,29 +114,72 @@ class ImageSourceGP(FramedMethod):
 
     # ---- fitting ----
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Search on `train` and `val` together: the number of sources is chosen by likelihood."""
-        refuse(data.site, self.name, data.target.shape[1])
+        """Search on `train` and `val` together: the number of sources is chosen by likelihood.
+
+        Raises:
+            ValueError: the data are not channels, or their phase means nothing.
+            KeyboardInterrupt: by the user; the message names the file to go on from.
+        """
+        refuse(data.site, self.name)
+        refuse_turning(data)
         known = np.concatenate([fold.train, fold.val])
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
+        try:
+            return self._fit(data, known, context, cache)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(cache.interrupted()) from None
+
+    def _fit(
+        self, data: Measurements, known: np.ndarray, context: FitContext, cache: SearchCache
+    ) -> FitReport:
         budget = context.time_budget(self._budget(len(known), context.budget_s), cache.spent)
+        searching = budget
+        if self.look_for_edges:
+            searching = context.time_budget((1 - EDGE_BUDGET) * budget.seconds, cache.spent)
         self.site, self.antennas = data.site, data.target.shape[1]
         everything = gather(data, known, self.row_limit, self.seed)
         self.frame = frame_of(data.site, everything)
         noise = None if data.noise_variance is None else float(np.mean(data.noise_variance[known]))
         self.noise_floor = max(1e-5, 0.0 if noise is None else noise / self.frame.scale**2)
         held = self.frame.inside(everything)
-        notes = []
+        notes: list[str] = []
+        self.factors = torch.ones(self.antennas, dtype=torch.complex64)
+        if held.array is not None and self.offsets == "none":
+            start = self._row_sets(data, known, 1)[0]
+            data = self._calibrated(data, start, direct_path(start, self._transmitter()))
+            held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
         if self.offsets != "none":
-            data = self._without_offsets(data, known, budget)
+            data = self._without_offsets(data, known, searching)
             held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
             notes.append(
                 f"{self.name}: {self.offsets} offset of every snapshot estimated; predictions have none"
             )
         row_sets = self._row_sets(data, known, self.searches)
-        found = self._search(row_sets, self.settings, budget, self.clutter, cache)
-        if self.look_for_edges:
+        found = self._search(row_sets, self.settings, searching, self.clutter, cache)
+        budget.limited |= searching.limited
+        if held.array is not None and self.offsets == "none":
+            more = self._calibrated(data, row_sets[0], found[0].phased.scene)
+            if more is not data:
+                data, row_sets = more, self._row_sets(more, known, self.searches)
+                held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
+                found = [
+                    refined(rows, member, self.noise_floor)
+                    for rows, member in zip(row_sets, found, strict=False)
+                ]
+            if (self.factors != 1).any():
+                turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
+                notes.append(
+                    f"{self.name}: factors of the {self.antennas} antennas estimated, "
+                    f"phases up to {turned:.0f} degrees from the first's"
+                )
+        if self.look_for_edges and not at_noise_floor([found[0].left_out], self.noise_floor, least=1):
             found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
+        affordable = affordable_rows(row_sets[0], found, self.noise_floor, budget)
+        if affordable < len(held):
+            budget.limited = True
+            notes.append(f"{self.name}: {affordable} of {len(held)} rows in the final process: time is short")
+            held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
@@ -144,6 +199,14 @@ class ImageSourceGP(FramedMethod):
             notes.append(f"{self.name}: clutter: {these}")
         limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
+
+    def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
+        """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
+        factors = element_factors(rows, scene, self.noise_floor)
+        if factors is None:
+            return data
+        self.factors = self.factors * factors
+        return replace(data, target=data.target * factors.numpy()[:, None])
 
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
@@ -171,12 +234,12 @@ class ImageSourceGP(FramedMethod):
         """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
         scene, rows = found[0].phased.scene, row_sets[0]
         transmitter, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
-        edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor)
+        late = partial(budget.over, 1 - EDGE_BUDGET / 2)
+        edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor, late)
         if not len(edges):
             return found, held
         log.info("%d edges; searching again on the residual", len(edges))
-        remaining = max(budget.seconds - budget.spent, EDGE_BUDGET * budget.seconds)
-        more = TimeBudget(remaining, budget.clock)
+        more = TimeBudget(max(budget.seconds - budget.spent, 0.0), budget.clock)
         row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
         with_edges = self._search(row_sets, self.settings, more, self.clutter, cache, "beside edges")
         budget.limited |= more.limited
@@ -198,7 +261,8 @@ class ImageSourceGP(FramedMethod):
 
     def _without_offsets(self, data: Measurements, known: np.ndarray, budget: TimeBudget) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
-        aligned = self._remove_offsets(data, known, self._transmitter()[None], torch.ones(1, self.antennas))
+        direct = Scene(self._transmitter(), torch.zeros(0, 4).double(), ((),), torch.zeros(1), 0.0)
+        aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(self.settings, max_sources=sources, final_steps=20)
             now = TimeBudget(ALIGNMENT_SHARE * budget.seconds, budget.clock)
@@ -208,17 +272,19 @@ class ImageSourceGP(FramedMethod):
             for _ in range(ALIGNMENT_ROUNDS):
                 rows = self._row_sets(aligned, known, 1)
                 gains = PhasedPosterior(rows[0], phased, self.noise_floor).mean_gains
-                aligned = self._remove_offsets(data, known, phased.scene.sources, gains)
+                aligned = self._remove_offsets(data, known, phased.scene, gains)
         return aligned
 
     def _remove_offsets(
-        self, data: Measurements, known: np.ndarray, sources: Tensor, gains: Tensor
+        self, data: Measurements, known: np.ndarray, scene: Scene, gains: Tensor
     ) -> Measurements:
-        """Targets of the known rows without their offsets against sources of constant gains."""
+        """Targets of the known rows without their offsets against a scene's sources of constant gains."""
         frequency = data.site.tones()
-        places = elements(data.site, data.moving[known], data.rx_rotation[known], self.antennas)
-        flat = torch.from_numpy(places.reshape(-1, 3).copy()) - self.frame.middle
-        waves = wave_over_band(ranges(flat, sources), torch.from_numpy(frequency))
+        places = torch.from_numpy(measured_places(data, known).copy())
+        places[..., :3] -= self.frame.middle
+        turned = orientations(scene.planes, scene.words)
+        away = ranges_at(places.flatten(0, 1), scene.sources, turned)
+        waves = wave_over_band(away, torch.from_numpy(frequency))
         if gains.shape[1] == 1 or places.shape[1] > 1:
             gains = gains[:, :1]
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
@@ -244,10 +310,10 @@ class ImageSourceGP(FramedMethod):
         stack, variance, prior = self.query.means(flat, tones)  # (members, B E, R, K)
         weight = self.weights[:, None, None, None]
         if len(self.edges):
-            stack = stack + self.edges.over_band(flat, tones, self.members[0].scene.transmitter)
+            stack = stack + self.edges.over_band(flat[:, :3], tones, self._static_ends(flat))
         mean = (weight * stack).sum(0)
         variance = variance + (weight * (stack - mean).abs().square()).sum(0).flatten(1).mean(1)
-        return self._prediction(self._stored(mean, tones), variance, prior)
+        return self._prediction(self._stored(mean, tones) / self.factors[:, None], variance, prior)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums: one per source of every search, with the search's weight, and edges.
@@ -258,22 +324,29 @@ class ImageSourceGP(FramedMethod):
             the carrier [Hz].
         """
         flat, count = self._places(tx, rx)
-        transmitter, carrier = self.members[0].scene.transmitter, self.frame.carrier_hz
-        middle = flat.view(count, -1, 3).mean(1)
+        carrier = self.frame.carrier_hz
+        middle = flat[:, :3].reshape(count, -1, 3).mean(1)
         weight = torch.repeat_interleave(self.weights, torch.tensor(self.query.counts))
-        away = ranges(flat, self.query.pack.sources)
+        away = self.query.pack.ranges(flat)
         gain = self.query.gains(flat) * weight[:, None, None] * wave(away, carrier).T[..., None]
         towards = self.query.pack.sources - middle[:, None]
         if len(self.edges):
-            length, met = diffracted(flat, self.edges, transmitter)
+            places, transmitter = flat[:, :3], self._static_ends(flat)
+            length, met = diffracted(places, self.edges, transmitter)
             hertz = torch.full((len(flat),), carrier, dtype=torch.float64)
-            waves = edge_wave(flat, self.edges.point, self.edges.axis, transmitter, hertz)
+            waves = edge_wave(places, self.edges.point, self.edges.axis, transmitter, hertz)
             gain = torch.cat([gain, waves.T[..., None] * self.edges.gain[:, None]])
             away = torch.cat([away, length], 1)
             # elements differ in diffraction points: their mean
             met = met.view(count, -1, len(self.edges), 3).mean(1)
             towards = torch.cat([towards, met - middle[:, None]], 1)
-        return self._stored_paths(gain.movedim(0, -1), away, towards)
+        gains, *rest = self._stored_paths(gain.movedim(0, -1), away, towards)
+        return gains / self.factors[:, None], *rest
+
+    def _static_ends(self, flat: Tensor) -> Tensor:
+        """The static end (3,), or the antenna (m, 3) of each of queries (m, 6)."""
+        transmitter = self.members[0].scene.transmitter
+        return transmitter if flat.shape[1] == 3 else transmitter + flat[:, 3:]
 
     def leave_one_out(self) -> LeftOut:
         """Residuals (n, R) of receivers (n,), each predicted from all others; see `LeaveOneOut`."""
@@ -325,6 +398,7 @@ class ImageSourceGP(FramedMethod):
             **self._frame_state(self.members[0].rows),
             "weights": self.weights,
             "noise_floor": self.noise_floor,
+            "factors": self.factors,
             "edges": [*vars(self.edges).values()],
             "scenes": [member.phased.state() for member in self.members],
         }
@@ -333,6 +407,8 @@ class ImageSourceGP(FramedMethod):
         """See `Method.restore`."""
         rows = self._restore_frame(site, state)
         self.noise_floor, self.weights = float(state["noise_floor"]), state["weights"]
+        ones = torch.ones(self.antennas, dtype=torch.complex64)  # models of earlier versions have none
+        self.factors = state.get("factors", ones)
         self.edges = Edges(*state["edges"]) if "edges" in state else Edges.none()
         scenes = [PhasedScene.from_state(stored) for stored in state["scenes"]]
         self.members = [PhasedPosterior(rows, scene, self.noise_floor) for scene in scenes]

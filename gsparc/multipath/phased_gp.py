@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter
-from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene, steering
+from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
@@ -82,7 +82,7 @@ class PhasedScene:
 
     def unobstructed(self, rows: Rows) -> Tensor:
         """The same without clutter."""
-        return steering(rows, self.scene.sources) * torch.polar(torch.ones(()), self.phase)
+        return self.scene.unobstructed(rows) * torch.polar(torch.ones(()), self.phase)
 
 
 def stacked(waves: Tensor) -> tuple[Tensor, Tensor]:
@@ -163,7 +163,7 @@ class PhasedPosterior:
         covariance = torch.zeros(2, n, 2, n)
         for k, source in enumerate(scene.sources):
             scaled = self.waves[:, k] * scene.log_amplitude[k].exp()
-            correlation = scene.visibility.correlation(self.rows.position, source)
+            correlation = scene.visibility.correlation(self.rows.places, source)
             add_source(covariance, scaled, self.phased.quadrature, correlation)
         noise = math.exp(scene.log_noise) + self.noise_floor
         covariance.view(2 * n, 2 * n).diagonal().add_(noise / 2)

@@ -12,9 +12,10 @@ from gsparc.multipath.clutter.blocking import Obstacles
 from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, shares, stacked
-from gsparc.multipath.rows import Rows
+from gsparc.multipath.rows import ranges_at
 from gsparc.multipath.visibility_kernel import directions, matern32
-from gsparc.physics.waves import ranges, wave_over_band
+from gsparc.physics.mirror_planes import orientations
+from gsparc.physics.waves import wave, wave_over_band
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 
@@ -26,7 +27,8 @@ class PackedSources:
     Attributes:
         sources: (K, 3) float64 [m].
         kernel: (K, 3) float32: constant, 1 / angle^2, 1 / length^2 of each source's visibility.
-        places: (n, 3) float64 [m].
+        places: (n, 3) float64 [m], or (n, 6) with the static end's antennas; see `Rows.places`.
+        orientations: (K, 3, 3) float64, how antennas of the static end are turned about each source.
         directions: (K, n, 3) float32, unit vectors from source to place.
         unfolding, obstacles: paths of the K sources and what occludes them; None without clutter.
     """
@@ -34,6 +36,7 @@ class PackedSources:
     sources: Tensor
     kernel: Tensor
     places: Tensor
+    orientations: Tensor
     directions: Tensor
     unfolding: Unfolding | None
     obstacles: Obstacles | None
@@ -43,7 +46,9 @@ class PackedSources:
         """All sources of the scenes, in order."""
         sources = torch.cat([scene.sources for scene in scenes])
         kernels = torch.cat([_kernel_parameters(scene) for scene in scenes])
-        packed = PackedSources(sources, kernels, places, directions(places, sources), None, None)
+        turned = torch.cat([orientations(scene.planes, scene.words) for scene in scenes])
+        away = directions(places[:, :3], sources)
+        packed = PackedSources(sources, kernels, places, turned, away, None, None)
         if not any(len(scene.clutter) for scene in scenes):
             return packed
         first = torch.tensor([0] + [len(scene.planes) for scene in scenes]).cumsum(0).tolist()
@@ -54,14 +59,18 @@ class PackedSources:
         return replace(packed, unfolding=unfolding, obstacles=obstacles)
 
     def visible_share(self, queries: Tensor) -> Tensor:
-        """Visible share of each source from queries (m, 3) [m]: (K, m), or (1, 1) for all."""
+        """Visible share of each source from queries (m, 3 or 6) [m]: (K, m), or (1, 1) for all."""
         if self.unfolding is None or self.obstacles is None:
             return torch.ones(1, 1)
-        return self.obstacles.visible_share(self.unfolding.paths(queries))
+        return self.obstacles.visible_share(self.unfolding.paths(queries[:, :3]))
+
+    def ranges(self, queries: Tensor) -> Tensor:
+        """Ranges (m, K) float64 [m] of each source, or of its image of the antenna of queries (m, 6)."""
+        return ranges_at(queries, self.sources, self.orientations)
 
     def correlation(self, queries: Tensor) -> Tensor:
-        """Visibility correlations (K, m, n) between queries (m, 3) float64 [m] and the places."""
-        cosine = torch.bmm(directions(queries, self.sources), self.directions.mT)
+        """Visibility correlations (K, m, n) between queries (m, 3 or 6) float64 [m] and the places."""
+        cosine = torch.bmm(directions(queries[:, :3], self.sources), self.directions.mT)
         constant, by_angle, by_length = (self.kernel[:, i, None, None] for i in range(3))
         apart = torch.cdist(queries, self.places).square().float()
         squared = (2 - 2 * cosine).clamp_min(0) * by_angle + apart * by_length
@@ -78,7 +87,7 @@ class Query:
 
     def __init__(self, members: list[PhasedPosterior], variance_rows: int = 350) -> None:
         rows, scenes = members[0].rows, [member.scene for member in members]
-        places, self.place_of = torch.unique(rows.position, dim=0, return_inverse=True)
+        places, self.place_of = torch.unique(rows.places, dim=0, return_inverse=True)
         self.pack = PackedSources.of(scenes, places)
         self.counts = [len(scene.words) for scene in scenes]
         dual_weights = [member.dual_weights for member in members]
@@ -95,7 +104,7 @@ class Query:
         self.root = self.first.factor.root
 
     def means(self, queries: Tensor, tones: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Means (M, m, R, F) at queries (m, 3) [m] and tones (F,) [Hz], variance (m,), prior (m,).
+        """Means (M, m, R, F) at queries (m, 3 or 6) [m] and tones (F,) [Hz], variance (m,), prior (m,).
 
         Variance and the power expected without any rows hold at the middle of the band.
         """
@@ -103,11 +112,13 @@ class Query:
         middle = tones[len(tones) // 2]
         for part in queries.split(CHUNK):
             gains, correlation, seen = self._gains(part)
-            waves = wave_over_band(ranges(part, self.pack.sources), tones)  # (m, K, F)
+            away = self.pack.ranges(part)
+            waves = wave_over_band(away, tones)  # (m, K, F)
             split = zip(gains.split(self.counts), waves.split(self.counts, 1), strict=True)
             means.append(torch.stack([torch.einsum("kmr,mkf->mrf", g, w) for g, w in split]))
             first = slice(self.counts[0])
-            variance, prior = self._variance(part, middle, correlation[first], seen[first].T)
+            arriving = wave(away[:, first], middle)
+            variance, prior = self._variance(arriving, correlation[first], seen[first].T)
             variances.append(variance)
             priors.append(prior)
         return torch.cat(means, 1), torch.cat(variances), torch.cat(priors)
@@ -123,12 +134,12 @@ class Query:
         return gains * seen[:, :, None], correlation, seen
 
     def _variance(
-        self, part: Tensor, tone: Tensor, correlation: Tensor, visible_share: Tensor
+        self, arriving: Tensor, correlation: Tensor, visible_share: Tensor
     ) -> tuple[Tensor, Tensor]:
-        phased, count = self.first.phased, len(part)
+        """Variance and prior (m,) of waves (m, K) that arrive, before phases and clutter."""
+        phased, count = self.first.phased, len(arriving)
         power = phased.scene.log_amplitude.mul(2).exp()
-        rows = Rows(part, tone.expand(count), torch.empty(count, 0), torch.arange(count))
-        waves = phased.unobstructed(rows) * visible_share
+        waves = arriving * torch.polar(torch.ones(()), phased.phase) * visible_share
         seen = correlation[:, :, self.place_of[self.few]]
         # Covariance of queries and rows, in phase with the gain and in quadrature.
         here, there = torch.stack(stacked(waves * power), -1), torch.stack(stacked(self.first.waves), -1)
@@ -150,5 +161,5 @@ def _kernel_parameters(scene: Scene) -> Tensor:
 class MeanQuery(Query):
     """Means alone: the variance is most of a query's time."""
 
-    def _variance(self, part: Tensor, *unused: Tensor) -> tuple[Tensor, Tensor]:
-        return torch.zeros(len(part)), torch.ones(len(part))
+    def _variance(self, arriving: Tensor, *unused: Tensor) -> tuple[Tensor, Tensor]:
+        return torch.zeros(len(arriving)), torch.ones(len(arriving))

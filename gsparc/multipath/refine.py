@@ -32,10 +32,16 @@ STEP = 0.05  # of logarithms of amplitudes and noise, and of phases [rad]
 SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and logit
 
 Objective = Callable[[list[Tensor], Tensor], tuple[float, list[Tensor]]]
+Late = Callable[[], bool]
+
+
+def never() -> bool:
+    """Of work without an end in time."""
+    return False
 
 
 def descend(
-    rows: Rows, scene: Scene, steps: int, objective: Objective, *more: Tensor
+    rows: Rows, scene: Scene, steps: int, objective: Objective, *more: Tensor, late: Late = never
 ) -> tuple[Scene, list[Tensor]]:
     """The best scene, and the best of `more` parameters [rad], by Adam (D. P. Kingma and J. Ba, ICLR 2015).
 
@@ -46,6 +52,7 @@ def descend(
         objective: transmitter, planes, log amplitudes, log noise and `more`, and visibility correlations
             (K, n, n), to the objective and its derivatives.
         more: start of parameters beside the scene's.
+        late: asked after every step; none follows when it says so.
     """
     values = [scene.transmitter, scene.planes, scene.log_amplitude, torch.tensor(scene.log_noise), *more]
     rates = [torch.tensor(step, dtype=torch.float64) for step in (TRANSMITTER_STEP, PLANE_STEP)]
@@ -58,7 +65,7 @@ def descend(
         value, gradient = objective(values, correlation)
         if value < lowest:
             lowest, best = value, values
-        if step == steps:
+        if step == steps or late():
             break
         decay = 1.0 if step < DECAY_AFTER * steps else DECAY
         moved = []
@@ -75,13 +82,13 @@ def descend(
     return found, best[4:]
 
 
-def refine(rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER) -> Scene:
-    """The best scene of `steps` steps."""
+def refine(rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER, late: Late = never) -> Scene:
+    """The best scene of `steps` steps, or of those until `late`."""
 
     def objective(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
         return _likelihood(rows, scene, values, correlation, noise_floor)
 
-    return descend(rows, scene, steps, objective)[0]
+    return descend(rows, scene, steps, objective, late=late)[0]
 
 
 def _likelihood(
@@ -89,7 +96,8 @@ def _likelihood(
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and its gradient: `d nll = trace(G dK)`, `G = R K^-1 - alpha alpha^H`."""
     transmitter, planes = (v.detach().requires_grad_() for v in values[:2])
-    waves = steering(rows, images(transmitter, planes, scene.words)) * scene.visible_share(rows.position)
+    sources = images(rows.static_ends(transmitter), planes, scene.words)
+    waves = steering(rows, sources) * scene.visible_share(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
     n = len(rows)
@@ -112,7 +120,9 @@ def _likelihood(
     return factor.nll, [*places, by_amplitude, by_noise]
 
 
-def learn_visibility(rows: Rows, scene: Scene, steps: int, start: KernelVisibility) -> Scene:
+def learn_visibility(
+    rows: Rows, scene: Scene, steps: int, start: KernelVisibility, late: Late = never
+) -> Scene:
     """Parameters of the visibility kernel by likelihood, with a log-normal prior about `start`.
 
     Without the prior the lengths collapse to explain the power of sources not found yet.
@@ -121,17 +131,20 @@ def learn_visibility(rows: Rows, scene: Scene, steps: int, start: KernelVisibili
         rows: a few hundred are enough.
         steps: of Adam.
         start: centre of the prior.
+        late: asked before every step; none follows when it says so.
     """
     centre, value = start.parameters(0.02), scene.visibility.parameters(0.02).requires_grad_()
     optimizer = torch.optim.Adam([value], lr=0.1, betas=(0.8, 0.95))
     for _ in range(steps):
+        if late():
+            break
         posterior = Posterior(rows, replace(scene, visibility=KernelVisibility.of(value.detach())))
         slope = posterior.factor.slope
         scaled = posterior.waves * scene.log_amplitude.exp()
         optimizer.zero_grad()
         for k, source in enumerate(scene.sources):
             weight = (slope.conj() * scaled[:, k, None] * scaled[:, k].conj()).real
-            (weight * KernelVisibility.of(value).correlation(rows.position, source)).sum().backward()
+            (weight * KernelVisibility.of(value).correlation(rows.places, source)).sum().backward()
         ((value - centre).square().sum() / SPREAD**2).backward()
         optimizer.step()
     return replace(scene, visibility=KernelVisibility.of(value.detach()).plain())

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER, steering
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene, RealFactor, add_source, shares, stacked
-from gsparc.multipath.refine import SPREAD, descend
+from gsparc.multipath.refine import SPREAD, Late, descend, never
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
@@ -22,8 +22,9 @@ def refine(
     steps: int,
     noise_floor: float = JITTER,
     prior: Callable[[Tensor], Tensor] | None = None,
+    late: Late = never,
 ) -> PhasedScene:
-    """The best phased scene of `steps` steps; `prior` is a negative log prior of phases (K,)."""
+    """The best phased scene of `steps` steps, or until `late`; `prior`: negative log, of phases (K,)."""
 
     def objective(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
         nll, gradient = _likelihood(rows, phased, values, correlation, noise_floor)
@@ -35,7 +36,7 @@ def refine(
             nll += cost.item()
         return nll, gradient
 
-    scene, (phase,) = descend(rows, phased.scene, steps, objective, phased.phase)
+    scene, (phase,) = descend(rows, phased.scene, steps, objective, phased.phase, late=late)
     return replace(phased, scene=scene, phase=phase)
 
 
@@ -45,7 +46,8 @@ def _likelihood(
     """Negative log likelihood and its derivatives by transmitter, planes, amplitudes, noise, phases."""
     words, n = phased.scene.words, len(rows)
     transmitter, planes, phase = (values[i].detach().requires_grad_() for i in (0, 1, 4))
-    waves = steering(rows, images(transmitter, planes, words)) * torch.polar(torch.ones(()), phase)
+    sources = images(rows.static_ends(transmitter), planes, words)
+    waves = steering(rows, sources) * torch.polar(torch.ones(()), phase)
     waves = waves * phased.scene.visible_share(rows.position)
     scaled = waves.detach() * values[2].exp()
     noise = values[3].exp()
@@ -70,8 +72,9 @@ def _likelihood(
 
 
 def learn_visibility(
-    rows: Rows, phased: PhasedScene, steps: int, start: KernelVisibility, noise_floor: float = JITTER
-) -> PhasedScene:
+    rows: Rows, phased: PhasedScene, steps: int, start: KernelVisibility, noise_floor: float = JITTER,
+    late: Late = never,
+) -> PhasedScene:  # fmt: skip
     """Parameters of the visibility kernel and `quadrature` by likelihood.
 
     The prior is about `start` and the present `quadrature` (which stays at 1) in logarithms and logits.
@@ -82,6 +85,7 @@ def learn_visibility(
         steps: of Adam.
         start: centre of the prior.
         noise_floor: known variance of the noise, in units of the rows' power.
+        late: asked before every step; none follows when it says so.
     """
     n, scene, free = len(rows), phased.scene, phased.quadrature < 1
     centre = start.parameters(0.005, phased.quadrature)
@@ -95,6 +99,8 @@ def learn_visibility(
         return replace(phased, scene=replace(scene, visibility=kernel), quadrature=kept)
 
     for _ in range(steps):
+        if late():
+            break
         posterior = PhasedPosterior(rows, current(), noise_floor)
         slope = posterior.factor.slope
         scaled = posterior.waves * scene.log_amplitude.exp()
@@ -102,7 +108,7 @@ def learn_visibility(
         loss = ((value - centre) / width).square().sum() / 2
         for k, source in enumerate(scene.sources):
             along, across = (_folded(slope, z, n) for z in stacked(scaled[:, k]))
-            correlation = KernelVisibility.of(value).correlation(rows.position, source)
+            correlation = KernelVisibility.of(value).correlation(rows.places, source)
             gain = (1 - share) * (along * correlation).sum() + share * (across * correlation).sum()
             loss = loss + gain / 2
         optimizer.zero_grad()

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import Posterior, Scene
-from gsparc.multipath.refine import refine
+from gsparc.multipath.refine import Late, never, refine
 from gsparc.multipath.rows import Rows
 from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
 
@@ -23,11 +23,11 @@ MANY_PLANES = 9  # beyond, third-order words are too many to try
 
 
 def drop_planes(
-    rows: Rows, scene: Scene, tolerance: float, steps: int = 12, allowance: float = 10.0
+    rows: Rows, scene: Scene, tolerance: float, steps: int = 12, allowance: float = 10.0, late: Late = never
 ) -> Scene:
-    """Try to remove each plane: its words become the nearest words over the others [tolerance: m]."""
+    """Try to remove each plane until `late`: its words become the nearest over the others [tolerance: m]."""
     letter = 0
-    while letter < len(scene.planes):
+    while letter < len(scene.planes) and not late():
         shorter = _without_plane(scene, letter, tolerance)
         if shorter is not None:
             shorter = refine(rows, shorter, steps)
@@ -184,14 +184,16 @@ def reassign(scene: Scene, walls: Tensor, relative: float = 0.03) -> Scene:
     return explained.only(list(range(len(kept))))
 
 
-def prune(rows: Rows, scene: Scene, least: float) -> Scene:
-    """Drop sources that gain fewer than `least` nats (twice that with a plane of their own)."""
+def prune(rows: Rows, scene: Scene, least: float, late: Late = never) -> Scene:
+    """Drop sources that gain fewer than `least` nats (twice that with a plane of their own), until `late`."""
     posterior = Posterior(rows, scene)
     weakest_first: list[Word] = sorted(
         scene.words[1:], key=lambda word: float(scene.log_amplitude[scene.words.index(word)])
     )
     kept = set(range(len(scene.words)))
     for word in weakest_first:
+        if late():
+            break
         i = scene.words.index(word)
         sole_user = any(sum(letter in scene.words[j] for j in kept) == 1 for letter in word)
         current = scene.only(sorted(kept))

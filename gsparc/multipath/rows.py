@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.ops import Pose
+from gsparc.physics.waves import ranges
 
 
 @dataclass(frozen=True)
@@ -21,19 +22,41 @@ class Rows:
         frequency: (n,) float64 [Hz].
         target: (n, R) complex64; R outputs share sources and visibility but not gains.
         receiver: (n,) int64, which measurement a row belongs to.
+        array: (E, 3) float64 [m], antennas of the static end from its position, site axes; None for one.
+        element: (n,) int64, which of these a row was measured with; None without `array`.
     """
 
     position: Tensor
     frequency: Tensor
     target: Tensor
     receiver: Tensor
+    array: Tensor | None = None
+    element: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.position)
 
     def take(self, index: Tensor) -> Rows:
         """The rows with these numbers."""
-        return Rows(self.position[index], self.frequency[index], self.target[index], self.receiver[index])
+        element = None if self.element is None else self.element[index]
+        mine = (self.position, self.frequency, self.target, self.receiver)
+        return Rows(*(column[index] for column in mine), self.array, element)
+
+    @property
+    def places(self) -> Tensor:
+        """(n, 3) [m], or (n, 6) with the static end's antennas: what visibility depends on."""
+        if self.array is None or self.element is None:
+            return self.position
+        return torch.cat([self.position, self.array[self.element]], 1)
+
+    def static_ends(self, static: Tensor) -> Tensor:
+        """The static end (3,) [m], or its antennas (E, 3), given its position (3,)."""
+        return static if self.array is None else static + self.array
+
+    def static_end_of_each(self, static: Tensor) -> Tensor:
+        """The static end (3,) [m], or the antenna (n, 3) of each row."""
+        ends = self.static_ends(static)
+        return ends if self.element is None else ends[self.element]
 
 
 def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: int) -> np.ndarray:
@@ -41,6 +64,17 @@ def elements(site: Site, position: np.ndarray, rotation: np.ndarray, antennas: i
     if site.array is None or antennas == 1:
         return position[:, None, :]
     return position[:, None, :] + np.einsum("sij,ej->sei", rotation, np.asarray(site.array, np.float64))
+
+
+def static_array(site: Site, antennas: int) -> np.ndarray | None:
+    """Antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
+
+    By reciprocity the moving transmitter receives from each of them; those of unknown places are outputs.
+    """
+    if site.static_end != "rx" or site.array is None or antennas == 1:
+        return None
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    return np.asarray(site.array, np.float64) @ np.asarray(rotation, np.float64).T
 
 
 def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> Tensor:
@@ -55,11 +89,12 @@ def query_elements(site: Site, rx: Pose, count: int, antennas: int) -> Tensor:
 def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
     """At most `limit` rows from the given measurements.
 
-    Every measurement gives the same number of tones, a comb over the band with a random start, so that
-    together they cover it. When one tone each exceeds the limit, measurements are subsampled.
+    Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each
+    of these the same number of tones, a comb over the band with a random start, so that together they cover
+    it. When one row each exceeds the limit, measurements are subsampled.
 
     Args:
-        data: kind csi; a transmitter that moves before one antenna is, by reciprocity, a moving receiver.
+        data: kind csi; a transmitter that moves is, by reciprocity, a moving receiver.
         index: (S,) measurements to draw from.
         limit: largest number of rows.
         seed: of the draw.
@@ -67,18 +102,18 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
     rng = np.random.default_rng(seed)
     index = np.asarray(index)
     antennas, tones = data.target.shape[1:]
-    frequency = data.site.tones()
-    places = elements(data.site, data.moving[index], data.rx_rotation[index], antennas)
+    frequency, array = data.site.tones(), static_array(data.site, antennas)
+    if len(index) > limit:
+        index = index[np.sort(rng.permutation(len(index))[:limit])]
+    places = measured_places(data, index)
     per = places.shape[1]
-    if len(index) * per > limit:
-        kept = np.sort(rng.permutation(len(index))[: max(limit // per, 1)])
-        index, places = index[kept], places[kept]
-    wanted = min(max(limit // max(len(index) * per, 1), 1), tones)
-    position, tone, target, receiver = [], [], [], []
+    drawn = min(max(limit // max(len(index), 1), 1), per)
+    wanted = min(max(limit // max(len(index) * drawn, 1), 1), tones)
+    position, tone, target, receiver, element = [], [], [], [], []
     for row, place in zip(index, places, strict=True):
         values = data.target[row]  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
-        for e in range(per):
+        for e in np.sort(rng.permutation(per)[:drawn]) if drawn < per else range(per):
             known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(known))
             if count == 0:
@@ -86,12 +121,37 @@ def gather(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows
             comb = np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)
             chosen = known[comb]
             tone.append(frequency[chosen])
-            position.append(np.repeat(place[e][None], count, 0))
+            position.append(np.repeat(place[e, None, :3], count, 0))
             target.append(values[e, chosen][:, None] if per > 1 else values[:, chosen].T)
             receiver.append(np.full(count, row))
-    return Rows(
-        torch.from_numpy(np.concatenate(position)),
-        torch.from_numpy(np.concatenate(tone)),
-        torch.from_numpy(np.concatenate(target).astype(np.complex64)),
-        torch.from_numpy(np.concatenate(receiver)).long(),
-    )
+            element.append(np.full(count, e))
+    columns = (position, tone, [each.astype(np.complex64) for each in target], receiver)
+    rows = Rows(*(torch.from_numpy(np.concatenate(column)) for column in columns))
+    if array is None:
+        return rows
+    return replace(rows, array=torch.from_numpy(array), element=torch.from_numpy(np.concatenate(element)))
+
+
+def measured_places(data: Measurements, index: np.ndarray) -> np.ndarray:
+    """Where each antenna's channel was measured, see `Rows.places`: (S, E, 3), or (S, E, 6), float64 [m]."""
+    antennas = data.target.shape[1]
+    array = static_array(data.site, antennas)
+    if array is not None:
+        moving = np.repeat(data.moving[index][:, None], len(array), 1)
+        return np.concatenate([moving, np.broadcast_to(array, moving.shape)], 2)
+    if data.site.static_end == "rx":
+        return data.moving[index][:, None]
+    return elements(data.site, data.moving[index], data.rx_rotation[index], antennas)
+
+
+def ranges_at(places: Tensor, sources: Tensor, turned: Tensor) -> Tensor:
+    """Ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
+
+    Args:
+        places: see `Rows.places`.
+        sources: (K, 3) float64 [m].
+        turned: (K, 3, 3), see `mirror_planes.orientations`.
+    """
+    if places.shape[1] > 3:
+        sources = sources + torch.einsum("kij,mj->mki", turned, places[:, 3:])
+    return ranges(places[:, :3], sources)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from gsparc.multipath.backprojection import Effort, pick_apart, score, search_box
 from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
-from gsparc.multipath.refine import learn_visibility, refine
+from gsparc.multipath.refine import Late, learn_visibility, never, refine
 from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogonal_walls, prune, reassign
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.source_types import box_of
@@ -21,6 +21,8 @@ from gsparc.physics.mirror_planes import Word, all_words, bisector, images, refl
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
+
+PARENTS = 4  # of a new source, tried in turn until one is found
 
 
 @dataclass(frozen=True)
@@ -72,17 +74,18 @@ class Search:
         settings: how.
         seed: of the candidates.
         late: asked after every round; no other starts when it says so.
+        over: asked after every step; what was found so far is the result when it says so.
     """
 
     def __init__(
         self, rows: Rows, transmitter: Tensor, settings: SearchSettings, seed: int,
-        late: Callable[[], bool] = lambda: False,
+        late: Late = never, over: Late = never,
     ) -> None:  # fmt: skip
-        self.rows, self.settings, self.late = rows, settings, late
+        self.rows, self.settings, self.late, self.over = rows, settings, late, over
         self.generator = torch.Generator().manual_seed(seed)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         self.box = box_of(rows, transmitter) + settings.margin * torch.tensor([[-1.0], [1.0]]).double()
-        waves = steering(rows, transmitter[None])
+        waves = steering(rows, rows.static_ends(transmitter)[..., None, :])
         gain = (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
         self.scene = Scene(
             transmitter,
@@ -106,11 +109,11 @@ class Search:
                 break
             self._refine(s.steps)
             if free or number % 2:
-                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength)
+                self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength, late=self.over)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, s.prune)
+                self.scene = prune(self.rows, self.scene, s.prune, self.over)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
@@ -130,21 +133,21 @@ class Search:
         self._refine(20)
         self._find_walls()
         self._reassign(orthogonal_walls(self.scene))
-        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength)
+        self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
         self._add_words()
         self._refine(s.steps)
-        self.scene = prune(self.rows, self.scene, s.prune)
+        self.scene = prune(self.rows, self.scene, s.prune, self.over)
         self._learn_visibility(10)
         self._refine(s.final_steps)
         return self.scene
 
     def _refine(self, steps: int) -> None:
-        self.scene = refine(self.rows, self.scene, steps)
+        self.scene = refine(self.rows, self.scene, steps, late=self.over)
 
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.words) >= self.settings.learn_visibility_from:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
-            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility)
+            self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
 
     def _add_words(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
@@ -158,7 +161,8 @@ class Search:
         if not words:
             return 0
         position = images(scene.transmitter, scene.planes, words)
-        scores, amplitude = score(self.rows, position, Posterior(self.rows, scene).factor)
+        candidates = replace(scene, words=tuple(words)).images(self.rows)
+        scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).factor)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
             position, scores * clear, 0.5 * self.wavelength, most or s.words_per_round, s.word_score
@@ -168,35 +172,63 @@ class Search:
         return len(chosen)
 
     def _add_free(self) -> int:
-        """Add the best sources anywhere in the box, each with a plane of its own; returns how many."""
+        """Add the best sources anywhere in the box, each with a plane of its own; returns how many.
+
+        Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
+        """
         s, posterior = self.settings, Posterior(self.rows, self.scene)
-        found = search_box(
-            self.rows, posterior.factor, self.box, 0.5 * self.wavelength, s.free_per_round,
-            self.generator, s.effort,
-        )  # fmt: skip
-        added = 0
-        for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
-            if gained < s.free_score:
-                continue
-            parent, plane = self._parent(position, posterior)
-            planes = torch.cat([self.scene.planes, plane[None]])
-            word = (*parent, len(planes) - 1)
-            self.scene = replace(self.scene, planes=planes).with_words([word], amplitude[None])
-            added += 1
-        return added
+        parents: list[Word | None] = [None] if self.rows.array is None else [*self._strong_parents()]
+        for parent in parents:
+            spread = partial(self._spread, parent)
+            found = search_box(
+                self.rows, posterior.factor, self.box, 0.5 * self.wavelength, s.free_per_round,
+                self.generator, s.effort, spread,
+            )  # fmt: skip
+            added = 0
+            for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
+                if gained < s.free_score:
+                    continue
+                word, plane = self._parent(position, posterior)
+                planes = torch.cat([self.scene.planes, plane[None]])
+                self.scene = replace(self.scene, planes=planes).with_words(
+                    [(*word, len(planes) - 1)], amplitude[None]
+                )
+                added += 1
+            if added:
+                return added
+        return 0
+
+    def _able(self, scene: Scene) -> list[int]:
+        """Sources that may be reflected once more."""
+        return [i for i, word in enumerate(scene.words) if len(word) < self.settings.order]
+
+    def _strong_parents(self) -> list[Word]:
+        """The static end, then the words of the loudest sources that may be reflected once more."""
+        loudness = self.scene.log_amplitude
+        louder = sorted((i for i in self._able(self.scene) if i), key=lambda i: -float(loudness[i]))
+        return [self.scene.words[i] for i in (0, *louder[: PARENTS - 1])]
+
+    def _spread(self, parent: Word | None, points: Tensor) -> Tensor:
+        """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
+        if parent is None:
+            return points
+        scene = replace(self.scene, words=(parent,))
+        return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
     def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Word, Tensor]:
         """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
-        scene = posterior.scene
-        able = [i for i, word in enumerate(scene.words) if len(word) < self.settings.order]
+        scene, able = posterior.scene, self._able(posterior.scene)
         planes = bisector(scene.sources[able], position)
         mirrored = reflect(scene.sources[None], planes[:, None])  # (parents, K, 3)
         flat = mirrored.flatten(0, 1)
+        candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
         taken = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
-        scores = score(self.rows, flat, posterior.factor)[0] * new
+        scores = score(self.rows, candidates, posterior.factor)[0].reshape(mirrored.shape[:2])
         letters = torch.tensor([len(scene.words[i]) for i in able])
-        gain = (scores.reshape(mirrored.shape[:2]) - 6).clamp_min(0).sum(1) - 1.5 * letters
+        gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * letters
+        if self.rows.array is not None:  # parents differ in how they turn the antennas
+            gain = gain + scores[torch.arange(len(able)), able]
         best = int(gain.argmax())
         return scene.words[able[best]], planes[best]
 
@@ -208,7 +240,7 @@ class Search:
 
     def _reassign(self, walls: Tensor | None) -> None:
         """Reassign every source to these walls, if the likelihood allows."""
-        if walls is None:
+        if walls is None or self.over():
             return
         before = self.scene
         self.scene = reassign(before, walls)

@@ -90,9 +90,22 @@ class SearchCache:
         with self._lock:
             self.limited_by = less_repeatable(self.limited_by, limited_by)
             self._kept[name] = {"scene": member.phased.state(), "left_out": member.left_out}
+            self._write()
+
+    def interrupted(self) -> str:
+        """Write what has finished, if only the time spent; what to do to go on from it, for a person."""
+        with self._lock:
             if self._path is None:
-                return
-            spent = self._watch.counted
-            facts = {"spent_s": spent.wall, "processor_s": spent.processor, "limited_by": self.limited_by}
-            with whole_file(self._path) as partial, partial.open("wb") as file:
-                torch.save({"depends_on": self._depends_on, **facts, SEARCHES: self._kept}, file)
+                return "the search was interrupted; it has no folder to leave a checkpoint in"
+            self._write()
+            count = len(self._kept)
+        return f"the search was interrupted, {count} finished; go on with ckpt_path={self._path}"
+
+    def _write(self) -> None:
+        if self._path is None:
+            return
+        spent = self._watch.counted
+        facts = {"spent_s": spent.wall, "processor_s": spent.processor, "limited_by": self.limited_by}
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        with whole_file(self._path) as partial, partial.open("wb") as file:
+            torch.save({"depends_on": self._depends_on, **facts, SEARCHES: self._kept}, file)

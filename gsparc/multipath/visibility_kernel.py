@@ -29,8 +29,11 @@ class KernelVisibility:
     length: float | Tensor = 2.0
 
     def correlation(self, places: Tensor, source: Tensor) -> Tensor:
-        """(n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m]."""
-        squared = _squared(directions(places, source)) / self.angle**2
+        """(n, n) float32 in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
+
+        By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
+        """
+        squared = _squared(directions(places[:, :3], source)) / self.angle**2
         if not _is_wide(places, float(torch.as_tensor(self.length).detach())):
             places = places.float()
         squared = squared + _squared(places).float() / self.length**2

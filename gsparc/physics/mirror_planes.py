@@ -30,15 +30,26 @@ def bisector(first: Tensor, second: Tensor) -> Tensor:
 
 
 def images(transmitter: Tensor, planes: Tensor, words: tuple[Word, ...] | list[Word]) -> Tensor:
-    """Positions (K, 3) [m] of the words; differentiable in transmitter (3,) and planes (P, 4)."""
+    """Positions (..., K, 3) [m] of the words; differentiable in transmitter (..., 3) and planes (P, 4)."""
     order = max(map(len, words), default=0)
-    place = transmitter.expand(len(words), 3)
+    place = transmitter[..., None, :].expand(*transmitter.shape[:-1], len(words), 3)
     letters = torch.tensor([[*w, *[-1] * (order - len(w))] for w in words], dtype=torch.long)
     for step in range(order):
         index = letters[:, step]
         mirrored = reflect(place, planes[index.clamp_min(0)])
         place = torch.where((index >= 0)[:, None], mirrored, place)
     return place
+
+
+def orientations(planes: Tensor, words: tuple[Word, ...] | list[Word]) -> Tensor:
+    """Orthogonal parts Q (K, 3, 3) of the words: the image of t + a is that of t, plus Q a.
+
+    One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.
+    Soc. Am. 65 (1979)); a word is their product, the first letter rightmost.
+    """
+    ends = torch.cat([torch.zeros(1, 3, dtype=planes.dtype), torch.eye(3, dtype=planes.dtype)])
+    placed = images(ends, planes, words)  # (4, K, 3)
+    return (placed[1:] - placed[:1]).permute(1, 2, 0)
 
 
 def all_words(letters: list[int], order: int) -> list[Word]:

@@ -17,8 +17,11 @@ NEAR_M = 0.001  # no receiver comes closer to a source; keeps 1/r and its slope 
 
 
 def ranges(observers: Tensor, sources: Tensor) -> Tensor:
-    """Ranges (n, K) float64 [m] between observers (n, 3) and sources (K, 3) [m], at least `NEAR_M`."""
-    offset = observers.double()[:, None, :] - sources.double()[None, :, :]
+    """Ranges (n, K) float64 [m] between observers (n, 3) and sources (K, 3) [m], at least `NEAR_M`.
+
+    Sources (n, K, 3) are each observer's own.
+    """
+    offset = observers.double()[:, None, :] - sources.double()
     return (offset.square().sum(-1) + NEAR_M**2).sqrt()
 
 

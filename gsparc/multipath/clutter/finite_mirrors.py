@@ -19,6 +19,7 @@ from gsparc.multipath.clutter.boxes import evolve
 from gsparc.multipath.clutter.residual import CandidateScorer
 from gsparc.multipath.clutter.unfold import Paths
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.worker import ask
 from gsparc.physics.mirror_planes import Word, reflect
 from gsparc.physics.waves import LIGHT, NEAR_M, wave
 
@@ -185,6 +186,7 @@ def _raster(
     low, cells = (room @ along.T).amin(0), _cells(room, along)
     tables = []
     for arriving, met in _sources(rows, transmitter, candidates, known):
+        ask()
         cell = ((met @ along.T - low) / CELL).floor().long()
         inside = (cell >= 0).all(-1) & (cell < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
         index = (cell[..., 0] * cells[1] + cell[..., 1]).clamp(0, cells[0] * cells[1] - 1)
@@ -226,16 +228,33 @@ def _sources(
 ) -> list[tuple[Tensor, Tensor]]:
     """Waves (C, n) of every word over a candidate, and where the candidate is met (C, n, 3), NaN if not."""
     places = rows.position.float()
-    once = reflect(transmitter[None], candidates)  # (C, 3)
-    found = [(once, _meeting(places, once, candidates))]
-    for wall in known:
-        after = reflect(reflect(transmitter, wall)[None], candidates)
-        found.append((after, _meeting(places, after, candidates)))
-        before = reflect(once, wall[None])
+    once, *more = _images(transmitter, candidates, known)
+    found = [_meeting(places, once, candidates)]
+    for wall, after, before in zip(known, more[::2], more[1::2], strict=True):
+        found.append(_meeting(places, after, candidates))
         first = _meeting(places, before, wall[None].expand(len(candidates), 4))
-        found.append((before, _meeting(first, once, candidates)))
-    away = ((torch.cdist(source, rows.position).clamp_min(NEAR_M), met) for source, met in found)
+        found.append(_meeting(first, once, candidates))
+    sources = (
+        [once, *more] if rows.array is None else _images(rows.static_ends(transmitter), candidates, known)
+    )
+    away = ((_distance(rows, source), met) for source, met in zip(sources, found, strict=True))
     return [(wave(distance, rows.frequency), met) for distance, met in away]
+
+
+def _images(static: Tensor, candidates: Tensor, known: Tensor) -> list[Tensor]:
+    """Images (..., C, 3) of (..., 3) in each candidate, then after and before each wall."""
+    start = static[..., None, :]
+    once = reflect(start, candidates)
+    pairs = ((reflect(reflect(start, wall), candidates), reflect(once, wall)) for wall in known)
+    return [once, *(image for pair in pairs for image in pair)]
+
+
+def _distance(rows: Rows, sources: Tensor) -> Tensor:
+    """Distances (C, n) [m] from sources (C, 3), or (E, C, 3) of the static end's antennas."""
+    if rows.element is None:
+        return torch.cdist(sources, rows.position).clamp_min(NEAR_M)
+    apart = sources.index_select(0, rows.element) - rows.position[:, None]
+    return torch.linalg.vector_norm(apart, dim=-1).T.clamp_min(NEAR_M)
 
 
 def _meeting(start: Tensor, end: Tensor, planes: Tensor) -> Tensor:

@@ -84,7 +84,7 @@ def descend(
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
         seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes, soft)
-        waves = steering(rows, images(scene.transmitter, planes, scene.words))
+        waves = steering(rows, images(rows.static_ends(scene.transmitter), planes, scene.words))
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
         cost = residual.nll(seen, log_amplitude, waves) + deviation.square().sum() / 2

@@ -16,7 +16,9 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER
 from gsparc.multipath.phased_gp import PhasedScene, add_source, shares, stacked
+from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
+from gsparc.multipath.worker import ask
 
 TRIED = 1.5  # factor between two candidates of the noise variance
 LEAST_NOISE = 3e-4  # variance, in units of the rows' power; smaller estimates mean a failed search
@@ -55,7 +57,7 @@ class Residual:
         scaled = phased.waves(self.rows) * scene.log_amplitude.exp()
         varying, kernel = torch.zeros(2, n, 2, n), replace(scene.visibility, constant=0.0)
         for k, source in enumerate(scene.sources):
-            correlation = kernel.correlation(self.rows.position, source)
+            correlation = kernel.correlation(self.rows.places, source)
             add_source(varying, scaled[:, k], phased.quadrature, correlation)
         across = stacked(scaled)[1]
         return varying.view(2 * n, 2 * n), shares(phased.quadrature)[1] * (across @ across.T)
@@ -91,7 +93,7 @@ class Residual:
         varying, across = self._cached
         covariance = (1 - constant) * varying + constant * across
         covariance.diagonal().add_((math.exp(noise) + self.noise_floor) / 2)
-        self._lower = torch.linalg.cholesky(covariance)
+        self._lower = cholesky(covariance)
         self._determinant = float(self._lower.diagonal().double().log().sum())
 
     @staticmethod
@@ -113,18 +115,18 @@ class Residual:
     def nats_per_source(self, visible_share: Tensor, log_amplitude: Tensor) -> Tensor:
         """Log likelihood lost without each source's constant part (K,) [nats]."""
         columns = self.columns(visible_share, log_amplitude)
-        inner = columns.T @ columns + torch.eye(columns.shape[1])
+        inner, seen = _inner(columns, self.white)
         inverse = torch.linalg.inv(inner)
-        mean = inverse @ (columns.T @ self.white)
-        spread = inverse.diagonal()
-        return 0.5 * (mean.square() / spread + spread.log())
+        mean, spread = inverse @ seen, inverse.diagonal()
+        return (0.5 * (mean.square() / spread + spread.log())).float()
 
     def scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
         """Scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
-        lower = torch.linalg.cholesky(columns.T @ columns + torch.eye(columns.shape[1]))
-        mean = torch.cholesky_solve((columns.T @ self.white)[:, None], lower)[:, 0]
-        projection = torch.linalg.solve_triangular(lower, columns.T, upper=False)
+        inner, seen = _inner(columns, self.white)
+        lower = torch.linalg.cholesky(inner)
+        mean = torch.cholesky_solve(seen[:, None], lower)[:, 0].float()
+        projection = torch.linalg.solve_triangular(lower, columns.T.double(), upper=False).float()
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
@@ -154,6 +156,7 @@ class CandidateScorer:
         """Nats (m,) of adding waves (n, K), each times its `share` (b, K, n) under b of m candidates."""
         scores = []
         for part in candidates.split(BLOCK):
+            ask()
             each = share(part)
             change = [torch.einsum("bkn,nk->nb", each, wave) for wave in (waves.real, waves.imag)]
             scores.append(self.score(torch.complex(*change)))
@@ -183,8 +186,19 @@ class CandidateScorer:
         return (along * gain.real + across * gain.imag) / 2, gain
 
 
+def _inner(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
+    """`I + C^T C` (K, K) and `C^T y` (K,), float64, of whitened columns (2 n, K) and targets (2 n,).
+
+    Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
+    """
+    ask()
+    exact = columns.double()
+    return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
+
+
 def _cost(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
-    inner = columns.T @ columns + torch.eye(columns.shape[1])
+    inner, seen = _inner(columns, white)
     lower = torch.linalg.cholesky(inner)
-    fit = torch.linalg.solve_triangular(lower, (columns.T @ white)[:, None], upper=False)
-    return determinant + lower.diagonal().log().sum() + 0.5 * (white.square().sum() - fit.square().sum())
+    fit = torch.linalg.solve_triangular(lower, seen[:, None], upper=False)
+    explained = white.double().square().sum() - fit.square().sum()
+    return determinant + lower.diagonal().log().sum() + 0.5 * explained

@@ -18,11 +18,11 @@ from gsparc.multipath.clutter.boxes import find_box, inside_out
 from gsparc.multipath.clutter.finite_mirrors import SmallMirror, find_mirrors, find_patch, same_mirror, walls
 from gsparc.multipath.clutter.refine import ReflectionPhasePrior, descend
 from gsparc.multipath.clutter.residual import CandidateScorer, Residual
-from gsparc.multipath.gp_likelihood import JITTER, Scene, steering
+from gsparc.multipath.gp_likelihood import JITTER, Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word, all_words, images
+from gsparc.physics.mirror_planes import Word, all_words
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
@@ -160,9 +160,10 @@ class _ClutterSearcher:
             for move in (self._mirrors, self._patches, self._boxes, self._words):
                 if not late():
                     move()
-            self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
-            self._drop()
-            self._refactor(self.phased)
+            if not late():
+                self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
+                self._drop()
+                self._refactor(self.phased)
             if not late():
                 self._relocate_boxes()
                 self._descend(10)
@@ -245,7 +246,7 @@ class _ClutterSearcher:
         inside = torch.where(paths.letter >= first, inside, 1.0).prod(-1)
         seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
         turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.words))
-        scores = scorer.score(steering(self.rows, trial.sources) * seen.T * turn)
+        scores = scorer.score(trial.unobstructed(self.rows) * seen.T * turn)
         total = scores.view(len(moves), -1).sum(1)
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))
@@ -272,7 +273,7 @@ class _ClutterSearcher:
         candidates = replace(scene, words=tuple(words))
         paths = candidates.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
-        waves = steering(self.rows, candidates.sources) * seen.T
+        waves = candidates.unobstructed(self.rows) * seen.T
         if self.phase_prior.concentration < MIN_CONCENTRATION:
             return *scorer.score_waves(waves), candidates.sources
         turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.words))
@@ -332,8 +333,7 @@ class _ClutterSearcher:
         words = [w for w in dict.fromkeys(all_words(letters, 2) + longer) if w not in known]
         if not words:
             return
-        places = images(scene.transmitter, scene.planes, words)
-        scores, _ = self._scorer().score_waves(steering(self.rows, places))
+        scores, _ = self._scorer().score_waves(replace(scene, words=tuple(words)).unobstructed(self.rows))
         best = scores.topk(min(60, len(words))).indices.tolist()
         self._add(scene, [words[i] for i in best], 6.0, self.parameter_cost, self.settings.words)
 
