@@ -40,6 +40,7 @@ class InitSettings(Checked):
         max_sources: of a search.
         order: largest number of reflections.
         edges: search for diffracting edges.
+        snapshot: what every channel snapshot has of its own, to be estimated; see `LossSettings`.
     """
 
     name: InitName = setting("auto", choice(*get_args(InitName)))
@@ -51,6 +52,7 @@ class InitSettings(Checked):
     max_sources: int = setting(60, whole(1))
     order: int = setting(3, whole(0))
     edges: bool = True
+    snapshot: Snapshot = setting("none", choice(*get_args(Snapshot)))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ def sources(
     """Image sources of several searches."""
     method = ImageSourceGP(
         searches=init.searches, search_rows=init.search_rows, rows=init.rows, margin=init.margin,
-        max_sources=init.max_sources, order=init.order, clutter=clutter, edges=init.edges, seed=context.seed,
+        max_sources=init.max_sources, order=init.order, clutter=clutter, edges=init.edges,
+        offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     return _completed(SourceField(method), data, report)

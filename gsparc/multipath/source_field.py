@@ -18,15 +18,15 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
 from gsparc.methods.method import FitContext
-from gsparc.ops import Pose
 from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.diffraction import subtract_edges
 from gsparc.multipath.directional_gp import DirectionalGP
-from gsparc.multipath.gp_likelihood import correlations, steering
+from gsparc.multipath.gp_likelihood import correlations
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.phased_gp import PhasedPosterior
 from gsparc.multipath.query import Query
 from gsparc.multipath.rows import Rows, gather
+from gsparc.ops import Pose
 
 
 class SourceField(ConditionalField):
@@ -41,7 +41,8 @@ class SourceField(ConditionalField):
     def __init__(self, method: ImageSourceGP) -> None:
         super().__init__()
         self.method = method
-        scenes = [member.scene for member in method.members]
+        fixed = method.offsets != "none"  # those of every snapshot were estimated against these sources
+        scenes = [] if fixed else [member.scene for member in method.members]
         self.planes = nn.ParameterList([scene.planes.clone() for scene in scenes])
         self.log_amplitudes = nn.ParameterList([scene.log_amplitude.clone() for scene in scenes])
 
@@ -63,7 +64,7 @@ class SourceField(ConditionalField):
         for number, member in enumerate(self.method.members):
             scene = self._scene(number)
             seen = scene.visible_share(rows.position).detach()
-            waves = steering(rows, scene.sources) * seen * scene.log_amplitude.exp()
+            waves = scene.unobstructed(rows) * seen * scene.log_amplitude.exp()
             correlation = correlations(rows, scene.sources.detach(), scene.visibility)
             covariance = torch.einsum("nk,mk,knm->nm", waves, waves.conj(), correlation.to(waves.dtype))
             noise = float(np.exp(member.scene.log_noise)) + self.method.noise_floor
@@ -80,11 +81,14 @@ class SourceField(ConditionalField):
     @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`."""
+        method = self.method
+        if method.offsets != "none":
+            return
         scenes = [
             replace(member.phased, scene=_detached(self._scene(number)))
-            for number, member in enumerate(self.method.members)
+            for number, member in enumerate(method.members)
         ]
-        method = self.method
+        data = replace(data, target=data.target * method.factors.numpy()[:, None])
         held = method.frame.inside(gather(data, rows, method.row_limit, method.seed))
         if len(method.edges):
             held = subtract_edges(held, method.edges, scenes[0].scene.transmitter)
@@ -213,17 +217,20 @@ def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
 
 def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:
     """A batch as rows of the method's frame, one tone of each antenna."""
-    flat, _ = method._places(batch.tx, batch.rx)
+    places, _ = method._places(batch.tx, batch.rx)
     assert method.site is not None
     tones = torch.from_numpy(method.site.tones())
-    count, antennas = batch.target.shape[:2]
-    per = len(flat) // count
+    count = len(batch)
+    per = len(places) // count
     chosen = batch.index.cpu() % len(tones)  # all tones have their turn
-    target = batch.target[torch.arange(count), :, chosen]  # (B, A)
+    target = batch.target[torch.arange(count), :, chosen] * method.factors  # (B, A)
     target = target.reshape(-1, 1) if per > 1 else target
     frequency = tones[chosen].repeat_interleave(per)
     receiver = torch.arange(count).repeat_interleave(per)
-    return method.frame.inside(Rows(flat + method.frame.middle, frequency, target, receiver))
+    rows = Rows(places[:, :3] + method.frame.middle, frequency, target, receiver)
+    if places.shape[1] > 3:
+        rows = replace(rows, array=places[:per, 3:], element=torch.arange(per).repeat(count))
+    return method.frame.inside(rows)
 
 
 def _detached(scene: Any) -> Any:

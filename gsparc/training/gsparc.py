@@ -73,7 +73,8 @@ class Gsparc(LearnedField):
         self, effects: EffectSettings | None = None, init: InitSettings | None = None, **field: Any
     ) -> None:
         super().__init__(**field)
-        self.switches, self.init = effects or EffectSettings(), init or InitSettings()
+        self.switches = effects or EffectSettings()
+        self.init = replace(init or InitSettings(), snapshot=self.loss.snapshot)
         self.field: ConditionalField | None = None
         self.plan: Plan | None = None
         self.explained: float | None = None
@@ -375,7 +376,9 @@ class Gsparc(LearnedField):
                 f"model=gsparc of an earlier version, which had chosen {state['chosen']} here; train again"
             )
         self.site, self.field, self._beside = site, None, None
-        response = replace(self.settings.response, array=bool(state.get("array", self.switches.array is True)))
+        response = replace(
+            self.settings.response, array=bool(state.get("array", self.switches.array is True))
+        )
         self.settings = replace(self.settings, response=response)
         if state.get("field") is not None:
             self.field = restored(site, state["field"])

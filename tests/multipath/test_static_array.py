@@ -16,7 +16,6 @@ from gsparc.methods.method import FitContext
 from gsparc.multipath import worker
 from gsparc.multipath.backprojection import quick_score, score
 from gsparc.multipath.clutter.residual import Residual, _cost
-from gsparc.multipath.found_sources import found_sources
 from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
@@ -86,28 +85,16 @@ def test_four_antennas_at_a_hundred_places(fitted):
         image = CENTRE.copy()
         image[axis] = 2 * wall - image[axis]
         true.append(image)
-    found = found_sources(method).positions + data.site.origin
+    found = (method.members[0].scene.sources + method.frame.middle).numpy() + data.site.origin
     assert np.linalg.norm(np.array(true)[:, None] - found, axis=-1).min(1).max() < 0.05
 
 
-def test_sources_as_a_field_takes_them_over_sum_to_the_prediction(fitted, tmp_path):
+def test_a_stored_model_answers_as_before(fitted, tmp_path):
     method, data, fold = fitted
     torch.save(method.state(), tmp_path / "state.pt")
     again = ImageSourceGP()
     again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    found = found_sources(again)
-    assert (found.member == 0).all() and found.weights.sum() == pytest.approx(1)
-    unit = found.rotations @ found.rotations.transpose(0, 2, 1)
-    assert np.allclose(unit, np.eye(3), atol=1e-9)
-    array = static_array(data.site, 4)
-    images = found.positions[:, None] + np.einsum("kij,ej->kei", found.rotations, array)
-    far = np.linalg.norm(data.moving[fold.test][:, None, None] - images, axis=-1)  # (S, K, E)
-    waves = np.exp(-2j * np.pi * CARRIER * far / LIGHT) / far
-    summed = np.einsum("ske,k->se", waves, found.gains[:, 0])
-    assert nmse(summed, data.target[fold.test][:, :, 0]) < 0.05
     assert _error(again, data, fold.test) == pytest.approx(_error(method, data, fold.test), rel=1e-3)
-    with pytest.raises(ValueError, match="not fitted yet"):
-        found_sources(ImageSourceGP())
 
 
 def test_paths_of_each_antenna_sum_to_the_prediction(fitted):
