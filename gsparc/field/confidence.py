@@ -1,4 +1,5 @@
-"""Confidence of a prediction by position: C = 1 + exp(g(x)) (paper, eq. 7; DUSt3R's form)."""
+"""Confidence of a prediction: C = 1 + exp(g(x)) by position (paper, eq. 7; DUSt3R's form), or by what is unknown.
+"""
 
 from __future__ import annotations
 
@@ -28,6 +29,37 @@ class ConfidenceSettings(Checked):
     alpha: float = setting(0.3, number(0))
     clamp: float = setting(10.0, number(0, 80, open_low=True))
     encoding: EncodingSettings = field(default_factory=lambda: EncodingSettings(kind="raw"))
+
+
+LEAST_UNKNOWN = 1e-3  # of the variance is always unknown: quantisation, recovery
+
+
+class ErrorModel(nn.Module):
+    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u.
+
+    Level and power are what errors of left-out training rows say; nothing is learned by gradient.
+    """
+
+    level: Tensor
+    power: Tensor
+
+    def __init__(self, level: float = 1.0, power: float = 1.0) -> None:
+        super().__init__()
+        self.register_buffer("level", torch.tensor(float(level)))
+        self.register_buffer("power", torch.tensor(float(power)))
+
+    def set(self, level: float, power: float) -> None:
+        """Take what left-out rows said."""
+        self.level.fill_(level)
+        self.power.fill_(power)
+
+    def forward(self, unknown: Tensor) -> tuple[Tensor, Tensor]:
+        """Confidence (B,) in [0, 1] and variance (B,) of unknown shares (B,).
+
+        The confidence is the share of the squared error expected far from all data that is not expected here.
+        """
+        error = self.level * (unknown + LEAST_UNKNOWN) ** self.power
+        return 1 - error / (self.level * (1 + LEAST_UNKNOWN) ** self.power), error
 
 
 class Confidence(nn.Module):

@@ -26,7 +26,7 @@ from gsparc.field.initial import InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, Prediction, PredictsVariance
 from gsparc.methods.origin import Origin
 from gsparc.methods.time_budget import Clock, Spent, TimeBudget, less_repeatable
 from gsparc.ops import Pose
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
-class LearnedField(Method):
+class LearnedField(PredictsVariance):
     """A Gaussian field trained by gradient.
 
     Args:
@@ -91,6 +91,7 @@ class LearnedField(Method):
         self._prior: Prior | None = None
         self._billed = Spent()  # for reusable work, by the stages so far
         self._frozen: FrozenView | FrozenArray | None = None
+        self._left_out: Any = None  # of the initialiser; not stored
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -98,7 +99,8 @@ class LearnedField(Method):
         """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
 
         The second stage (`refit`) trains again on both with the confidence fixed, because the baselines
-        learn from all of them.
+        learn from all of them. A field through an array is solved from both at once and takes no steps (but
+        see `ResponseSettings.refine`): what it is sure of is found by leaving training rows out.
         """
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
@@ -116,6 +118,12 @@ class LearnedField(Method):
         budget.pause()
         now = None if context.budget_s is None else context.budget_clock
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
+        if self._solved(context):
+            if self.refit:
+                fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+            seconds = self._stage("train", origin, data, fold, context, budget, seconds)
+            self._frozen = None
+            return FitReport(seconds, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
@@ -129,6 +137,13 @@ class LearnedField(Method):
             seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
         self._frozen = None
         return FitReport(seconds, limited_by=self._limited_by)
+
+    def _solved(self, context: FitContext) -> bool:
+        """Whether the closed-form start is the answer."""
+        assert self.choices is not None
+        closed = self.settings.response.array and self.choices.warm_start
+        fresh = context.init_from is None and context.resume is None
+        return closed and fresh and not self.settings.response.refine
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
@@ -153,7 +168,7 @@ class LearnedField(Method):
                     context.seed, folder,
                 )
             )  # fmt: skip
-            self._prior = start.prior
+            self._prior, self._left_out = start.prior, start.left_out
             self.model = self._new_model(data.site, start.sources)
             start.solve(self.model)
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
@@ -166,6 +181,8 @@ class LearnedField(Method):
             self.fitted().confidence = confidence.requires_grad_(False)
         budget.pause()
         prepared = (budget.counted - started).wall
+        if self._solved(context):
+            return prepared
         steps, pace = total_steps(context), None
         if context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
@@ -244,12 +261,12 @@ class LearnedField(Method):
         if len(tx) > QUERY_CHUNK:
             chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
             parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
-            confidence = None if parts[0].confidence is None else torch.cat([p.confidence for p in parts])  # type: ignore[misc]
-            return Prediction(torch.cat([p.mean for p in parts]), confidence)
+            return joined(parts)
         frozen = self._frozen_view(rx)
-        mean = model(tx, rx).mean if frozen is None else frozen.render(model, tx, rx)
-        if model.site.kind == "spectrum":
-            mean = mean.clamp(0, 1)
+        found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
+        mean = found.mean.clamp_(0, 1) if model.site.kind == "spectrum" else found.mean
+        if model.error is not None and found.unknown is not None:
+            return Prediction(mean, *model.error(found.unknown))
         if model.confidence is None:
             return Prediction(mean)
         return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))
@@ -318,6 +335,14 @@ class LearnedField(Method):
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.fitted().gaussians)
+
+
+def joined(parts: Sequence[Prediction]) -> Prediction:
+    """Predictions of one method, one after the other."""
+    rest = ([getattr(part, name) for part in parts] for name in ("confidence", "variance"))
+    return Prediction(
+        torch.cat([part.mean for part in parts]), *(None if each[0] is None else torch.cat(each) for each in rest)
+    )
 
 
 def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:
