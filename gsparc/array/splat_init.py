@@ -116,7 +116,8 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
     tuned = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed)
     kernel = tuned.kernel
     process = fit_vector_gp(found.vectors, places, partner, kernel)
-    features = whitened(torch.from_numpy(places), kernel.length, kernel.noise, "smooth_rough", anchors)
+    stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
+    features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
         "array: length %.3g m, noise %.2g of the field's variance, %d features of %d spectra",
         kernel.length, kernel.noise, len(features.places), len(rows),

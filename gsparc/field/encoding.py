@@ -88,7 +88,7 @@ class PositionEncoding(nn.Module):
                 raise ValueError(
                     "model.emission.encoding.kind=kernel needs a prior learned from training positions"
                 )
-            self.length, self.kernel = prior.length, prior.kernel
+            self.length, self.noise, self.kernel = prior.length, prior.noise, prior.kernel
             self.tells_share = prior.whitening is not None
             self.register_buffer("anchors", prior.anchors.float())
             whitening = _whitening(prior) if prior.whitening is None else prior.whitening
@@ -116,7 +116,7 @@ class PositionEncoding(nn.Module):
 
 def unknown_share(features: Tensor) -> Tensor:
     """Posterior variance (B,) of a process in [0, 1], of its prior's: `1 - |phi|^2` of features (B, E)."""
-    return (1 - features.square().sum(1)).clamp(0, 1)
+    return (1 - torch.linalg.vecdot(features, features)).clamp_(0, 1)
 
 
 def _whitening(prior: Prior) -> Tensor:

@@ -52,8 +52,8 @@ class FrozenArray:
     Attributes:
         version: the field's counter at the time.
         view: (N, M) complex64, emissions to array vectors.
-        weights: (E, 2 M + 2) float32, encoded positions to real and imaginary parts of array vectors and, left
-            at 0, of the unknown share; None where emissions are not linear in them.
+        weights: (E, 2 M + 2) float32, encoded positions to real and imaginary parts of array vectors and,
+            left at 0, of the unknown share; None where emissions are not linear in them.
         offset: (2 M + 2,) float32, added to them.
         renderer: array vectors to spectra where the unknown share is known; on the site's grid or a coarser.
     """
@@ -74,15 +74,16 @@ class FrozenArray:
             emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
             unknown = model.unknown(tx, rx)
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
-        encoded = model.emission.encoding(model.site.moving(tx, rx))
+        moving = model.site.moving(tx, rx)
         if not model.tells_unknown:
+            encoded = model.emission.encoding(moving)
             parts = torch.addmm(self.offset, encoded, self.weights).view(len(encoded), -1, 2)
             return Rendered(response.spectra(torch.view_as_complex(parts)[:, :-1]), None)
-        mean, unknown = encoded.new_empty(len(tx), *self.renderer.square.shape), encoded.new_empty(len(tx))
+        mean, unknown = tx.new_empty(len(tx), *self.renderer.square.shape), tx.new_empty(len(tx))
         with torch.inference_mode():  # the results are ordinary tensors, made before
-            unknown.copy_(unknown_share(encoded))
+            encoded = model.emission.encoding(moving)
             parts = torch.addmm(self.offset, encoded, self.weights)
-            torch.sqrt(unknown, out=parts[:, -2])
+            torch.sqrt(unknown.copy_(unknown_share(encoded)), out=parts[:, -2])
             vectors = torch.view_as_complex(parts.view(len(tx), -1, 2))
             for start in range(0, len(tx), IN_CACHE):
                 part = slice(start, start + IN_CACHE)
@@ -101,9 +102,7 @@ def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
 
 
 @torch.no_grad()
-def frozen_array(
-    model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None
-) -> FrozenArray:
+def frozen_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None) -> FrozenArray:
     """Freeze a model with an array from what the array measures of each Gaussian, `view` (N, M).
 
     Args:

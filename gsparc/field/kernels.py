@@ -20,6 +20,7 @@ Correlation = Literal["matern32", "smooth_rough"]
 ROUGH_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
 ROUGH_RATIO = 1 / 3  # of the lengths
 ENOUGH = 0.5  # of the noise: a row this well known from the places before it is no further place
+ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 JITTER = 1e-8  # of the unit variance: places lie apart, this covers rounding
 LEAST = 1e-12  # eigenvalue below which a feature is none
 
@@ -36,17 +37,18 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
     # Differences are formed before squaring: the expanded form loses millimetres in float32.
     distance = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
     if name == "matern32":
-        return _matern32(distance * (math.sqrt(3) / length))
+        return _matern32(distance * (-math.sqrt(3) / length))
     if name != "smooth_rough":
         raise ValueError(f"correlation {name!r} is none of {', '.join(get_args(Correlation))}")
-    smooth = distance * (math.sqrt(5) / length)
-    long = (1 + smooth + smooth.square() / 3) * torch.exp(-smooth)
-    rough = _matern32(distance * (math.sqrt(3) / (ROUGH_RATIO * length)))
+    rough = _matern32(distance * (-math.sqrt(3) / (ROUGH_RATIO * length)))
+    smooth = distance * (-math.sqrt(5) / length)
+    long = torch.addcmul(torch.sub(ONE, smooth), smooth, smooth, value=1 / 3) * smooth.exp()
     return torch.lerp(long, rough, ROUGH_SHARE)
 
 
 def _matern32(scaled: Tensor) -> Tensor:
-    return (1 + scaled) * torch.exp(-scaled)
+    """Of minus sqrt(3) lengths: few operations, because single queries cost one call each."""
+    return torch.sub(ONE, scaled) * scaled.exp()
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, number, setting
 from gsparc.data.schema import Site
-from gsparc.ops import Pose
+from gsparc.ops import Pose, SphereGrid
 from gsparc.ops.channels import channels
 from gsparc.physics.array_response import array_output, element_pattern, normalised, steering
 from gsparc.physics.bartlett import SpectrumRenderer
@@ -157,14 +157,14 @@ class ArrayResponse(nn.Module):
         super().__init__()
         if site.array_problem is not None:
             raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
-        array, self.grid, wavelength = site.array_geometry()
+        self.array, self.grid, self.wavelength = site.array_geometry()
         self.normalisation = site.normalisation
-        matrix = steering(array, self.grid, wavelength).to(torch.complex64)
+        matrix = steering(self.array, self.grid, self.wavelength).to(torch.complex64)
         self.register_buffer("matrix", matrix, persistent=False)
         elements = element_pattern(self.grid, pattern) if pattern else None
         self.register_buffer("pattern", elements, persistent=False)
         no_background = torch.zeros(self.grid.height, self.grid.width)
-        self.renderer = SpectrumRenderer(array, self.grid, wavelength, no_background)
+        self.renderer = SpectrumRenderer(self.array, self.grid, self.wavelength, no_background)
 
     def measured(self, image: Tensor) -> Tensor:
         """Array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
@@ -180,11 +180,15 @@ class ArrayResponse(nn.Module):
     def background(self, image: Tensor) -> None:
         self.renderer.square.copy_(image.square())
 
-    def spectra(self, vectors: Tensor, unknown: Tensor | None = None) -> Tensor:
-        """Published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), where there are any.
+    def every(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
+        """The renderer on `grid`, every `stride`-th row and column of its own."""
+        return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
 
-        Vectors beside a share have the scale of published spectra: the mean of an uncertain one has no maximum
-        of 1 to be divided by.
+    def spectra(self, vectors: Tensor, unknown: Tensor | None = None) -> Tensor:
+        """Published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if there are any.
+
+        Vectors beside a share have the scale of published spectra: the mean of an uncertain one has no
+        maximum of 1 to be divided by.
         """
         if unknown is not None:
             share = unknown.clamp_min(SLOPE_ENDS).sqrt()

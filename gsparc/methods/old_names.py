@@ -8,7 +8,6 @@ OLD_NAMES: dict[str, str] = {  # classes, by import path
     "gsparc.array.field.ArrayField": "gsparc.array.method.ArrayField",
     "gsparc.array.moving.method.BearingField": "gsparc.array.moving.method.MovingArrayField",
     "gsparc.array.moving.method.TrendSettings": "gsparc.array.moving.power_gp.TrendSettings",
-    "gsparc.array.packets.PacketSettings": "gsparc.array.wave_packets.PacketSettings",
     "gsparc.bearings.field.BearingField": "gsparc.array.moving.method.MovingArrayField",
     "gsparc.bearings.field.TrendSettings": "gsparc.array.moving.power_gp.TrendSettings",
     "gsparc.bearings.sources.SearchSettings": "gsparc.array.moving.triangulate.SearchSettings",
@@ -43,12 +42,18 @@ OLD_KEYS = {  # settings of models
     "bearing_model": "moving_array_model",
     "furniture": "clutter",
 }
+GONE = {  # arguments that a class of that path no longer takes
+    "gsparc.array.method.ArrayField": ("packets", "rows", "cache", "seed"),
+}
 
 
 def renamed(node: Any) -> Any:
-    """A configuration (plain containers) of an earlier version in today's names."""
+    """A configuration (plain containers) of an earlier version in today's names, without what is gone."""
     if isinstance(node, dict):
-        return {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+        now = {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+        target = now.get("_target_")
+        gone = GONE.get(target, ()) if isinstance(target, str) else ()
+        return {key: value for key, value in now.items() if key not in gone}
     if isinstance(node, list):
         return [renamed(value) for value in node]
     return OLD_NAMES.get(node, node) if isinstance(node, str) else node

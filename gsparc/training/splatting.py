@@ -90,7 +90,7 @@ class LearnedField(PredictsVariance):
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
         self._billed = Spent()  # for reusable work, by the stages so far
-        self._frozen: FrozenView | FrozenArray | None = None
+        self.frozen: FrozenView | FrozenArray | None = None
         self._left_out: Any = None  # of the initialiser; not stored
 
     # -- learning ----------------------------------------------------------------------------------
@@ -122,7 +122,7 @@ class LearnedField(PredictsVariance):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             seconds = self._stage("train", origin, data, fold, context, budget, seconds)
-            self._frozen = None
+            self.frozen = None
             return FitReport(seconds, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
@@ -135,7 +135,7 @@ class LearnedField(PredictsVariance):
             again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
             confidence = self.fitted().confidence
             seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
-        self._frozen = None
+        self.frozen = None
         return FitReport(seconds, limited_by=self._limited_by)
 
     def _solved(self, context: FitContext) -> bool:
@@ -262,7 +262,7 @@ class LearnedField(PredictsVariance):
             chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
             parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
             return joined(parts)
-        frozen = self._frozen_view(rx)
+        frozen = self.frozen_at(rx)
         found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
         mean = found.mean.clamp_(0, 1) if model.site.kind == "spectrum" else found.mean
         if model.error is not None and found.unknown is not None:
@@ -271,16 +271,16 @@ class LearnedField(PredictsVariance):
             return Prediction(mean)
         return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))
 
-    def _frozen_view(self, rx: Pose) -> FrozenView | FrozenArray | None:
+    def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """The matrix of the static receiver, made anew after an edit; None for any other pose."""
         model, static = self.fitted(), self._receiver()
         if model.site.kind != "spectrum" or static is None or rx.batched:
             return None
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
             return None
-        if self._frozen is None or self._frozen.version != int(model.gaussians.version):
-            self._frozen = frozen_view(model, rx)
-        return self._frozen
+        if self.frozen is None or self.frozen.version != int(model.gaussians.version):
+            self.frozen = frozen_view(model, rx)
+        return self.frozen
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The model's own mean, not clamped; see `Differentiable`.
@@ -300,11 +300,7 @@ class LearnedField(PredictsVariance):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        model = self.fitted()
-        static = model.site.kind == "spectrum" and model.site.static_end == "rx"
-        known = ("keep", "cutoff", "projection", "confidence")
-        stride = () if reduce.through_array(model) else ("stride",)
-        return (*known, *stride, *(("frozen",) if static else ()))
+        return reduce.knobs(self.fitted())
 
     contributions = reduce.contributions
     reduced = reduce.reduced
@@ -330,7 +326,7 @@ class LearnedField(PredictsVariance):
         self.model = self._new_model(site, torch.zeros(1, 3))
         edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
-        self._frozen = None
+        self.frozen = None
 
     def size(self) -> int:
         """Number of Gaussians."""
@@ -339,10 +335,12 @@ class LearnedField(PredictsVariance):
 
 def joined(parts: Sequence[Prediction]) -> Prediction:
     """Predictions of one method, one after the other."""
-    rest = ([getattr(part, name) for part in parts] for name in ("confidence", "variance"))
-    return Prediction(
-        torch.cat([part.mean for part in parts]), *(None if each[0] is None else torch.cat(each) for each in rest)
-    )
+
+    def both(each: list[Tensor | None]) -> Tensor | None:
+        return None if each[0] is None else torch.cat(each)  # type: ignore[arg-type]
+
+    mean = torch.cat([part.mean for part in parts])
+    return Prediction(mean, both([p.confidence for p in parts]), both([p.variance for p in parts]))
 
 
 def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:
