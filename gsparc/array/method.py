@@ -11,12 +11,13 @@ from gsparc.array.phase_retrieval import recover
 from gsparc.data.schema import Measurements, Site
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.response import ResponseSettings
+from gsparc.methods.method import PredictsVariance
 from gsparc.training.splatting import LearnedField
 
 ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
 
 
-class ArrayField(LearnedField):
+class ArrayField(LearnedField, PredictsVariance):
     """The complex field at a static array as a function of the transmitter's position.
 
     Args:

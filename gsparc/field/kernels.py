@@ -83,7 +83,7 @@ def whitened(rows: Tensor, length: float, noise: float, name: Correlation, most:
         eye = torch.eye(len(rows), dtype=rows.dtype)
         inverse = torch.linalg.solve_triangular(lower, eye, upper=False)
         return Whitened(rows, inverse.T.contiguous(), inverse)
-    return with_places(rows[apart(rows, length, noise, name, most)], rows, length, noise, name)
+    return with_places(rows[apart(rows, length, ENOUGH * noise, name, most)], rows, length, noise, name)
 
 
 def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Whitened:
@@ -101,18 +101,18 @@ def with_places(places: Tensor, rows: Tensor, length: float, noise: float, name:
     return Whitened(places, whitening.contiguous(), weigh)
 
 
-def apart(rows: Tensor, length: float, noise: float, name: Correlation, most: int) -> Tensor:
+def apart(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
     """Indices of up to `most` rows (n, 3), each the one that those before it tell least about.
 
-    It ends when every row's variance given these is below half the noise: a pivoted Cholesky factorization
-    (Fine and Scheinberg 2001), n times the square of their number in time.
+    It ends when every row's variance given these is at most `enough`: a pivoted Cholesky factorization (Fine
+    and Scheinberg 2001), n times the square of their number in time.
     """
     most = min(most, len(rows))
     left, factor = torch.ones(len(rows), dtype=rows.dtype), rows.new_zeros(most, len(rows))
     chosen: list[int] = []
     while len(chosen) < most:
         row, number = int(left.argmax()), len(chosen)
-        if chosen and float(left[row]) < ENOUGH * noise:
+        if chosen and float(left[row]) <= max(enough, JITTER):
             break
         column = correlation(rows[row : row + 1], rows, length, name)[0]
         column -= factor[:number, row] @ factor[:number]

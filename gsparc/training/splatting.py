@@ -26,7 +26,7 @@ from gsparc.field.initial import InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.response import PathResponse, ResponseSettings
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext, FitReport, Prediction, PredictsVariance
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.origin import Origin
 from gsparc.methods.time_budget import Clock, Spent, TimeBudget, less_repeatable
 from gsparc.ops import Pose
@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
-class LearnedField(PredictsVariance):
+class LearnedField(Method):
     """A Gaussian field trained by gradient.
 
     Args:

@@ -113,7 +113,7 @@ def test_an_array_of_few_spectra_answers_with_a_process_beside_it(tmp_path):
     data = load({"name": "rfid_sim", "count": 32, "root": str(tmp_path / "sim"), "seed": 0})
     rows = np.arange(32)
     fold = Fold(rows[rows % 2 > 0], rows[:0], rows[::2])
-    settings = ["array_model.cache=false", "array_model.packets.samples=300", "effects.array=true"]
+    settings = ["array_model.field.count=64", "effects.array=true"]
     method = build(compose(*(f"model.{s}" for s in settings), "model.effects.hybrid=true").model)
     method.fit(data, fold, FitContext(tmp_path))
     array, beside = method._models["array"], method._companion

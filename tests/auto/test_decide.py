@@ -117,7 +117,7 @@ def test_an_array_that_cannot_foretell_spectra_gives_way_to_their_images(tmp_pat
     apart = np.random.default_rng(0).uniform([0.5, 0.5, 0.5], [5.5, 4.5, 2.0], (40, 3))
     data = measure(site, apart, room_vectors(apart, 1, site.array)[0], sha256="apart")
     fold = Fold(np.arange(36), np.arange(0), np.arange(36, 40))
-    trial = ArrayField(cache=False)
+    trial = ArrayField()
     assert probe_array(trial, data, fold, seed=0).on  # it explains them all the same
     monkeypatch.chdir(tmp_path)
     decision = contest_array(trial, GaussianProcess(), data, fold, seed=0)
