@@ -26,7 +26,7 @@ ARROWS = {
     "field": "data ops physics",
     "methods": "data ops",
     "training": "data field methods ops",
-    "array": "data field methods ops physics",
+    "array": "data field methods ops physics training",
     "multipath": "data field methods ops physics",
     "peers": "data field methods ops physics training",
     "auto": "data field methods ops training",

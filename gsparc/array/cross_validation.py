@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from gsparc.array.vector_gp import Kernel, align, refine_alignment
+from gsparc.field.confidence import LEAST_UNKNOWN
 from gsparc.methods.gp import choose_kernel
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
@@ -22,7 +23,6 @@ ROWS = 384  # neighbouring samples used: the inverse costs their cube
 CENTRES = 160  # of them predicted
 STEPS = 36  # evaluations of Nelder-Mead
 WEIGHTS = np.linspace(0, 1, 21)  # candidates of the ensemble weight of a process on images
-MIN_VARIANCE = 1e-3  # of the variance is always unknown: quantisation, recovery
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
 
 
@@ -109,12 +109,12 @@ class Tuned:
     left_out: LeftOut | None = None
 
     def error_model(self) -> tuple[float, float]:
-        """(a, p): the expected squared error of a pixel is about `a (unknown + MIN_VARIANCE)^p`.
+        """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
         The likeliest for errors that are exponential about it, so that their mean is right at every level: a
         line through logarithms would fit the many small errors and miss the few large ones.
         """
-        x, y = np.log(self.unknown + MIN_VARIANCE), self.error + 1e-9
+        x, y = np.log(self.unknown + LEAST_UNKNOWN), self.error + 1e-9
 
         def deviance(parameters: np.ndarray) -> float:
             level = parameters[0] + np.clip(parameters[1], 0.0, 2.0) * x

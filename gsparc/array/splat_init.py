@@ -1,19 +1,22 @@
-"""Initialise a splatted field with an array response from the array's complex vectors, in closed form.
+"""A splatted field whose array vectors are the posterior of the vector process, in closed form.
 
 Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen plan.
-The minimum-norm emission of each vector is regressed on kernel features of the position.
+Emissions are linear in the features of the process (`gsparc.field.kernels`), whose weights give its posterior
+mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The same features tell the unknown share.
 """
 
 from __future__ import annotations
 
+import logging
 from dataclasses import astuple, dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from gsparc.array.cross_validation import tune
+from gsparc.array.cross_validation import LeftOut, tune
 from gsparc.array.vector_cache import recovered, report
 from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
 from gsparc.data.files import platform_cache
@@ -21,53 +24,88 @@ from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import seen_by_array
 from gsparc.field.initial import InitTask, Start
+from gsparc.field.kernels import whitened
 from gsparc.field.model import GaussianModel
+from gsparc.field.response import ArrayResponse
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.methods.time_budget import Spent, TimeBudget
 from gsparc.ops import Pose
 from gsparc.physics.array_response import steering
 
+log = logging.getLogger(__name__)
+
+MOST_ROWS = 5000  # training spectra; of more, so many are drawn: time grows with their cube
 RIDGE = 1e-3  # of the largest singular value of G: bounds the norm of emissions
-MIN_NOISE = 1e-3  # of the kernel's variance, for the ridge regression
 
 
 @dataclass(frozen=True)
-class Vectors:
-    """Array vectors of training spectra, phases and twins aligned, and the kernel of their variation.
+class Learned:
+    """What training spectra say about a field through their array.
 
     Attributes:
-        rows: (n,) of the dataset.
-        vectors: (n, M) complex128.
         prior: features of the emission.
+        weights: (E, M) complex128, features to array vectors.
+        background: (H, W) float32, the mean spectrum.
+        error: level and power of the field's `ErrorModel`.
+        left_out: training spectra predicted without their neighbours; None for too few.
         elapsed, training: time of phase retrieval in this run, and when it was computed.
         time_limited: whether seconds ended it.
     """
 
-    rows: np.ndarray
-    vectors: np.ndarray
     prior: Prior
+    weights: Tensor
+    background: Tensor
+    error: tuple[float, float]
+    left_out: LeftOut | None
     elapsed: Spent
     training: Spent
     time_limited: bool
 
 
 class ThroughArray:
-    """Gaussians whose emissions through the array give the retrieved vectors; see `Initialiser`."""
+    """Gaussians whose emissions through the array are the posterior of its vectors; see `Initialiser`."""
 
     def __call__(self, task: InitTask) -> Start:
-        """Retrieve the vectors of the training rows."""
+        """Retrieve the vectors of the training rows and fit their process.
+
+        Raises:
+            ValueError: no array, no rows, or an emission that is not linear in its features.
+        """
         assert task.receiver is not None
-        found = aligned_vectors(task.data, task.rows, task.anchors, task.seed, task.run_dir)
-        solve = partial(start, data=task.data, found=found, receiver=task.receiver)
+        if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
+            raise ValueError(
+                "model.warm_start=true solves a linear read-out: set model.emission.hidden=0 and "
+                "model.attenuation.inverse_distance=false"
+            )
+        found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         return Start(
-            found.prior, None, solve, astuple(found.training), astuple(found.elapsed), found.time_limited
+            found.prior, None, partial(start, found=found, receiver=task.receiver), astuple(found.training),
+            astuple(found.elapsed), found.time_limited, found.left_out,
         )  # fmt: skip
 
 
-def aligned_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Vectors:
-    """Retrieve the vectors of the given rows (cached where known) and align phases and twins."""
+def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path) -> Learned:
+    """Retrieve the vectors of the given rows (cached where known) and fit their process.
+
+    Args:
+        data: spectra of a static array.
+        rows: (n,) to learn from, at most `MOST_ROWS` of them.
+        anchors: largest number of places that stand for them.
+        seed: of every random choice.
+        run_dir: for the report of phase retrieval.
+
+    Raises:
+        ValueError: the site declares no usable array, or there are no rows.
+    """
     site = data.site
+    if site.array_problem is not None:
+        raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
+    if not len(rows):
+        raise ValueError("the training set is empty")
     assert site.array is not None and site.grid is not None and site.wavelength is not None
+    if len(rows) > MOST_ROWS:
+        rows = np.sort(np.random.default_rng([seed, 5]).permutation(rows)[:MOST_ROWS])
+        log.info("training on %d of the spectra", len(rows))
     watch = TimeBudget()
     found, training = recovered(data, rows, platform_cache(), seed)
     elapsed = watch.counted
@@ -75,37 +113,40 @@ def aligned_vectors(data: Measurements, rows: np.ndarray, anchors: int, seed: in
     matrix = steering(site.array, site.grid, site.wavelength).numpy()
     images = to_real(training_targets(data, rows), "spectrum")
     partner, places = mirror_elements(site.array), data.tx[rows]
-    kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed).kernel
+    tuned = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed)
+    kernel = tuned.kernel
     process = fit_vector_gp(found.vectors, places, partner, kernel)
-    if len(rows) > anchors:
-        places = places[np.sort(np.random.default_rng(seed).choice(len(rows), anchors, replace=False))]
-    prior = Prior(torch.from_numpy(places.astype(np.float32)), kernel.length, max(kernel.noise, MIN_NOISE))
-    return Vectors(rows, process.vectors, prior, elapsed, training, bool(found.time_limited.any()))
+    stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
+    features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
+    log.info(
+        "array: length %.3g m, noise %.2g of the field's variance, %d features of %d spectra",
+        kernel.length, kernel.noise, len(features.places), len(rows),
+    )  # fmt: skip
+    return Learned(
+        Prior(
+            features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
+        ),
+        features.weigh.to(torch.complex128) @ torch.from_numpy(process.vectors),
+        torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
+        tuned.error_model(),
+        tuned.left_out,
+        elapsed,
+        training,
+        bool(found.time_limited.any()),
+    )
 
 
 @torch.no_grad()
-def start(model: GaussianModel, data: Measurements, found: Vectors, receiver: Pose) -> None:
-    """Set the emission's read-out so that the model's array vectors are those of the training spectra.
-
-    Raises:
-        ValueError: the emission has hidden units, or depends on the transmitter's distance.
-    """
-    if model.settings.emission.hidden or model.settings.attenuation.inverse_distance:
-        raise ValueError(
-            "model.warm_start=true solves a linear read-out: set model.emission.hidden=0 and "
-            "model.attenuation.inverse_distance=false"
-        )
+def start(model: GaussianModel, found: Learned, receiver: Pose) -> None:
+    """Set what a fresh model emits, its mean spectrum and its errors to what was learned."""
+    response = model.response
+    assert isinstance(response, ArrayResponse)
     view = seen_by_array(model, receiver)  # (N, M)
     left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
-    damped = size / (size.square() + (RIDGE * size[0]).square())
-    shortest = (right.mH * damped) @ left.mH  # (M, N)
-    places = torch.from_numpy(data.tx[found.rows].astype(np.float32))
-    features = model.emission.encoding(places).to(torch.complex128)
-    gram = features.mT @ features
-    gram.diagonal().add_(found.prior.noise)
-    vectors = torch.from_numpy(found.vectors)
-    readout = torch.linalg.solve(gram, features.mT @ vectors) @ shortest  # (width, N)
-    if data.site.normalisation != "none":  # spectra do not depend on the scale: unit emission power
-        readout = readout / (features @ readout).abs().square().mean().sqrt()
+    damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)
+    readout = found.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
     model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
     model.emission.bias2.zero_()
+    response.background = found.background
+    if model.error is not None:
+        model.error.set(*found.error)

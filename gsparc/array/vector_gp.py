@@ -16,10 +16,9 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from gsparc.field.kernels import ROUGH_RATIO, ROUGH_SHARE
 from gsparc.methods import gp
 
-SHORT_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
-SHORT_RATIO = 1 / 3  # of the lengths
 SWEEPS = 30
 QUERIES = 2048  # at a time: bounds the memory for thousands of samples
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
@@ -29,15 +28,15 @@ TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 class Kernel(gp.Kernel):
     """`amplitude * (a smooth long part + a rough short one + noise * identity)`, of array vectors.
 
-    The long part is Matern-5/2 of `length`, the short one Matern-3/2 of a third of it.
+    `smooth_rough` of `gsparc.field.kernels`, the kernel of the emissions too.
     """
 
     def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """See the base class."""
         distance = cdist(a, b) / self.length
-        smooth, rough = 5**0.5 * distance, 3**0.5 / SHORT_RATIO * distance
+        smooth, rough = 5**0.5 * distance, 3**0.5 / ROUGH_RATIO * distance
         long = (1 + smooth + smooth**2 / 3) * np.exp(-smooth)
-        return (1 - SHORT_SHARE) * long + SHORT_SHARE * (1 + rough) * np.exp(-rough)
+        return (1 - ROUGH_SHARE) * long + ROUGH_SHARE * (1 + rough) * np.exp(-rough)
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:

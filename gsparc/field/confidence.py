@@ -1,4 +1,4 @@
-"""Confidence of a prediction by position: C = 1 + exp(g(x)) (paper, eq. 7; DUSt3R's form)."""
+"""Confidence of a prediction: a network of position (paper, eq. 7; DUSt3R's form), or what is unknown."""
 
 from __future__ import annotations
 
@@ -28,6 +28,45 @@ class ConfidenceSettings(Checked):
     alpha: float = setting(0.3, number(0))
     clamp: float = setting(10.0, number(0, 80, open_low=True))
     encoding: EncodingSettings = field(default_factory=lambda: EncodingSettings(kind="raw"))
+
+
+LEAST_UNKNOWN = 1e-3  # of the variance is always unknown: quantisation, recovery
+ONE = torch.ones(())  # a number would cost each operation of a single query as much again
+
+
+class ErrorModel(nn.Module):
+    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u.
+
+    What errors of left-out training rows say; nothing is learned by gradient.
+
+    Attributes:
+        far: the error far from all data, where u is 1.
+        power: 0 where nothing is said about the share.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.far, self.power = 1.0, 1.0  # numbers: as tensors they would cost a query a tenth of its time
+
+    def set(self, level: float, power: float) -> None:
+        """Take what left-out rows said."""
+        self.far, self.power = level * (1 + LEAST_UNKNOWN) ** power, power
+
+    def forward(self, unknown: Tensor) -> tuple[Tensor, Tensor]:
+        """Confidence (B,) in [0, 1] and variance (B,) of unknown shares (B,).
+
+        The confidence is the share of the squared error expected far from all data that is not expected here.
+        """
+        share = torch.lerp(unknown, ONE, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow_(self.power)
+        return torch.sub(ONE, share), share * self.far
+
+    def get_extra_state(self) -> dict[str, float]:
+        """For `state_dict`."""
+        return {"far": self.far, "power": self.power}
+
+    def set_extra_state(self, state: dict[str, float]) -> None:
+        """From `state_dict`."""
+        self.far, self.power = float(state["far"]), float(state["power"])
 
 
 class Confidence(nn.Module):

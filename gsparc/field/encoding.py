@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, setting, whole
+from gsparc.field.kernels import Correlation, correlation
 
 JITTER = 1e-5  # relative to the unit variance of the kernel
 
@@ -20,8 +21,8 @@ class EncodingSettings(Checked):
 
     Attributes:
         kind: `raw` coordinates (the paper), `fourier` octaves along the axes, or `kernel`: whitened
-            Matern-3/2 similarities to training positions, so that a linear read-out with independent
-            weights is a Gaussian process of the emission.
+            similarities to training positions, so that a linear read-out with independent weights is a
+            Gaussian process of the emission.
         octaves: number of octaves of `fourier`; the first has a period of twice the scene box.
         anchors: largest number of training positions of `kernel`.
     """
@@ -33,17 +34,23 @@ class EncodingSettings(Checked):
 
 @dataclass(frozen=True)
 class Prior:
-    """How smoothly targets change with position: what leave-one-out likelihood found on training data.
+    """How smoothly targets change with position: what leaving training data out found.
 
     Attributes:
         anchors: (M, 3) float32 [m], training positions.
-        length: Matern-3/2 correlation length [m].
+        length: correlation length [m].
         noise: variance of the unexplained part relative to the signal's.
+        kernel: of `correlation`.
+        whitening: (M, M) float32 that counts the noise and all training rows in, of `whitened`: the features'
+            squared length is then the share of the process that these rows tell. None: that of the anchors
+            alone without noise, and nothing is known about the share.
     """
 
     anchors: Tensor
     length: float
     noise: float
+    kernel: Correlation = "matern32"
+    whitening: Tensor | None = None
 
 
 class PositionEncoding(nn.Module):
@@ -61,6 +68,7 @@ class PositionEncoding(nn.Module):
     phases: Tensor
     anchors: Tensor
     whitening: Tensor
+    tells_share = False  # whether the squared length of the features is a share that is known
 
     def __init__(self, settings: EncodingSettings, box: Tensor, prior: Prior | None = None) -> None:
         super().__init__()
@@ -80,14 +88,12 @@ class PositionEncoding(nn.Module):
                 raise ValueError(
                     "model.emission.encoding.kind=kernel needs a prior learned from training positions"
                 )
-            self.length = prior.length
+            self.length, self.noise, self.kernel = prior.length, prior.noise, prior.kernel
+            self.tells_share = prior.whitening is not None
             self.register_buffer("anchors", prior.anchors.float())
-            gram = _matern(prior.anchors.double(), prior.anchors.double(), prior.length)
-            gram += JITTER * torch.eye(len(gram), dtype=gram.dtype)  # repeated positions stay invertible
-            inverse = torch.linalg.solve_triangular(
-                torch.linalg.cholesky(gram), torch.eye(len(gram), dtype=gram.dtype), upper=False
-            )
-            self.register_buffer("whitening", inverse.T.float().contiguous())
+            whitening = _whitening(prior) if prior.whitening is None else prior.whitening
+            # What the prior holds is stored with it.
+            self.register_buffer("whitening", whitening, persistent=prior.whitening is None)
         elif settings.kind != "raw":
             raise ValueError(f"model.emission.encoding.kind={settings.kind!r}: choose raw, fourier or kernel")
 
@@ -95,21 +101,28 @@ class PositionEncoding(nn.Module):
     def width(self) -> int:
         """Number of encoded values."""
         if self.settings.kind == "kernel":
-            return len(self.anchors)
+            return self.whitening.shape[1]
         return 3 + (len(self.frequencies) if self.settings.kind == "fourier" else 0)
 
     def forward(self, position: Tensor) -> Tensor:
         """Encode (B, 3) [m] as (B, width)."""
         if self.settings.kind == "kernel":
-            return _matern(position, self.anchors, self.length) @ self.whitening
+            return correlation(position, self.anchors, self.length, self.kernel) @ self.whitening
         scaled = (position - self.centre) / self.half_extent
         if self.settings.kind == "raw":
             return scaled
         return torch.cat([scaled, torch.cos(scaled @ self.frequencies.T + self.phases)], dim=-1)
 
 
-def _matern(a: Tensor, b: Tensor, length: float) -> Tensor:
-    """Matern-3/2 correlations (A, B) between positions (A, 3) and (B, 3) [m]."""
-    # Differences are formed before squaring: the expanded form loses millimetres in float32.
-    scaled = torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist") * (math.sqrt(3) / length)
-    return (1 + scaled) * torch.exp(-scaled)
+def unknown_share(features: Tensor) -> Tensor:
+    """Posterior variance (B,) of a process in [0, 1], of its prior's: `1 - |phi|^2` of features (B, E)."""
+    return (1 - torch.linalg.vecdot(features, features)).clamp_(0, 1)
+
+
+def _whitening(prior: Prior) -> Tensor:
+    anchors = prior.anchors.double()
+    gram = correlation(anchors, anchors, prior.length, prior.kernel)
+    gram.diagonal().add_(JITTER)  # repeated positions stay invertible
+    eye = torch.eye(len(gram), dtype=gram.dtype)
+    inverse = torch.linalg.solve_triangular(torch.linalg.cholesky(gram), eye, upper=False)
+    return inverse.T.float().contiguous()

@@ -9,10 +9,13 @@ import torch
 from torch import Tensor
 
 from gsparc.field import edit
-from gsparc.field.model import GaussianModel
+from gsparc.field.encoding import unknown_share
+from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.response import ArrayResponse
 from gsparc.ops import FrozenPlan, Pose, StalePlan
+from gsparc.physics.bartlett import SpectrumRenderer
 
+IN_CACHE = 4  # spectra rendered at a time: they stay in the CPU cache
 BLOCK = 128  # Gaussians whose images are in memory at once
 
 
@@ -32,14 +35,14 @@ class FrozenView:
     visible: GaussianModel
 
     @torch.no_grad()
-    def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
+    def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Rendered:
         """Spectra (B, H, W) at tx (B, 3) [m]; `rx` is the pose that was frozen.
 
         Raises:
             StalePlan: the field has changed since.
         """
         _check_version(self.version, model)
-        return self.plan.compose(self.visible.features(tx, rx)).squeeze(1)
+        return Rendered(self.plan.compose(self.visible.features(tx, rx)).squeeze(1), None)
 
 
 @dataclass(frozen=True)
@@ -48,38 +51,74 @@ class FrozenArray:
 
     Attributes:
         version: the field's counter at the time.
-        matrix: (N, M) complex64, emissions to array vectors; or (E, M), encoded positions to array vectors.
-        offset: (M,) complex64, added in the second case; None in the first.
+        view: (N, M) complex64, emissions to array vectors.
+        weights: (E, 2 M + 2) float32, encoded positions to real and imaginary parts of array vectors and,
+            left at 0, of the unknown share; None where emissions are not linear in them.
+        offset: (2 M + 2,) float32, added to them.
+        renderer: array vectors to spectra where the unknown share is known; on the site's grid or a coarser.
     """
 
     version: int
-    matrix: Tensor
+    view: Tensor
+    weights: Tensor | None
     offset: Tensor | None
+    renderer: SpectrumRenderer
 
     @torch.no_grad()
-    def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Tensor:
-        """See `FrozenView.render`."""
+    def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Rendered:
+        """See `FrozenView.render`; spectra of a known share are cut off at 1."""
         _check_version(self.version, model)
-        assert isinstance(model.response, ArrayResponse)
-        if self.offset is None:
+        response = model.response
+        assert isinstance(response, ArrayResponse)
+        if self.weights is None:
             emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
-            return model.response.spectra(emitted @ self.matrix)
-        encoded = model.emission.encoding(model.site.moving(tx, rx))
-        return model.response.spectra(torch.addmm(self.offset, encoded.to(self.matrix.dtype), self.matrix))
+            unknown = model.unknown(tx, rx)
+            return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)
+        moving = model.site.moving(tx, rx)
+        if not model.tells_unknown:
+            encoded = model.emission.encoding(moving)
+            parts = torch.addmm(self.offset, encoded, self.weights).view(len(encoded), -1, 2)
+            return Rendered(response.spectra(torch.view_as_complex(parts)[:, :-1]), None)
+        mean, unknown = tx.new_empty(len(tx), *self.renderer.square.shape), tx.new_empty(len(tx))
+        with torch.inference_mode():  # the results are ordinary tensors, made before
+            encoded = model.emission.encoding(moving)
+            parts = torch.addmm(self.offset, encoded, self.weights)
+            torch.sqrt(unknown.copy_(unknown_share(encoded)), out=parts[:, -2])
+            vectors = torch.view_as_complex(parts.view(len(tx), -1, 2))
+            for start in range(0, len(tx), IN_CACHE):
+                part = slice(start, start + IN_CACHE)
+                self.renderer.draw(vectors[part], mean[part])
+        return Rendered(mean, None, unknown)
 
 
 @torch.no_grad()
 def frozen_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
     """Freeze what a static receiver sees of a model of spectra."""
     version = int(model.gaussians.version)
-    if not isinstance(model.response, ArrayResponse):
-        plan = model.freeze(rx)
-        return FrozenView(version, plan, _subset(plan.order, model))
-    matrix, emission = seen_by_array(model, rx), model.emission
+    if isinstance(model.response, ArrayResponse):
+        return frozen_array(model, seen_by_array(model, rx))
+    plan = model.freeze(rx)
+    return FrozenView(version, plan, _subset(plan.order, model))
+
+
+@torch.no_grad()
+def frozen_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None) -> FrozenArray:
+    """Freeze a model with an array from what the array measures of each Gaussian, `view` (N, M).
+
+    Args:
+        model: the field as it is now.
+        view: of `seen_by_array`.
+        renderer: None takes the response's own.
+    """
+    emission, response, version = model.emission, model.response, int(model.gaussians.version)
+    assert isinstance(response, ArrayResponse)
+    renderer = renderer or response.renderer
     if emission.settings.hidden or model.settings.attenuation.inverse_distance:
-        return FrozenArray(version, matrix, None)
+        return FrozenArray(version, view, None, None, renderer)
     weight, bias = (torch.view_as_complex(part.contiguous()) for part in (emission.weight2, emission.bias2))
-    return FrozenArray(version, weight.T @ matrix, bias @ matrix)
+    lines = torch.nn.functional.pad(torch.cat([weight.T, bias[None]]) @ view, (0, 1))  # and the share
+    parts = torch.view_as_real(lines).flatten(1)
+    return FrozenArray(version, view, parts[:-1].contiguous(), parts[-1], renderer)
 
 
 def _check_version(version: int, model: GaussianModel) -> None:

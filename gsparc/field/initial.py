@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, get_args
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 from torch import Tensor
@@ -104,6 +104,7 @@ class Start:
         billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
             the processor [s].
         time_limited: whether seconds ended that work.
+        left_out: training targets that it predicted without their neighbours, for whoever asks; not stored.
     """
 
     prior: Prior | None
@@ -112,6 +113,7 @@ class Start:
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
     time_limited: bool = False
+    left_out: Any = None
 
 
 class Initialiser(Protocol):

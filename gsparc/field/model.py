@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from gsparc import ops
 from gsparc.data.limits import POSITIVE, Checked, or_null, setting
 from gsparc.data.schema import Site
-from gsparc.field.confidence import Confidence, ConfidenceSettings
+from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel
 from gsparc.field.emission import Emission, EmissionSettings
-from gsparc.field.encoding import PositionEncoding, Prior
+from gsparc.field.encoding import PositionEncoding, Prior, unknown_share
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
 from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
@@ -77,10 +77,18 @@ class ModelSettings:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A prediction and, for spectra, the raster it came from (densification reads its gradients)."""
+    """A prediction and what it came from.
+
+    Attributes:
+        mean: (B, ...) in stored units.
+        raster: of spectra; densification reads its gradients.
+        unknown: (B,) in [0, 1], the share of the field's variance that training positions leave unknown; None
+            where features do not tell.
+    """
 
     mean: Tensor
     raster: Raster | None
+    unknown: Tensor | None = None
 
 
 class GaussianModel(nn.Module):
@@ -125,11 +133,13 @@ class GaussianModel(nn.Module):
         )
         encoding = PositionEncoding(settings.emission.encoding, box, prior)
         self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
-        self.confidence = (
-            Confidence(settings.confidence, PositionEncoding(settings.confidence.encoding, box, prior))
-            if settings.confidence.enabled
-            else None
-        )
+        self.confidence: Confidence | None = None
+        self.error: ErrorModel | None = None  # in its place where the unknown share is known
+        if settings.confidence.enabled and self.tells_unknown:
+            self.error = ErrorModel()
+        elif settings.confidence.enabled:
+            of_position = PositionEncoding(settings.confidence.encoding, box, prior)
+            self.confidence = Confidence(settings.confidence, of_position)
         static = receiver.position if receiver is not None else transmitter
         apart = None if static is None else float((static.float() - box.mean(0)).norm())
         self.d_ref = settings.attenuation.d_ref or (apart if apart and apart > 0.1 else 1.0)
@@ -160,6 +170,18 @@ class GaussianModel(nn.Module):
         """Real outputs of each emission network: one power, or one complex gain."""
         return 2 if self.site.kind == "csi" or self.settings.response.array else 1
 
+    @property
+    def tells_unknown(self) -> bool:
+        """Whether the emission's features tell what training positions leave unknown, and spectra show it."""
+        return self.settings.response.array and self.emission.encoding.tells_share
+
+    @torch.autocast("cpu", enabled=False)
+    def unknown(self, tx: Tensor, rx: Pose) -> Tensor | None:
+        """Share f^2 (B,) of the field's variance that is unknown; None where features do not tell."""
+        if not self.tells_unknown:
+            return None
+        return unknown_share(self.emission.encoding(self.site.moving(tx, rx)))
+
     @torch.autocast("cpu", enabled=False)  # a kernel expansion cancels: half precision costs 8 dB
     def features(self, tx: Tensor, rx: Pose) -> Tensor:
         """Attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
@@ -188,8 +210,9 @@ class GaussianModel(nn.Module):
         plan = self.plan(rx)
         if self.site.kind == "spectrum":
             raster = ops.composite(plan, *self.gaussians.geometry(), features)
-            image = raster.image
-            return Rendered(self.response(image) if self.response else image.squeeze(1), raster)
+            image, unknown = raster.image, self.unknown(tx, rx)
+            mean = self.response(image, unknown) if self.response else image.squeeze(1)
+            return Rendered(mean, raster, unknown)
         weights = ops.mean_weights(plan, *self.gaussians.geometry()).share
         if self.response is None:
             return Rendered((weights.unsqueeze(-1) * features).sum(1), None)

@@ -14,12 +14,13 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, number, setting
 from gsparc.data.schema import Site
-from gsparc.ops import Pose
+from gsparc.ops import Pose, SphereGrid
 from gsparc.ops.channels import channels
 from gsparc.physics.array_response import array_output, element_pattern, normalised, steering
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.waves import LIGHT, ranges, wave_over_band
 
+SLOPE_ENDS = 1e-12  # of an unknown share: its square root has a finite slope above
 UNEVEN = 1e-6  # tones this far off an even comb, in spacings, are evaluated one by one
 
 
@@ -29,7 +30,9 @@ class ResponseSettings(Checked):
 
     Attributes:
         array: spectra arise in the static array: complex emissions are composited per direction to z, the
-            elements measure `h = A z`, and the spectrum is `|A^H h|`, normalised as the dataset is.
+            elements measure `h = A z`, and the spectrum is `sqrt(|A^H h|^2 + f^2 mean^2)` with the share f^2
+            of the field that training positions leave unknown; where emissions tell none (not started in
+            closed form), `|A^H h|` normalised as the dataset is.
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
         carrier: channels take phase, delay and 1/r from the path between Gaussian and receiver. Gaussians
             then do not occlude; visibility is part of the emission.
@@ -152,28 +155,48 @@ class ArrayResponse(nn.Module):
         super().__init__()
         if site.array_problem is not None:
             raise ValueError(f"model.response.array=true is not possible: {site.array_problem}")
-        array, self.grid, wavelength = site.array_geometry()
+        self.array, self.grid, self.wavelength = site.array_geometry()
         self.normalisation = site.normalisation
-        matrix = steering(array, self.grid, wavelength).to(torch.complex64)
+        matrix = steering(self.array, self.grid, self.wavelength).to(torch.complex64)
         self.register_buffer("matrix", matrix, persistent=False)
         elements = element_pattern(self.grid, pattern) if pattern else None
         self.register_buffer("pattern", elements, persistent=False)
         no_background = torch.zeros(self.grid.height, self.grid.width)
-        self.renderer = SpectrumRenderer(array, self.grid, wavelength, no_background)
+        self.renderer = SpectrumRenderer(self.array, self.grid, self.wavelength, no_background)
 
     def measured(self, image: Tensor) -> Tensor:
         """Array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
         waves = torch.complex(image[:, 0], image[:, 1])
         return array_output(waves, self.matrix, self.grid, self.pattern)
 
-    def spectra(self, vectors: Tensor) -> Tensor:
-        """Published spectra (B, H, W) of array vectors (B, M)."""
+    @property
+    def background(self) -> Tensor:
+        """Mean spectrum (H, W), what an unknown field is expected to look like."""
+        return self.renderer.square.sqrt()
+
+    @background.setter
+    def background(self, image: Tensor) -> None:
+        self.renderer.square.copy_(image.square())
+
+    def every(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
+        """The renderer on `grid`, every `stride`-th row and column of its own."""
+        return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
+
+    def spectra(self, vectors: Tensor, unknown: Tensor | None = None) -> Tensor:
+        """Published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if there are any.
+
+        Vectors beside a share have the scale of published spectra: the mean of an uncertain one has no
+        maximum of 1 to be divided by.
+        """
+        if unknown is not None:
+            share = unknown.clamp_min(SLOPE_ENDS).sqrt()
+            return self.renderer(torch.cat([vectors, share[:, None].to(vectors.dtype)], 1))
         known = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # no incoherent background
         if self.normalisation != "none":  # scaled first: the slope is cut off below a fixed amplitude
             known = known / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
         image = self.renderer(known).flatten(1)
         return normalised(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
 
-    def forward(self, image: Tensor) -> Tensor:
-        """Composited fields (B, 2, H, W) -> spectra (B, H, W)."""
-        return self.spectra(self.measured(image))
+    def forward(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:
+        """Composited fields (B, 2, H, W) and unknown shares (B,) -> spectra (B, H, W)."""
+        return self.spectra(self.measured(image), unknown)

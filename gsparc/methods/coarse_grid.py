@@ -37,11 +37,8 @@ class Filled(View):
     def __init__(self, inner: Method, grid: SphereGrid, stride: int) -> None:
         super().__init__(inner)
         height, width = (grid.height - 1) // stride + 1, grid.width // stride
-        place = torch.arange(grid.height) / stride
-        low = place.floor().long()
-        share, eye = (place - low)[:, None], torch.eye(height)
-        # Rows past the last rendered one repeat it.
-        self._rows = (1 - share) * eye[low] + share * eye[(low + 1).clamp_max(height - 1)]
+        self._height = grid.height
+        self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it
         self._next = torch.arange(1, width + 1)
         self._next[-1] = 0 if grid.periodic else width - 1
         self._between = torch.arange(stride) / stride
@@ -54,5 +51,8 @@ class Filled(View):
 
     def fill(self, image: Tensor) -> Tensor:
         """(B, h, w) -> (B, H, W)."""
-        wide = torch.lerp(image[..., None], image.index_select(2, self._next)[..., None], self._between)
-        return torch.matmul(self._rows, wide.flatten(2))
+        beside = image.index_select(2, self._next)
+        wide = torch.lerp(image[..., None], beside[..., None], self._between).flatten(2)
+        below = wide.index_select(1, self._below)
+        tall = torch.lerp(wide[:, :, None], below[:, :, None], self._between[:, None])
+        return tall.flatten(1, 2)[:, : self._height]

@@ -8,7 +8,6 @@ OLD_NAMES: dict[str, str] = {  # classes, by import path
     "gsparc.array.field.ArrayField": "gsparc.array.method.ArrayField",
     "gsparc.array.moving.method.BearingField": "gsparc.array.moving.method.MovingArrayField",
     "gsparc.array.moving.method.TrendSettings": "gsparc.array.moving.power_gp.TrendSettings",
-    "gsparc.array.packets.PacketSettings": "gsparc.array.wave_packets.PacketSettings",
     "gsparc.bearings.field.BearingField": "gsparc.array.moving.method.MovingArrayField",
     "gsparc.bearings.field.TrendSettings": "gsparc.array.moving.power_gp.TrendSettings",
     "gsparc.bearings.sources.SearchSettings": "gsparc.array.moving.triangulate.SearchSettings",
@@ -46,13 +45,20 @@ CHOSEN = (  # settings of the models that it chose among
     *("phase_model", "phase_probe", "array_model", "moving_array_model", "directional_model"),
     *("bearing_model", "directed_model"),
 )
+GONE = {  # arguments that a class of that path no longer takes
+    "gsparc.array.method.ArrayField": ("packets", "rows", "cache", "seed"),
+}
 
 
 def renamed(node: Any) -> Any:
-    """A configuration (plain containers) of an earlier version in today's names."""
+    """A configuration (plain containers) of an earlier version in today's names, without what is gone."""
     if isinstance(node, dict):
-        found = {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
-        return _one_field(found) if found.get("_target_") == FIELD and "phase_model" in found else found
+        now = {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+        target = now.get("_target_")
+        if target == FIELD and "phase_model" in now:
+            return _one_field(now)
+        gone = GONE.get(target, ()) if isinstance(target, str) else ()
+        return {key: value for key, value in now.items() if key not in gone}
     if isinstance(node, list):
         return [renamed(value) for value in node]
     return OLD_NAMES.get(node, node) if isinstance(node, str) else node

@@ -12,6 +12,7 @@ Settings = Mapping[str, Any]  # what is spared; a knob that is absent stays as t
 
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",
+    "anchors": lambda value: f"{value:.0%} of the places",
     "stride": lambda value: f"1 of {value} x {value} pixels",
     "cutoff": lambda value: f"cut-off x{value:g}",
     "projection": lambda value: f"{value} projection",

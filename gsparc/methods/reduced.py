@@ -18,7 +18,7 @@ from gsparc.ops import Pose
 log = logging.getLogger(__name__)
 
 AS_TRAINED = {  # else: None
-    "keep": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True, "hybrid": True,
+    "keep": 1.0, "anchors": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True, "hybrid": True,
 }  # fmt: skip
 Measured = dict[str, Tensor]
 

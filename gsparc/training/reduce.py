@@ -13,7 +13,10 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements
 from gsparc.field import edit
+from gsparc.field.fewer_features import tell_with_fewer
+from gsparc.field.frozen import FrozenArray, frozen_array
 from gsparc.field.model import FULL_SPHERE_ROWS, GaussianModel
+from gsparc.field.response import ArrayResponse
 from gsparc.methods.coarse_grid import Filled, coarser
 from gsparc.methods.method import Method, Prediction
 from gsparc.methods.pareto import Settings
@@ -31,6 +34,19 @@ MOST_ROWS = 64  # positions over which a contribution is averaged
 def through_array(model: GaussianModel) -> bool:
     """Whether images are formed by an array from the splatted ones: on pixels of its own."""
     return model.settings.response.array
+
+
+def knobs(model: GaussianModel) -> tuple[str, ...]:
+    """See `Reducible`.
+
+    Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
+    places that the features are told by, and pixels.
+    """
+    if model.tells_unknown:
+        return ("anchors", "stride", "confidence", "frozen")
+    stride = () if through_array(model) else ("stride",)
+    static = model.site.kind == "spectrum" and model.site.static_end == "rx"
+    return ("keep", "cutoff", "projection", "confidence", *stride, *(("frozen",) if static else ()))
 
 
 @torch.no_grad()
@@ -64,8 +80,9 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
 
     Args:
         method: fitted.
-        settings: `keep` share of Gaussians in (0, 1]; `stride` in pixels; `cutoff` factor on the smallest
-            alpha that counts; `projection`; `frozen` plan or not; `confidence` or not.
+        settings: `keep` share of Gaussians in (0, 1]; `anchors` share of the places that features are told
+            by; `stride` in pixels; `cutoff` factor on the smallest alpha that counts; `projection`; `frozen`
+            plan or not; `confidence` or not.
         measured: from `measure`.
     """
     twin = copy.copy(method)
@@ -88,10 +105,15 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
             teach(model, method.fitted(), measured["receiver"])
         else:
             _keep(model, measured["contribution"].topk(math.ceil(share * total)).indices)
+    if "anchors" in settings:
+        tell_with_fewer(model, float(settings["anchors"]))
     if not settings.get("confidence", True):
-        model.confidence = None
+        model.confidence = model.error = None
     model.gaussians.version += 1  # a plan frozen before is stale
     found: Method = twin if settings.get("frozen", True) else Live(twin)
+    if model.tells_unknown and found is twin and not {"keep", "cutoff", "projection"} & set(settings):
+        twin.frozen, grid = _frozen_again(method, model, measured["receiver"], stride)
+        return Filled(found, grid, stride) if stride > 1 else found
     if stride == 1:
         return found
     if site.kind != "spectrum":  # visibility is measured on fewer directions, nothing to fill in
@@ -101,6 +123,20 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
     assert site.grid is not None
     model.site = replace(site, grid=coarser(site.grid, stride))
     return Filled(found, site.grid, stride)
+
+
+def _frozen_again(
+    method: LearnedField, model: GaussianModel, receiver: Tensor, stride: int
+) -> tuple[FrozenArray, SphereGrid]:
+    """The field through its array with other features and on fewer pixels, and their full grid.
+
+    What the array measures of each Gaussian is that of the full grid.
+    """
+    view = method.frozen_at(Pose(receiver[0], receiver[1:]))
+    response, grid = model.response, model.site.grid
+    assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
+    renderer = response.every(stride, coarser(grid, stride)) if stride > 1 else None
+    return frozen_array(model, view.view, renderer), grid
 
 
 class Live(View):

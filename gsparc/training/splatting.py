@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import check_arguments, switch
+from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field import edit
@@ -58,6 +58,7 @@ class LearnedField(Method):
             `auto` does so where it can.
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best validation, and end early when none is better.
+        steps: of gradient, at most; None: `trainer.max_steps`. 0 after a closed-form start: it is the answer.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -80,14 +81,17 @@ class LearnedField(Method):
         warm_start: bool | Literal["auto"] = "auto",
         refit: bool = True,
         keep_best: bool = True,
+        steps: int | None = None,
         guesses: Sequence[str] = (),
     ) -> None:
-        check_arguments(locals(), warm_start=switch("auto"), refit=switch(), keep_best=switch())
+        check_arguments(
+            locals(), warm_start=switch("auto"), refit=switch(), keep_best=switch(), steps=or_null(whole(0))
+        )
         response = response or ResponseSettings()
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.warm_start, self.refit, self.guesses = warm_start, refit, tuple(guesses)
-        self.keep_best = keep_best
+        self.keep_best, self.most_steps = keep_best, steps
         self.model: GaussianModel | None = None
         self.site: Site | None = None
         self.choices: Choices | None = None
@@ -97,7 +101,8 @@ class LearnedField(Method):
         self._paying: int | None = None  # position in the schedule after which steps did not pay
         self.steps, self.init_s = 0, 0.0  # gradient steps of the last stage, seconds of all initialisers
         self._billed = Spent()  # for reusable work, by the stages so far
-        self._frozen: FrozenView | FrozenArray | None = None
+        self.frozen: FrozenView | FrozenArray | None = None
+        self._left_out: Any = None  # of the initialiser; not stored
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -105,7 +110,7 @@ class LearnedField(Method):
         """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
 
         The second stage (`refit`) trains again on both with the confidence fixed, because the baselines
-        learn from all of them.
+        learn from all of them. Without steps (`steps=0`) both are solved at once.
         """
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
@@ -124,6 +129,12 @@ class LearnedField(Method):
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
+        if self._solved():
+            if self.refit:
+                fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
+            seconds = self._stage("train", origin, data, fold, context, budget, seconds)
+            self.frozen = None
+            return FitReport(seconds, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
@@ -136,8 +147,12 @@ class LearnedField(Method):
             again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
             confidence = self.fitted().confidence
             seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
-        self._frozen = None
+        self.frozen = None
         return FitReport(seconds, limited_by=self._limited_by)
+
+    def _solved(self) -> bool:
+        """Whether the closed-form start is the answer."""
+        return self.most_steps == 0 and self.choices is not None and self.choices.warm_start
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
@@ -162,7 +177,7 @@ class LearnedField(Method):
                     context.seed, folder,
                 )
             )  # fmt: skip
-            self._prior = start.prior
+            self._prior, self._left_out = start.prior, start.left_out
             self.model = self._new_model(data.site, start.sources)
             start.solve(self.model)
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
@@ -176,7 +191,9 @@ class LearnedField(Method):
         budget.pause()
         prepared = (budget.counted - started).wall
         self.init_s += prepared
-        steps, pace = total_steps(context), None
+        if self._solved():
+            return prepared
+        steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None
         if context.budget_s is not None:
             first = stage == "train" and self.refit and len(fold.val)  # half is left for the second stage
             end = context.budget_s * (0.5 if first else 1.0)
@@ -267,26 +284,26 @@ class LearnedField(Method):
         if len(tx) > QUERY_CHUNK:
             chunks = [slice(i, i + QUERY_CHUNK) for i in range(0, len(tx), QUERY_CHUNK)]
             parts = [self.predict(tx[chunk], rx[chunk] if rx.batched else rx) for chunk in chunks]
-            confidence = None if parts[0].confidence is None else torch.cat([p.confidence for p in parts])  # type: ignore[misc]
-            return Prediction(torch.cat([p.mean for p in parts]), confidence)
-        frozen = self._frozen_view(rx)
-        mean = model(tx, rx).mean if frozen is None else frozen.render(model, tx, rx)
-        if model.site.kind == "spectrum":
-            mean = mean.clamp(0, 1)
+            return joined(parts)
+        frozen = self.frozen_at(rx)
+        found = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
+        mean = found.mean.clamp_(0, 1) if model.site.kind == "spectrum" else found.mean
+        if model.error is not None and found.unknown is not None:
+            return Prediction(mean, *model.error(found.unknown))
         if model.confidence is None:
             return Prediction(mean)
         return Prediction(mean, model.confidence.normalised(model.site.moving(tx, rx)))
 
-    def _frozen_view(self, rx: Pose) -> FrozenView | FrozenArray | None:
+    def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """The matrix of the static receiver, made anew after an edit; None for any other pose."""
         model, static = self.fitted(), self._receiver()
         if model.site.kind != "spectrum" or static is None or rx.batched:
             return None
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
             return None
-        if self._frozen is None or self._frozen.version != int(model.gaussians.version):
-            self._frozen = frozen_view(model, rx)
-        return self._frozen
+        if self.frozen is None or self.frozen.version != int(model.gaussians.version):
+            self.frozen = frozen_view(model, rx)
+        return self.frozen
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The model's own mean, not clamped; see `Differentiable`.
@@ -306,11 +323,7 @@ class LearnedField(Method):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        model = self.fitted()
-        static = model.site.kind == "spectrum" and model.site.static_end == "rx"
-        known = ("keep", "cutoff", "projection", "confidence")
-        stride = () if reduce.through_array(model) else ("stride",)
-        return (*known, *stride, *(("frozen",) if static else ()))
+        return reduce.knobs(self.fitted())
 
     contributions = reduce.contributions
     reduced = reduce.reduced
@@ -336,11 +349,21 @@ class LearnedField(Method):
         self.model = self._new_model(site, torch.zeros(1, 3))
         edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
-        self._frozen = None
+        self.frozen = None
 
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.fitted().gaussians)
+
+
+def joined(parts: Sequence[Prediction]) -> Prediction:
+    """Predictions of one method, one after the other."""
+
+    def both(each: list[Tensor | None]) -> Tensor | None:
+        return None if each[0] is None else torch.cat(each)  # type: ignore[arg-type]
+
+    mean = torch.cat([part.mean for part in parts])
+    return Prediction(mean, both([p.confidence for p in parts]), both([p.variance for p in parts]))
 
 
 def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""The static-array model end to end: renderer, packets, Gaussian process, kernel choice, state, queries."""
+"""The static-array model end to end: renderer, Gaussian process, kernel choice, state, queries."""
 
 from __future__ import annotations
 
@@ -10,14 +10,16 @@ import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
 
+from gsparc.array import splat_init
 from gsparc.array.cross_validation import tune
 from gsparc.array.method import ArrayField
 from gsparc.array.vector_gp import Kernel, fit_vector_gp, mirror_elements, refine_alignment, twin
-from gsparc.array.wave_packets import PacketSettings, WavePackets, distil
 from gsparc.data.campaigns.rfid import planar_array
 from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold, Split, indices_hash
 from gsparc.evaluation.scores import score
+from gsparc.field.encoding import EncodingSettings
+from gsparc.field.gaussians import FieldSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.registry import method_class
@@ -25,7 +27,7 @@ from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering
 from gsparc.physics.bartlett import SpectrumRenderer
 
-SMALL = PacketSettings(count=300, samples=1500)
+SMALL = FieldSettings(count=64)
 
 
 def _fold(rows, seed=0):
@@ -67,47 +69,12 @@ def test_renderer_gradient():
     assert torch.autograd.gradcheck(lambda v: renderer(torch.view_as_complex(v)), [real])
 
 
-def test_packets_vanish_far_away():
-    packets = WavePackets(torch.rand(20, 3), torch.full((20,), 0.1), torch.randn(20, 3), torch.zeros(3), 4)
-    with torch.no_grad():
-        packets.gains.normal_()
-        out = packets(torch.tensor([[50.0, 0.0, 0.0], [1e4, -1e4, 3.0]]))
-    assert torch.equal(out[:, :4], torch.zeros_like(out[:, :4])) and (out[:, 4] == 1).all()
-
-
-@pytest.mark.parametrize("extent,wavelength", [(3.0, 0.33), (10.0, 0.0107), (100.0, 0.125), (100.0, 0.005)])
-def test_packets_far_from_the_middle_are_as_good_as_float64(extent, wavelength):
-    """The exponent is a difference of squares of site / width: in float32 off by 0.6, or infinite."""
-    rng = np.random.default_rng(0)
-    widths = np.resize([0.2, 0.4, 0.8], 60) * wavelength
-    centres, waves = rng.uniform(-extent / 2, extent / 2, (60, 3)), rng.normal(size=(60, 3)) / widths[:, None]
-    parts = [torch.from_numpy(part) for part in (centres, widths, waves, np.zeros(3))]
-    x = (centres + 0.3 * widths[:, None] * rng.normal(size=(60, 3))).astype(np.float32)
-    away = x[:, None].astype(np.float64) - centres
-    window = np.exp(-0.5 * (away**2).sum(-1) / widths**2)
-    phase = (away * waves).sum(-1)
-    found = WavePackets(*parts, elements=4).features(torch.from_numpy(x)).numpy()
-    wanted = np.concatenate([window * np.cos(phase), window * np.sin(phase)], 1)
-    assert np.abs(wanted).max() > 0.5 and np.abs(found - wanted).max() < 1e-5
-
-
 def test_antennas_at_one_place_are_no_array(tmp_path):
     """A Fourier transform of no lags ended in the library's words."""
     site = array_site(SphereGrid.hemisphere(4, 6), np.zeros((4, 3)))
     data = measure(site, walk(12), np.ones((12, 4), complex))
     with pytest.raises(ValueError, match="all antennas of the declared array are at one place"):
-        ArrayField(cache=False).fit(data, _fold(12), FitContext(tmp_path))
-
-
-def test_packets_gradient():
-    c, w = torch.rand(6, 3).double(), torch.randn(6, 3).double()
-    packets = WavePackets(c, torch.full((6,), 0.3).double(), w, torch.zeros(3), 2).double()
-    with torch.no_grad():
-        packets.gains.normal_()
-        packets.gains[:, -2:] *= 0.01  # off the bounds of the share
-        packets.bias[-2] = 0.5
-    x = torch.rand(3, 3).double().requires_grad_()
-    assert torch.autograd.gradcheck(lambda v: torch.view_as_real(packets(v)), [x])
+        ArrayField(SMALL).fit(data, _fold(12), FitContext(tmp_path))
 
 
 def test_alignment_undoes_phases_and_twins(known_campaign):
@@ -146,23 +113,6 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
     assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
 
 
-@pytest.mark.parametrize("length", [0.15, 1.5])
-def test_packets_match_their_teacher(known_campaign, length):
-    """Also a teacher of long correlation: its packets stay within a wavelength."""
-    data, truth = known_campaign
-    scale = truth / np.abs(truth).max()
-    teacher = fit_vector_gp(scale, data.tx, None, Kernel(length, 1e-3))
-    packets = distil(teacher, PacketSettings(count=600, samples=2500), 0.3259, seed=0)
-    for quick, whole in zip(teacher.at_samples(), teacher.posterior(data.tx), strict=True):
-        np.testing.assert_allclose(quick, whole, atol=1e-8)
-    asked = data.tx[::7] + 0.01
-    mean, unknown = teacher.posterior(asked)
-    with torch.no_grad():
-        out = packets(torch.from_numpy(asked).float()).numpy()
-    assert np.linalg.norm(out[:, :-1] - mean) < 0.03 * np.linalg.norm(mean)
-    assert np.abs(out[:, -1].real - np.sqrt(unknown)).max() < 0.1
-
-
 def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
     data, truth = known_campaign
     images = data.target.reshape(160, -1).astype(np.float32) / 255
@@ -177,7 +127,7 @@ def test_tuning_prefers_a_length_that_reaches_over_gaps(known_campaign):
 def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
     data, _ = known_campaign
     split = _split(160)
-    method = ArrayField(SMALL, cache=False)
+    method = ArrayField(SMALL)
     report = method.fit(data, split.folds[0], FitContext(tmp_path))
     assert report.seconds > 0 and (tmp_path / "array_recovery.csv").exists()
     nearest = method_class("nearest")()
@@ -189,25 +139,26 @@ def test_beats_neighbours_is_stored_and_restored(known_campaign, tmp_path):
     batch = data.batch(split.folds[0].test)
     one, other = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
     assert torch.equal(one.mean, other.mean) and torch.equal(one.variance, other.variance)
-    assert again.size() == 300
+    assert again.size() == 64
 
 
 def test_confidence_falls_and_error_grows_with_distance(known_campaign, tmp_path):
     data, _ = known_campaign
-    method = ArrayField(SMALL, cache=False)
+    method = ArrayField(SMALL)
     method.fit(data, _fold(160), FitContext(tmp_path))
     batch = data.batch(np.array([40]))
     away = torch.tensor([[0.0, 0, 0], [0, 0, 0.1], [0, 0, 0.3], [0, 0, 5.0]])
     found = method.predict(batch.tx + away, batch.rx)
     assert (found.confidence.diff() < 0).all() and (found.variance.diff() > 0).all()
     assert found.confidence[-1] == 0 and found.mean.min() >= 0 and found.mean.max() <= 1
-    torch.testing.assert_close(found.mean[-1], method.background, atol=1e-3, rtol=0)
+    background = method.fitted().response.background
+    torch.testing.assert_close(found.mean[-1], background, atol=1e-3, rtol=0)
 
 
 def test_position_errors_cost_smoothly(known_campaign, tmp_path):
     """The sensitivity hook: millimetres change a spectrum by little, centimetres by more."""
     data, _ = known_campaign
-    method = ArrayField(SMALL, cache=False)
+    method = ArrayField(SMALL)
     method.fit(data, _fold(160), FitContext(tmp_path))
     batch = data.batch(np.arange(0, 160, 8))
     still = method.predict(batch.tx, batch.rx).mean
@@ -216,22 +167,21 @@ def test_position_errors_cost_smoothly(known_campaign, tmp_path):
     assert error[0] < 0.02 and error[0] < error[1] < error[2]
 
 
-def test_same_seed_same_answer(known_campaign, tmp_path):
+def test_many_rows_are_thinned_and_told_by_few_places(known_campaign, tmp_path, monkeypatch):
     data, _ = known_campaign
-    batch = data.batch(np.arange(3))
-    answers = []
-    for seed in (0, 0, 1):
-        method = ArrayField(SMALL, cache=False, seed=seed)
-        method.fit(data, _fold(160), FitContext(tmp_path))
-        answers.append(method.predict(batch.tx, batch.rx).mean)
-    assert torch.equal(answers[0], answers[1]) and not torch.equal(answers[0], answers[2])
-
-
-def test_many_rows_are_thinned(known_campaign, tmp_path):
-    data, _ = known_campaign
-    method = ArrayField(SMALL, rows=40, cache=False)
-    method.fit(data, _fold(160), FitContext(tmp_path))
-    assert method.seen == 40
+    whole, few = ArrayField(SMALL), ArrayField(SMALL)
+    whole.fit(data, _fold(160), FitContext(tmp_path))
+    few.settings = replace(
+        few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))
+    )
+    few.fit(data, _fold(160), FitContext(tmp_path))
+    assert few.fitted().emission.encoding.width == 40 and whole.fitted().emission.encoding.width == 128
+    batch = data.batch(_fold(160).test)
+    said = [m.predict(batch.tx, batch.rx).mean for m in (whole, few)]
+    assert (said[0] - said[1]).square().mean() < 5e-3 * batch.target.square().mean()
+    monkeypatch.setattr(splat_init, "MOST_ROWS", 30)
+    few.fit(data, _fold(160), FitContext(tmp_path))
+    assert few.fitted().emission.encoding.width == 30
 
 
 def test_refuses_what_has_no_array(campaign, tmp_path):
@@ -241,10 +191,15 @@ def test_refuses_what_has_no_array(campaign, tmp_path):
         ArrayField().predict(torch.zeros(1, 3), None)
 
 
+def test_a_field_of_wave_packets_is_not_read_any_more():
+    with pytest.raises(ValueError, match="made of wave packets, as earlier versions were; train it again"):
+        ArrayField().restore(array_site(SphereGrid.hemisphere(4, 6), planar_array()), {"packets": {}})
+
+
 @pytest.mark.parametrize("rows", [1, 3])
 def test_very_few_rows(known_campaign, tmp_path, rows):
     data, _ = known_campaign
-    method = ArrayField(SMALL, cache=False)
+    method = ArrayField(SMALL)
     method.fit(data, Fold(np.arange(rows), np.arange(0), np.arange(rows, 10)), FitContext(tmp_path))
     batch = data.batch(np.arange(4))
     assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()
@@ -253,7 +208,7 @@ def test_very_few_rows(known_campaign, tmp_path, rows):
 def test_duplicate_positions(known_campaign, tmp_path):
     data, _ = known_campaign
     data = replace(data, tx=np.repeat(data.tx[::4], 4, axis=0))
-    method = ArrayField(SMALL, cache=False)
+    method = ArrayField(SMALL)
     method.fit(data, _fold(160), FitContext(tmp_path))
     batch = data.batch(np.arange(4))
     assert torch.isfinite(method.predict(batch.tx, batch.rx).mean).all()

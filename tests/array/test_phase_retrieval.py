@@ -76,7 +76,7 @@ def test_rows_that_seconds_gave_up_are_known_also_from_the_cache(known_campaign,
         assert np.flatnonzero(found.time_limited).tolist() == [5]
     fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
     for measured, clock in ((spoilt, "processor"), (data, None)):
-        assert ArrayField(cache=False).fit(measured, fold, FitContext(tmp_path)).limited_by == clock
+        assert ArrayField().fit(measured, fold, FitContext(tmp_path)).limited_by == clock
 
 
 def test_a_zero_spectrum_gives_a_zero_vector(known_campaign):

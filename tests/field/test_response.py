@@ -241,8 +241,8 @@ def _splatted(hidden: int = 0):
 def test_the_small_matrix_says_what_compositing_says(hidden):
     model, tx = _splatted(hidden), torch.rand(5, 3)
     frozen = frozen_view(model, _pose())
-    assert frozen.matrix.shape[1] == 4 and (frozen.offset is None) == bool(hidden)
-    got = frozen.render(model, tx, _pose())
+    assert frozen.view.shape == (30, 4) and (frozen.weights is None) == bool(hidden)
+    got = frozen.render(model, tx, _pose()).mean
     torch.testing.assert_close(got, model(tx, _pose()).mean.detach(), atol=1e-4, rtol=1e-3)
     model.gaussians.version += 1
     with pytest.raises(StalePlan, match="freeze again"):

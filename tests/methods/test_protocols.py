@@ -25,7 +25,7 @@ from gsparc.ops import Pose
 FIXTURES = Path(__file__).parent / "old_checkpoints"
 FILES = {  # of methods whose name has changed since
     "moving_array": "bearings", "image_source_gp": "vsgp", "directional_gp": "directed",
-    "gsparc": "gsparc_field",
+    "gsparc": "gsparc_field", "array": "traded_array_field",
 }  # fmt: skip
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "ridge", "fire", "uplink"), ""),
@@ -36,12 +36,16 @@ DECLARED = {
     "complex_gp": "HasVariance Differentiable LeaveOneOut",
     "directional_gp": "HasVariance Differentiable LeaveOneOut HasPaths",
     "image_source_gp": "HasVariance LeaveOneOut HasPaths Reducible",
-    "array": "HasVariance Reducible Explains ComparesWithGP",
+    "array": "HasVariance Differentiable Reducible Explains ComparesWithGP",
     "moving_array": "HasVariance Reducible Explains",
     "gsparc": "Differentiable HasPaths Reducible",
 }
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
-SMOOTH = {"gsparc": ["gsparc_field", "gsparc_splat_phase"], "gp": ["gp", "gp_power_process"]}
+SMOOTH = {
+    "gsparc": ["gsparc_field", "gsparc_splat_phase"],
+    "gp": ["gp", "gp_power_process"],
+    "array": ["traded_array_field"],
+}
 
 
 def having(protocol: str) -> list[str]:
@@ -107,7 +111,7 @@ def test_gradients_are_those_of_the_predicted_mean(file):
     method = read(FILES.get(file, file))[0]
     assert isinstance(method, Differentiable)
     # What is computed in float32 is asked in float32, with steps that rounding does not hide.
-    exact = not file.startswith("gsparc")
+    exact = not file.startswith(("gsparc", "traded"))
     where = places(method).to(torch.float64 if exact else torch.float32)
     with torch.no_grad():
         said, mean = method.predict(*ends(method, where)).mean, method.mean_at(*ends(method, where))
@@ -167,7 +171,7 @@ def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):
     ("file", "settings"),
     [
         ("traded_gp", {"keep": 0.5, "confidence": False}),
-        ("traded_array", {"keep": 0.5}),
+        ("traded_array_field", {"anchors": 0.5}),
         ("traded_bearings", {"keep": 0.5}),
         ("traded_phase_rest", {"keep": 0.5, "hybrid": False}),
         ("traded", {"keep": 0.5, "confidence": False}),

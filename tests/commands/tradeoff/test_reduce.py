@@ -15,10 +15,10 @@ from campaigns import brief, channels, compose
 from gsparc.array.method import ArrayField
 from gsparc.array.moving.method import MovingArrayField
 from gsparc.array.moving.triangulate import SearchSettings
-from gsparc.array.wave_packets import PacketSettings
 from gsparc.commands.train import train
 from gsparc.data.load import load
 from gsparc.data.splits import Fold
+from gsparc.field.gaussians import FieldSettings
 from gsparc.methods import reduced
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.mean import Mean
@@ -90,25 +90,39 @@ def test_confidence_that_is_spared_is_not_computed(field):
 
 
 @pytest.fixture(scope="module")
-def packets(tmp_path_factory):
+def through_array(tmp_path_factory):
     data = load({"name": "rfid_sim", "count": 48, "root": str(tmp_path_factory.mktemp("sim")), "seed": 0})
-    method = ArrayField(PacketSettings(count=96, samples=500), cache=False)
+    method = ArrayField(FieldSettings(count=64))
     rows = np.arange(48)
     fold = Fold(rows[rows % 4 > 0], rows[:0], rows[::4])
     method.fit(data, fold, FitContext(tmp_path_factory.mktemp("run")))
     return method, data, fold
 
 
-def test_fewer_packets_say_what_all_of_them_said(packets):
-    method, data, fold = packets
+def test_fewer_places_say_what_all_of_them_said(through_array):
+    method, data, fold = through_array
+    assert reduced.knobs(method) == ("anchors", "stride", "confidence", "frozen")
     measured = reduced.contributions(method, data, fold.train)
-    half = reduced.reduced(method, {"keep": 0.5}, measured)
-    few = reduced.reduced(method, {"keep": 0.05}, measured)
-    assert half.size() == 48 and few.size() == 5 and method.size() == 96
-    error = [away(method, way, data, fold.test) for way in (half, few)]
-    assert error[0] < 0.01 and error[0] < error[1]
+    ways = [reduced.reduced(method, {"anchors": share}, measured) for share in (1.0, 0.75, 0.1)]
+    assert [way.fitted().emission.encoding.width for way in ways] == [36, 27, 4]
+    assert method.fitted().emission.encoding.width == 36
+    error = [away(method, way, data, fold.test) for way in ways]
+    assert error[0] < 1e-5 < error[1] < error[2]
+    unsure = [float(answer(way, data, fold.train).confidence.mean()) for way in ways]
+    assert unsure[0] > unsure[1] > unsure[2]
+    live = reduced.reduced(method, {"anchors": 0.75, "frozen": False}, measured)
+    assert away(ways[1], live, data, fold.test) < 1e-4
+
+
+def test_an_array_spares_pixels_and_its_confidence(through_array):
+    method, data, fold = through_array
+    measured = reduced.contributions(method, data, fold.train)
     coarse = reduced.reduced(method, {"stride": 3, "confidence": False}, measured)
     assert away(method, coarse, data, fold.test) < 0.05 and answer(coarse, data, fold.test).confidence is None
+    wide = answer(reduced.reduced(method, {"stride": 2}, measured), data, fold.test)
+    whole = answer(method, data, fold.test)
+    torch.testing.assert_close(wide.mean[:, ::2, ::2], whole.mean[:, ::2, ::2], atol=1e-5, rtol=1e-4)
+    assert torch.equal(wide.confidence, whole.confidence) and torch.equal(wide.variance, whole.variance)
 
 
 def test_a_process_of_sources_spares_searches_sources_and_its_variance(tmp_path):
