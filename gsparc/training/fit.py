@@ -188,8 +188,7 @@ def run_stage(
         options["val_check_interval"] = validate_every
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
-    if pace is not None:
-        options["max_steps"] = -1
+    options["max_steps"] = module.total_steps if pace is None else -1
     trainer = make(
         max_epochs=-1,
         callbacks=[*callbacks, SeveralDevices(), stop],

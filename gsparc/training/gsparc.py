@@ -1,7 +1,7 @@
 """`model=gsparc`: one Gaussian field whatever is measured; terms and initialiser follow from the site.
 
-Where Gaussians are rendered it is trained by rendering (`LearnedField`). Where weights follow from the rows in
-closed form (`ConditionalField`), initialisers find the Gaussians, held-out rows weigh what they found, and
+Where Gaussians are rendered it is trained by rendering (`LearnedField`). Where weights follow from the rows
+in closed form (`ConditionalField`), initialisers find the Gaussians, held-out rows weigh what they found, and
 steps of gradient refine it as long as validation gains.
 """
 
@@ -117,7 +117,7 @@ class Gsparc(LearnedField):
         report = super().fit(data, fold, context)
         self.started = self.choices.init if self.choices is not None else ""
         if self._beside is not None:
-            method, weight = self._beside
+            method = self._beside[0]
             known = np.sort(np.concatenate([fold.train, fold.val]))
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)

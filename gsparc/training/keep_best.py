@@ -1,4 +1,4 @@
-"""Gradient steps that pay: the parameters of the best validation are kept, and steps end when none is better."""
+"""Gradient steps that pay: parameters of the best validation are kept, and steps end when none is better."""
 
 from __future__ import annotations
 
@@ -17,19 +17,23 @@ from gsparc.training.lightning_module import GaussianModule
 log = logging.getLogger(__name__)
 
 PATIENCE = 0.25  # of the schedule without a better validation: an opacity reset takes some of it to recover
+SHORT = 0.1  # the same after a closed-form start, and the share between validations
 LEAST_GAIN = 1e-3  # of the error, for a validation to count as better
 
 
 class KeepBest(L.Callback):
     """Looks before the first step and at every validation; restores the best when training ends.
 
+    Args:
+        patience: share of the schedule without a better validation that ends training.
+
     Attributes:
         position: of the kept parameters in the schedule [steps]; 0: as they were before the first.
         step: the number of steps taken until then.
     """
 
-    def __init__(self) -> None:
-        self.error = float("inf")
+    def __init__(self, patience: float = PATIENCE) -> None:
+        self.patience, self.error = patience, float("inf")
         self.step = self.position = 0
         self._kept: dict[str, Any] | None = None
 
@@ -47,7 +51,7 @@ class KeepBest(L.Callback):
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
         self._look(module, float(trainer.callback_metrics["val/error"]), trainer.global_step)
-        if module.position - self.position > PATIENCE * module.total_steps:
+        if module.position - self.position >= self.patience * module.total_steps:
             trainer.should_stop = True
 
     def _look(self, module: GaussianModule, error: float, step: int) -> None:

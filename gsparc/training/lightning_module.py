@@ -58,7 +58,7 @@ class HasModule(TrainsByGradient, Protocol):
 
 
 class GaussianModule(L.LightningModule):
-    """Trains a Gaussian field: by rendering it, or by the density of left-out rows where weights are closed form.
+    """Trains a Gaussian field: by rendering, or by the density of left-out rows where weights are closed form.
 
     Args:
         model: what is trained.
@@ -70,8 +70,8 @@ class GaussianModule(L.LightningModule):
     """
 
     def __init__(
-        self, model: GaussianModel | ConditionalField, loss: LossSettings, optimizer: OptimizerSettings, total_steps: int,
-        run_dir: Path, pace: Pace | None = None,
+        self, model: GaussianModel | ConditionalField, loss: LossSettings, optimizer: OptimizerSettings,
+        total_steps: int, run_dir: Path, pace: Pace | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.model: Any = model

@@ -35,7 +35,7 @@ from gsparc.training.auto_settings import Choices, resolve, settled
 from gsparc.training.checkpoint_io import GsparcCheckpointIO, interrupted
 from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.initialise import prepare
-from gsparc.training.keep_best import KeepBest, StopAt
+from gsparc.training.keep_best import SHORT, KeepBest, StopAt
 from gsparc.training.lightning_module import GaussianModule, LossSettings
 from gsparc.training.optimizer import OptimizerSettings
 from gsparc.training.time_budget import Pace
@@ -214,10 +214,15 @@ class LearnedField(Method):
         if stage == "refit" and self._paying == 0:
             self.steps = 0
             return prepared
-        watch: list[L.Callback] = [KeepBest()] if self.keep_best and stage == "train" else []
+        watch: list[L.Callback] = []
+        every = None
+        if self.keep_best and stage == "train":
+            assert self.choices is not None
+            watch.append(KeepBest(SHORT) if self.choices.warm_start else KeepBest())
+            every = max(1, round(SHORT / 2 * steps)) if self.choices.warm_start else None
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
-        ran = run_stage(module, data, fold, context, files, budget, watch)
+        ran = run_stage(module, data, fold, context, files, budget, watch, every)
         self.steps = ran.steps
         if stage == "train":
             self._paying = ran.position
