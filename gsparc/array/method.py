@@ -10,6 +10,7 @@ from gsparc.array.cross_validation import compared
 from gsparc.array.phase_retrieval import recover
 from gsparc.data.schema import Measurements, Site
 from gsparc.field.gaussians import FieldSettings
+from gsparc.field.initial import InitSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.methods.method import PredictsVariance
 from gsparc.training.splatting import LearnedField
@@ -36,7 +37,7 @@ class ArrayField(LearnedField, PredictsVariance):
         super().__init__(
             field=field,
             response=ResponseSettings(array=True),
-            warm_start=True,
+            init=InitSettings("vectors"),
             refit=refit,
             name=name,
             steps=0,

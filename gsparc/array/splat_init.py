@@ -74,12 +74,12 @@ class ThroughArray:
         assert task.receiver is not None
         if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
             raise ValueError(
-                "model.warm_start=true solves a linear read-out: set model.emission.hidden=0 and "
+                "init=vectors solves a linear read-out: set model.emission.hidden=0 and "
                 "model.attenuation.inverse_distance=false"
             )
         found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         return Start(
-            found.prior, None, partial(start, found=found, receiver=task.receiver), astuple(found.training),
+            found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
             astuple(found.elapsed), found.time_limited, found.left_out,
         )  # fmt: skip
 

@@ -11,7 +11,6 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import POSITIVE, SHARE, Checked, number, or_null, setting, whole
 
-POINT = 0.05  # [m], standard deviation of a Gaussian that stands for a point
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
 
 
@@ -21,10 +20,9 @@ class FieldSettings(Checked):
 
     Attributes:
         count: initial number of Gaussians N.
-        init: `uniform` in the scene box enlarged by `margin` (the paper), `sphere`: evenly spread
-            directions around the static receiver at distances between `near` and `far`, or
-            `backprojection`: one Gaussian at each source that a search of the training channels finds
-            (then `count` is not used). `auto` is settled by `gsparc.training.auto_settings`.
+        placement: `uniform` in the scene box enlarged by `margin` (the paper), or `sphere`: evenly spread
+            directions around the static receiver at distances between `near` and `far`. `auto` is settled by
+            the group `init` (`gsparc.training.auto_settings`).
         margin: enlargement of the box on each side [m].
         near, far: range of distances of `sphere` [m].
         opacity: initial opacity in (0, 1).
@@ -32,7 +30,7 @@ class FieldSettings(Checked):
     """
 
     count: int = setting(500, whole(0))
-    init: Literal["auto", "uniform", "sphere", "backprojection"] = "auto"
+    placement: Literal["auto", "uniform", "sphere"] = "auto"
     margin: float = setting(2.0, number(0))
     near: float = setting(1.0, number(0))
     far: float = setting(6.0, POSITIVE)
@@ -92,7 +90,6 @@ def initial_field(
     box: Tensor,
     receiver: Tensor | None,
     rotation: Tensor | None,
-    sources: Tensor | None = None,
 ) -> GaussianField:
     """A field before training.
 
@@ -101,28 +98,22 @@ def initial_field(
         box: (2, 3) [m], scene box, local frame.
         receiver: (3,) [m], the static receiver; None when it moves (then `sphere` is refused).
         rotation: (3, 3), its local-to-world rotation.
-        sources: (N, 3) [m], found by a search, for `backprojection`.
 
     Raises:
-        ValueError: `init=sphere` without a static receiver, `init=backprojection` without sources, or an
-            unknown `init`.
+        ValueError: `sphere` without a static receiver, or nothing settled.
     """
     count = settings.count
-    if settings.init == "backprojection":
-        if sources is None:
-            raise ValueError("model.field.init=backprojection needs model.effects.phase=splat")
-        return GaussianField(sources, torch.full((len(sources), 3), POINT), settings.opacity)
-    if settings.init == "uniform":
+    if settings.placement == "uniform":
         low, high = box[0] - settings.margin, box[1] + settings.margin
         means = low + (high - low) * torch.rand(count, 3)
         volume = (high - low).clamp_min(FLAT).prod()  # positions in one plane span none
         spacing = (volume / max(count, 1)) ** (1 / 3)
         scales = torch.full((count, 3), float(settings.scale or spacing / 2))
         return GaussianField(means, scales, settings.opacity)
-    if settings.init != "sphere":
-        raise ValueError(f"model.field.init={settings.init!r}: choose uniform, sphere or backprojection")
+    if settings.placement != "sphere":
+        raise ValueError(f"placement={settings.placement!r} is not settled: choose uniform or sphere")
     if receiver is None or rotation is None:
-        raise ValueError("model.field.init=sphere needs a static receiver; here it moves: use init=uniform")
+        raise ValueError("init=sphere needs a static receiver; here it moves: use init=uniform")
     step = torch.arange(count) + 0.5
     height = step / count  # equal areas on the upper hemisphere
     azimuth = math.pi * (1 + 5**0.5) * step  # golden angle: a Fibonacci lattice

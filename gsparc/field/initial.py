@@ -61,7 +61,6 @@ class InitTask:
 
     Attributes:
         settings: of the model.
-        init: where Gaussians stand, settled: `sphere`, `uniform` or `backprojection`.
         closed_form: whether the emission's read-out is solved before training.
         data: all measurements.
         rows: (n,) to learn from.
@@ -73,7 +72,6 @@ class InitTask:
     """
 
     settings: ModelSettings
-    init: str
     closed_form: bool
     data: Measurements
     rows: np.ndarray
@@ -99,7 +97,6 @@ class Start:
 
     Attributes:
         prior: features of the encodings, or None.
-        sources: (N, 3) places of the Gaussians [m], or None to place them by `init`.
         solve: sets the parameters of a fresh model.
         billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
             the processor [s].
@@ -108,7 +105,6 @@ class Start:
     """
 
     prior: Prior | None
-    sources: Tensor | None = None
     solve: Callable[[GaussianModel], None] = unchanged
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)

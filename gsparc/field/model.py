@@ -16,7 +16,7 @@ from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel
 from gsparc.field.emission import Emission, EmissionSettings
 from gsparc.field.encoding import PositionEncoding, Prior, unknown_share
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
-from gsparc.field.response import ArrayResponse, ChannelResponse, PathResponse, ResponseSettings
+from gsparc.field.response import ArrayResponse, ChannelResponse, ResponseSettings
 from gsparc.ops import Cutoff, FrozenPlan, Plan, Pose, Projection, Raster, SphereGrid
 
 FULL_SPHERE_ROWS = 90  # visibility of channels is measured on 2-degree pixels
@@ -101,7 +101,6 @@ class GaussianModel(nn.Module):
         transmitter: (3,) [m], the static transmitter, or None when it moves.
         prior: smoothness found on training data, for `encoding.kind=kernel`.
         shape: (antennas A, subcarriers K) of a channel; None for one of each.
-        sources: (N, 3) [m], for `field.init=backprojection`.
     """
 
     def __init__(
@@ -112,7 +111,6 @@ class GaussianModel(nn.Module):
         transmitter: Tensor | None = None,
         prior: Prior | None = None,
         shape: tuple[int, int] | None = None,
-        sources: Tensor | None = None,
     ) -> None:
         super().__init__()
         signed = site.kind == "csi" or settings.response.array
@@ -129,7 +127,6 @@ class GaussianModel(nn.Module):
             box,
             None if receiver is None else receiver.position,
             None if receiver is None else receiver.rotation,
-            sources,
         )
         encoding = PositionEncoding(settings.emission.encoding, box, prior)
         self.emission = Emission(settings.emission, len(self.gaussians), self.channels, encoding)
@@ -150,14 +147,12 @@ class GaussianModel(nn.Module):
 
     def _response(
         self, antennas: int, subcarriers: int, transmitter: Tensor | None
-    ) -> ArrayResponse | ChannelResponse | PathResponse | None:
+    ) -> ArrayResponse | ChannelResponse | None:
         site, settings, means = self.site, self.settings.response, self.gaussians.means.detach()
         if settings.array:
             return ArrayResponse(site, settings.pattern)
         if site.kind != "csi":
             return None
-        if settings.carrier:
-            return PathResponse(site, len(means), antennas)
         middle = torch.as_tensor(site.box).float().mean(0)
         lengths = (means - middle).norm(dim=1)
         if transmitter is not None:
@@ -204,9 +199,6 @@ class GaussianModel(nn.Module):
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         features = self.features(tx, rx)
-        if isinstance(self.response, PathResponse):
-            gains = torch.view_as_complex(features.contiguous())
-            return Rendered(self.response(gains, self.gaussians.means, rx), None)
         plan = self.plan(rx)
         if self.site.kind == "spectrum":
             raster = ops.composite(plan, *self.gaussians.geometry(), features)

@@ -1,4 +1,4 @@
-"""From emissions of Gaussians to measurements: channels, carrier phase, an array's spectra.
+"""From emissions of rasterized Gaussians to measurements: channels, an array's spectra.
 
 Each response is one term of the model, with its own gradients; the model holds the one that site and
 settings require.
@@ -14,11 +14,11 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, number, setting
 from gsparc.data.schema import Site
-from gsparc.ops import Pose, SphereGrid
+from gsparc.ops import SphereGrid
 from gsparc.ops.channels import channels
 from gsparc.physics.array_response import array_output, element_pattern, normalised, steering
 from gsparc.physics.bartlett import SpectrumRenderer
-from gsparc.physics.waves import LIGHT, ranges, wave_over_band
+from gsparc.physics.waves import LIGHT
 
 SLOPE_ENDS = 1e-12  # of an unknown share: its square root has a finite slope above
 UNEVEN = 1e-6  # tones this far off an even comb, in spacings, are evaluated one by one
@@ -34,13 +34,10 @@ class ResponseSettings(Checked):
             of the field that training positions leave unknown; where emissions tell none (not started in
             closed form), `|A^H h|` normalised as the dataset is.
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
-        carrier: channels take phase, delay and 1/r from the path between Gaussian and receiver. Gaussians
-            then do not occlude; visibility is part of the emission.
     """
 
     array: bool = False
     pattern: float = setting(0.0, number(0))
-    carrier: bool = False
 
 
 class ChannelResponse(nn.Module):
@@ -85,56 +82,6 @@ class ChannelResponse(nn.Module):
         phase = -2 * math.pi * torch.outer(delays, self.numbers).float()
         comb = torch.polar(torch.ones_like(phase), phase)
         return torch.einsum("bn,na,nk->bak", weighted, torch.view_as_complex(self.steering), comb)
-
-
-class PathResponse(nn.Module):
-    """Channels whose phase, delay and amplitude come from positions: a moving receiver, any band, no grid.
-
-    `h[a, k] = sum_n g_n s_na (f_c / f_k) exp(-j 2 pi f_k r_n / c) / r_n`. With a known array r_n is measured
-    from each element; else s (N, A) is learned.
-
-    Args:
-        site: csi, the receiver moves.
-        count: N.
-        antennas: A.
-    """
-
-    per_gaussian = True
-    array: Tensor
-    tones: Tensor
-
-    def __init__(self, site: Site, count: int, antennas: int) -> None:
-        super().__init__()
-        known = site.array is not None and antennas > 1
-        array = torch.as_tensor(site.array).double() if known else torch.zeros(1, 3, dtype=torch.float64)
-        self.register_buffer("array", array, persistent=False)
-        self.register_buffer("tones", torch.from_numpy(site.tones()), persistent=False)
-        learned = 1 if known else antennas
-        self.steering = nn.Parameter(
-            torch.tensor([1.0, 0.0]).repeat(count, learned, 1), requires_grad=learned > 1
-        )
-        self.carrier_hz = float(site.carrier_hz or self.tones.mean())
-
-    def waves(self, means: Tensor, rx: Pose) -> Tensor:
-        """Spherical waves (P, E, N, K) complex64 of Gaussians (N, 3) [m] at the elements of P poses."""
-        place, turn = rx.position.reshape(-1, 3).double(), rx.rotation.reshape(-1, 3, 3).double()
-        elements = place[:, None] + self.array @ turn.mT
-        distance = ranges(elements.flatten(0, 1), means)
-        waves = wave_over_band(distance, self.tones) * (self.carrier_hz / self.tones).float()
-        return waves.unflatten(0, elements.shape[:2])
-
-    def forward(self, gains: Tensor, means: Tensor, rx: Pose) -> Tensor:
-        """Emitted gains (B, N) complex -> channels (B, A, K) complex."""
-        waves = self.waves(means, rx).expand(len(gains), -1, -1, -1)
-        if waves.shape[1] > 1:
-            return torch.einsum("bn,benk->bek", gains, waves)
-        return torch.einsum("bn,na,bnk->bak", gains, torch.view_as_complex(self.steering), waves[:, 0])
-
-    def contributions(self, gains: Tensor, means: Tensor, rx: Pose) -> Tensor:
-        """Share (N,) of each Gaussian in the total power at B receivers."""
-        gain = torch.view_as_complex(self.steering).abs().square().mean(1)
-        power = (gains.abs().square() * self.waves(means, rx).abs().square().mean((1, 3))).sum(0) * gain
-        return power / power.sum().clamp_min(1e-30)
 
 
 class ArrayResponse(nn.Module):

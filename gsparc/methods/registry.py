@@ -37,7 +37,6 @@ METHODS = {
 }
 
 INITIALISERS = {  # of a splatted field, by the coherent term they are for
-    "carrier": "gsparc.multipath.splat_init.FromSources",
     "array": "gsparc.array.splat_init.ThroughArray",
 }
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 from gsparc.data.schema import Site
+from gsparc.field.initial import InitName
 from gsparc.field.model import ModelSettings
 
 AUTO = "auto"
@@ -18,27 +18,32 @@ class Choices:
     """What `auto` became; stored in checkpoints, so that a model reads back as it was trained.
 
     Attributes:
-        init: as in `FieldSettings`.
+        init: `sphere` or `uniform`, with random weights; `images` or `vectors`, the sphere with weights in
+            closed form.
         encoding: `kind` of the emission's `EncodingSettings`.
         activation: as in `EmissionSettings`.
         init_bias: as in `EmissionSettings`.
-        warm_start: whether the emission starts in closed form.
     """
 
     init: str
     encoding: str
     activation: str
     init_bias: float
-    warm_start: bool
+
+    @property
+    def closed_form(self) -> bool:
+        """Whether the emission's read-out is solved before training."""
+        return self.init in ("images", "vectors")
 
 
-def resolve(
-    settings: ModelSettings, warm_start: bool | Literal["auto"], site: Site
-) -> tuple[Choices, tuple[str, ...]]:
+def resolve(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choices, tuple[str, ...]]:
     """Choices for a site, and one line for each that was `auto`: "init=auto -> uniform: the receiver moves".
 
     A closed-form start needs spectra, a static receiver, a linear read-out and kernel features. Hidden units
     need an encoding of few values, because each Gaussian has a network of its own.
+
+    Raises:
+        ValueError: a closed-form start that these settings or data do not allow.
     """
     emission, spectra, static = settings.emission, site.kind == "spectrum", site.static_end == "rx"
     notes: list[str] = []
@@ -51,19 +56,21 @@ def resolve(
 
     still = "spectra of a static receiver"
     why = (still if static else "the receiver moves") if spectra else f"the target is {site.kind}"
-    coherent = settings.response
-    choice = "backprojection" if coherent.carrier else "sphere" if spectra and static else "uniform"
-    init = decide("init", settings.field.init, choice, "carrier phase" if coherent.carrier else why)
+    through_array = settings.response.array
     choice = "fourier" if emission.hidden else "kernel"
     encoding = decide("encoding.kind", emission.encoding.kind, choice, f"hidden={emission.hidden}")
-    possible = (coherent.carrier or (spectra and static)) and not emission.hidden and encoding == "kernel"
-    started = possible if warm_start == AUTO else bool(warm_start)
-    if warm_start == AUTO:
-        shape = f"hidden={emission.hidden}, encoding.kind={encoding}"
-        notes.append(f"warm_start=auto -> {str(possible).lower()}: {why}, {shape}")
+    possible = spectra and static and not emission.hidden and encoding == "kernel"
+    fitted = "vectors" if through_array else "images"
+    choice = fitted if possible else "sphere" if spectra and static else "uniform"
+    start = decide("init", init, choice, f"{why}, hidden={emission.hidden}, encoding.kind={encoding}")
+    if start in ("images", "vectors") and not (possible and start == fitted):
+        needed = "spectra, a static receiver, model.emission.hidden=0 and encoding.kind=kernel"
+        array = "with" if start == "vectors" else "without"
+        raise ValueError(f"init={start} needs {needed}, {array} effects.array; here {why}")
+    started = start in ("images", "vectors")
     fitting = {"csi": "linear", "rssi": "softplus", "spectrum": "linear" if started else "sigmoid"}
     reason = "a closed-form start" if started else f"the target is {site.kind}"
-    if coherent.array:
+    if through_array:
         fitting["spectrum"], reason = "linear", "fields at an array are signed"
     if emission.log_distance and site.kind != "csi":
         fitting[site.kind], reason = "sigmoid", "log_distance=true"
@@ -76,7 +83,7 @@ def resolve(
             count = max(settings.field.count, 1)
             bias = math.log(math.expm1(1 / count))
             notes.append(f"init_bias=auto -> {bias:.2f}: {count} Gaussians add up to unit power")
-    return Choices(init, encoding, activation, float(bias), started), tuple(notes)
+    return Choices(start, encoding, activation, float(bias)), tuple(notes)
 
 
 def settled(settings: ModelSettings, choices: Choices) -> ModelSettings:
@@ -86,4 +93,5 @@ def settled(settings: ModelSettings, choices: Choices) -> ModelSettings:
     emission = replace(
         settings.emission, encoding=encoding, activation=choices.activation, init_bias=choices.init_bias
     )
-    return replace(settings, field=replace(settings.field, init=choices.init), emission=emission)
+    placement = "uniform" if choices.init == "uniform" else "sphere"
+    return replace(settings, field=replace(settings.field, placement=placement), emission=emission)

@@ -53,7 +53,7 @@ def warm_start(
         ValueError: the emission has hidden units.
     """
     if model.settings.emission.hidden:
-        raise ValueError("model.warm_start=true solves a linear read-out: set model.emission.hidden=0")
+        raise ValueError("init=images solves a linear read-out: set model.emission.hidden=0")
     version = int(model.gaussians.version)
     weights = model.freeze(receiver).render(torch.eye(len(model.gaussians)), version).flatten(1).mT
     gram = weights.mT @ weights

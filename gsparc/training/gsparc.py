@@ -20,7 +20,6 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import CompletedField, ConditionalField, Posterior, StackedField, learns
-from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
@@ -65,16 +64,12 @@ class Gsparc(LearnedField):
 
     Args:
         effects: switches of terms.
-        init: where Gaussians come from.
         **field: see `LearnedField`.
     """
 
-    def __init__(
-        self, effects: EffectSettings | None = None, init: InitSettings | None = None, **field: Any
-    ) -> None:
+    def __init__(self, effects: EffectSettings | None = None, **field: Any) -> None:
         super().__init__(**field)
         self.switches = effects or EffectSettings()
-        self.init = replace(init or InitSettings(), snapshot=self.loss.snapshot)
         self.field: ConditionalField | None = None
         self.plan: Plan | None = None
         self.explained: float | None = None

@@ -15,20 +15,12 @@ def prepare(task: InitTask) -> Start:
     Raises:
         ValueError: a start is asked for that the data do not allow.
     """
-    response = task.settings.response
-    if response.carrier:
-        return initialiser("carrier")(task)
-    if task.init == "backprojection":
-        raise ValueError("model.field.init=backprojection needs model.effects.phase=splat")
-    if response.array and task.closed_form:
+    if task.settings.response.array and task.closed_form:
         return initialiser("array")(task)
     kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
     prior = learn_prior(task.data, task.rows, task.anchors, task.seed) if kernel else None
     if not task.closed_form:
-        return Start(prior, None, unchanged)
-    if task.data.site.kind != "spectrum" or task.receiver is None or prior is None:
-        raise ValueError(
-            "model.warm_start=true needs spectra, a static receiver and model.emission.encoding.kind=kernel"
-        )
+        return Start(prior, unchanged)
+    assert prior is not None and task.receiver is not None  # else `auto_settings` refuses
     solve = partial(warm_start, data=task.data, rows=task.rows, receiver=task.receiver, noise=prior.noise)
-    return Start(prior, None, solve)
+    return Start(prior, solve)

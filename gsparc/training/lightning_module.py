@@ -58,7 +58,7 @@ class HasModule(TrainsByGradient, Protocol):
 
 
 class GaussianModule(L.LightningModule):
-    """Trains a Gaussian field: by rendering, or by the density of left-out rows where weights are closed form.
+    """Trains a Gaussian field: by rendering, or by the density of left-out rows where weights follow.
 
     Args:
         model: what is trained.

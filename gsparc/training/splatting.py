@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import lightning.pytorch as L
 import numpy as np
@@ -22,9 +22,9 @@ from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Prior
 from gsparc.field.frozen import FrozenArray, FrozenView, frozen_view
 from gsparc.field.gaussians import FieldSettings
-from gsparc.field.initial import InitTask
+from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
-from gsparc.field.response import PathResponse, ResponseSettings
+from gsparc.field.response import ResponseSettings
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.origin import Origin
@@ -52,10 +52,9 @@ class LearnedField(Method):
         field, emission, attenuation, raster, confidence: all switches of the model.
         loss: task loss.
         optimizer: learning rates.
-        response: coherent terms: carrier phase, an array's spectra.
+        response: coherent terms: an array's spectra.
         name: as it appears in tables.
-        warm_start: solve the emission in closed form before training (spectra of a static receiver);
-            `auto` does so where it can.
+        init: where Gaussians come from; `auto` solves the emission in closed form where it can.
         refit: after validation, train again on training and validation rows together.
         keep_best: end with the parameters of the best validation, and end early when none is better.
         steps: of gradient, at most; None: `trainer.max_steps`. 0 after a closed-form start: it is the answer.
@@ -78,19 +77,18 @@ class LearnedField(Method):
         optimizer: OptimizerSettings = OptimizerSettings(),
         response: ResponseSettings | None = None,
         name: str = "gsparc",
-        warm_start: bool | Literal["auto"] = "auto",
+        init: InitSettings | None = None,
         refit: bool = True,
         keep_best: bool = True,
         steps: int | None = None,
         guesses: Sequence[str] = (),
     ) -> None:
-        check_arguments(
-            locals(), warm_start=switch("auto"), refit=switch(), keep_best=switch(), steps=or_null(whole(0))
-        )
+        check_arguments(locals(), refit=switch(), keep_best=switch(), steps=or_null(whole(0)))
         response = response or ResponseSettings()
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
-        self.warm_start, self.refit, self.guesses = warm_start, refit, tuple(guesses)
+        self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
+        self.refit, self.guesses = refit, tuple(guesses)
         self.keep_best, self.most_steps = keep_best, steps
         self.model: GaussianModel | None = None
         self.site: Site | None = None
@@ -115,7 +113,7 @@ class LearnedField(Method):
         self.site, self._ends = data.site, _static_end(data, int(fold.train[0]))
         if data.site.kind == "csi":
             self._shape = (data.target.shape[1], data.target.shape[2])
-        self.choices, reasons = resolve(self.settings, self.warm_start, data.site)
+        self.choices, reasons = resolve(self.settings, self.init.name, data.site)
         for reason in reasons:
             log.info("%s", reason)
         origin = Origin.of(data, fold, context)
@@ -152,7 +150,7 @@ class LearnedField(Method):
 
     def _solved(self) -> bool:
         """Whether the closed-form start is the answer."""
-        return self.most_steps == 0 and self.choices is not None and self.choices.warm_start
+        return self.most_steps == 0 and self.choices is not None and self.choices.closed_form
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
@@ -172,13 +170,13 @@ class LearnedField(Method):
         elif resume is None:
             start = prepare(
                 InitTask(
-                    settled(self.settings, self.choices), self.choices.init, self.choices.warm_start, data,
+                    settled(self.settings, self.choices), self.choices.closed_form, data,
                     fold.train, self._receiver(), self._ends.get("tx_position"), self.loss.snapshot,
                     context.seed, folder,
                 )
             )  # fmt: skip
             self._prior, self._left_out = start.prior, start.left_out
-            self.model = self._new_model(data.site, start.sources)
+            self.model = self._new_model(data.site)
             start.solve(self.model)
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
             budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
@@ -218,8 +216,8 @@ class LearnedField(Method):
         every = None
         if self.keep_best and stage == "train":
             assert self.choices is not None
-            watch.append(KeepBest(SHORT) if self.choices.warm_start else KeepBest())
-            every = max(1, round(SHORT / 2 * steps)) if self.choices.warm_start else None
+            watch.append(KeepBest(SHORT) if self.choices.closed_form else KeepBest())
+            every = max(1, round(SHORT / 2 * steps)) if self.choices.closed_form else None
         if stage == "refit" and self._paying is not None:
             watch.append(StopAt(self._paying))
         ran = run_stage(module, data, fold, context, files, budget, watch, every)
@@ -259,10 +257,10 @@ class LearnedField(Method):
         ends = self._ends
         return Pose(ends["rx_position"], ends["rx_rotation"]) if "rx_position" in ends else None
 
-    def _new_model(self, site: Site, sources: Tensor | None) -> GaussianModel:
+    def _new_model(self, site: Site) -> GaussianModel:
         assert self.choices is not None
         settings, transmitter = settled(self.settings, self.choices), self._ends.get("tx_position")
-        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape, sources)
+        return GaussianModel(settings, site, self._receiver(), transmitter, self._prior, self._shape)
 
     def _calibrate(self, data: Measurements, fold: Fold) -> None:
         model = self.fitted()
@@ -316,7 +314,7 @@ class LearnedField(Method):
         Raises:
             ValueError: gradients by the receiver's position are asked for, and images depend on it.
         """
-        if rx.position.requires_grad and not isinstance(self.fitted().response, PathResponse):
+        if rx.position.requires_grad:
             raise ValueError(f"{self.name}: footprints have no gradients by the receiver's position")
         return self.fitted()(tx, rx).mean
 
@@ -347,11 +345,11 @@ class LearnedField(Method):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
         self.site = site
-        self.choices = Choices(**state["choices"])
+        self.choices = _choices(state["choices"])
         self._ends = dict(state["ends"])
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Prior(**state["prior"])
-        self.model = self._new_model(site, torch.zeros(1, 3))
+        self.model = self._new_model(site)
         edit.resize(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
         self.model.load_state_dict(state["model"])
         self.frozen = None
@@ -359,6 +357,14 @@ class LearnedField(Method):
     def size(self) -> int:
         """Number of Gaussians."""
         return len(self.fitted().gaussians)
+
+
+def _choices(stored: dict[str, Any]) -> Choices:
+    """Choices of a checkpoint; earlier versions had another key for the closed-form start."""
+    known = dict(stored)
+    if known.pop("warm_start", False):
+        known["init"] = "images"
+    return Choices(**known)
 
 
 def joined(parts: Sequence[Prediction]) -> Prediction:

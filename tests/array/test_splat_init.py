@@ -125,7 +125,7 @@ def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):
 def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
     data, _ = known_campaign
     fold = Fold(np.arange(40), np.arange(40, 44), np.arange(44, 50))
-    method = _trained(data, fold, tmp_path, "model.field.count=20", "model.warm_start=false", steps=3)
+    method = _trained(data, fold, tmp_path, "model.field.count=20", "init=sphere", steps=3)
     assert not method.fitted().tells_unknown
     said = method.predict(*_ends(data, fold.test))
     assert (said.mean.flatten(1).amax(1) > 0.999).all() and said.variance is None

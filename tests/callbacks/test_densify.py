@@ -21,7 +21,7 @@ RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 def model(campaign) -> GaussianModel:
     torch.manual_seed(0)
     emission = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0)
-    settings = ModelSettings(field=FieldSettings(count=10, init="sphere", scale=0.1), emission=emission)
+    settings = ModelSettings(field=FieldSettings(count=10, placement="sphere", scale=0.1), emission=emission)
     return GaussianModel(settings, campaign("spectrum").site, RECEIVER)
 
 
@@ -127,7 +127,7 @@ def test_children_are_the_same_for_the_same_seed_and_step(model):
 def test_a_moving_receiver_gives_gradients_per_pose(campaign):
     data = campaign("spectrum", static_end="tx")
     emission = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0)
-    settings = ModelSettings(field=FieldSettings(count=30, init="uniform"), emission=emission)
+    settings = ModelSettings(field=FieldSettings(count=30, placement="uniform"), emission=emission)
     moving = GaussianModel(settings, data.site, None, torch.zeros(3))
     batch = data.batch([0, 1, 2, 3])
     rendered = moving(batch.tx, batch.rx)

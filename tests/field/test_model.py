@@ -22,7 +22,7 @@ def model(data, count: int = 20, **more) -> GaussianModel:
     moving = data.site.static_end == "tx"
     settings = ModelSettings(
         **{
-            "field": FieldSettings(count=count, init="uniform", opacity=0.5),
+            "field": FieldSettings(count=count, placement="uniform", opacity=0.5),
             "emission": LINEAR,
             "attenuation": INVERSE,
             **more,
@@ -85,7 +85,7 @@ def test_the_emission_reads_the_end_that_moves(campaign):
 def test_a_frozen_view_equals_the_forward_pass_until_the_next_edit(campaign):
     data = campaign("spectrum")
     batch = data.batch(np.arange(6))
-    field = model(data, field=FieldSettings(count=60, init="sphere", near=1, far=4))
+    field = model(data, field=FieldSettings(count=60, placement="sphere", near=1, far=4))
     frozen = field.freeze(batch.rx)
     image = frozen.render(field.features(batch.tx, batch.rx).detach(), int(field.gaussians.version))
     assert torch.allclose(image.squeeze(1), field(batch.tx, batch.rx).mean, atol=1e-5)
@@ -98,7 +98,7 @@ def test_a_frozen_view_equals_the_forward_pass_until_the_next_edit(campaign):
 def test_only_the_gaussians_that_a_static_receiver_sees_emit(campaign):
     data = campaign("spectrum")
     batch = data.batch(np.arange(6))
-    field = model(data, field=FieldSettings(count=60, init="uniform", margin=4.0))
+    field = model(data, field=FieldSettings(count=60, placement="uniform", margin=4.0))
     want = field(batch.tx, batch.rx)
     view = frozen_view(field, batch.rx)
     seen = int(want.raster.visible.sum())

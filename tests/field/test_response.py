@@ -227,7 +227,7 @@ def _splatted(hidden: int = 0):
 
     torch.manual_seed(0)
     settings = ModelSettings(
-        field=FieldSettings(count=30, init="sphere"),
+        field=FieldSettings(count=30, placement="sphere"),
         attenuation=AttenuationSettings(inverse_distance=bool(hidden)),
         emission=EmissionSettings(
             EncodingSettings("fourier"), hidden, "linear", init_scale=1.0, init_bias=0.0

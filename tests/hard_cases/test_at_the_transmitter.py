@@ -29,7 +29,7 @@ def model(campaign, activation: str) -> GaussianModel:
         init_bias=0.0,
     )
     attenuation = AttenuationSettings(inverse_distance=True, d_min=D_MIN, d_ref=D_REF, gain=1.0)
-    settings = ModelSettings(FieldSettings(count=1, init="uniform"), emission, attenuation)
+    settings = ModelSettings(FieldSettings(count=1, placement="uniform"), emission, attenuation)
     return GaussianModel(settings, campaign("spectrum").site, RECEIVER)
 
 

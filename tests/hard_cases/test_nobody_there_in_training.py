@@ -39,7 +39,7 @@ def test_pruning_stops_at_the_floor(tmp_path):
 @pytest.mark.parametrize("maker", [spectra, channels, powers])
 def test_no_gaussians_at_all(tmp_path, maker):
     file = maker(tmp_path / "own.npz")
-    settings = brief(file, "model.warm_start=false", "model.field.count=0", "callbacks=densify")
+    settings = brief(file, "init=sphere", "model.field.count=0", "callbacks=densify")
     facts, _ = train(compose(*settings), tmp_path / "run")
     assert facts["model/num_gaussians"] == 0
     assert facts["test/nmse"] == pytest.approx(1.0)  # silence
@@ -55,7 +55,7 @@ def test_nobody_is_seen(tmp_path):
                 module.model.gaussians.log_scales.fill_(-3.0)
 
     file = spectra(tmp_path / "own.npz")
-    method = build(compose(*brief(file, "model.warm_start=false", "model.refit=false")).model)
+    method = build(compose(*brief(file, "init=sphere", "model.refit=false")).model)
     data = load({"name": "own", "file": str(file)})
     method.fit(
         data, split_for({"name": "random"}, data).folds[0], short(tmp_path, 10, callbacks=lambda: [Sink()])

@@ -112,7 +112,7 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(data, folds, tmp_
     target = data.target.astype(np.float32).copy()
     bad = int(fold.train[4])
     target[bad, 3, 3] = np.nan
-    method = build(compose(*brief(tmp_path / "own.npz", "model.warm_start=false")).model)
+    method = build(compose(*brief(tmp_path / "own.npz", "init=sphere")).model)
     method.settings = dataclasses.replace(
         method.settings,
         emission=dataclasses.replace(

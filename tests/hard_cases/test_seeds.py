@@ -52,7 +52,7 @@ def test_no_seed_breaks(tmp_path, name, seeds):
     file = spectra(tmp_path / "any.npz")  # only composes the configuration
     for seed in seeds:
         began = time.perf_counter()
-        method = build(compose(*brief(file, "model.refit=false", "model.warm_start=false")).model)
+        method = build(compose(*brief(file, "model.refit=false", "init=sphere")).model)
         method.fit(data, fold, short(tmp_path / str(seed), 15, callbacks=callbacks, seed=seed))
         assert all(p.isfinite().all() for p in method.fitted().parameters())
         batch = data.batch(fold.test[:16])

@@ -51,7 +51,7 @@ def fresh(count: int) -> tuple[GaussianModel, SimpleNamespace]:
     torch.manual_seed(0)
     emission = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0)
     model = GaussianModel(
-        ModelSettings(field=FieldSettings(count=count, init="sphere"), emission=emission), SITE, RECEIVER
+        ModelSettings(field=FieldSettings(count=count, placement="sphere"), emission=emission), SITE, RECEIVER
     )
     optimizer = optimizer_for(model, OptimizerSettings())
     return model, SimpleNamespace(optimizers=[optimizer], global_step=0)
@@ -179,7 +179,7 @@ def test_training_under_adversarial_gradients_ends_whole_or_stops_by_name(tmp_pa
     """Densified, pruned and reset all the while; a run never goes on with a NaN."""
     file = spectra(tmp_path / "own.npz")
     data = load({"name": "own", "file": str(file)})
-    method = build(compose(*brief(file, "model.refit=false", "model.warm_start=false")).model)
+    method = build(compose(*brief(file, "model.refit=false", "init=sphere")).model)
     densify = Densify(2, 30, 3, 0.0, 0.05, max_gaussians=80, min_gaussians=4, max_radius=50.0)
     made = [Fire(size, 0), densify, OpacityReset(5, 30, 0.05)]
     try:

@@ -20,7 +20,7 @@ def module(data, run_dir, confidence: bool = True) -> GaussianModule:
     torch.manual_seed(0)
     emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", init_bias=0.0)
     settings = ModelSettings(
-        field=FieldSettings(count=20, init="uniform"),
+        field=FieldSettings(count=20, placement="uniform"),
         emission=emission,
         attenuation=AttenuationSettings(inverse_distance=True),
         confidence=ConfidenceSettings(enabled=confidence),

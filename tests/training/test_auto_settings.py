@@ -16,7 +16,7 @@ def open_settings(hidden: int = 0, **more) -> ModelSettings:
         EncodingSettings("auto"),
         **{"hidden": hidden, "activation": "auto", "init_bias": "auto", "log_distance": False, **more},
     )
-    return ModelSettings(field=FieldSettings(init="auto"), emission=emission)
+    return ModelSettings(field=FieldSettings(placement="auto"), emission=emission)
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_reasons_are_said(campaign):
 def test_what_is_said_stays_and_needs_no_words(campaign):
     given = dataclasses.replace(
         open_settings(),
-        field=FieldSettings(init="uniform"),
+        field=FieldSettings(placement="uniform"),
         emission=EmissionSettings(EncodingSettings("raw"), activation="sigmoid", init_bias=0.0),
     )
     choices, notes = resolve(given, False, campaign("spectrum").site)

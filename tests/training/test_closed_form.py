@@ -22,7 +22,7 @@ def started(data, emission=KERNEL, count: int = 150, on: bool = False) -> Gaussi
     torch.manual_seed(0)
     prior = learn_prior(data, ROWS, 1024, 0)
     settings = ModelSettings(
-        field=FieldSettings(count=count, init="sphere"),
+        field=FieldSettings(count=count, placement="sphere"),
         emission=emission,
         attenuation=AttenuationSettings(inverse_distance=on),
     )

@@ -41,7 +41,7 @@ MAKERS = {
 
 
 @pytest.mark.parametrize("height,width", [(1, 8), (8, 1), (7, 13)])
-@pytest.mark.parametrize("more", [(), ("model.warm_start=false",)], ids=["closed form", "steps"])
+@pytest.mark.parametrize("more", [(), ("init=sphere",)], ids=["closed form", "steps"])
 def test_images_smaller_than_the_window_of_ssim_train(tmp_path, caplog, height, width, more):
     with np.load(spectra(tmp_path / "own.npz")) as stored:
         arrays = {**stored, "spectrum": stored["spectrum"][:, :height, :width]}

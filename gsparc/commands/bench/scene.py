@@ -69,7 +69,7 @@ def scene(
     with torch.random.fork_rng():
         torch.manual_seed(count)
         settings = ModelSettings(
-            FieldSettings(count=count, init="uniform", margin=0.0),
+            FieldSettings(count=count, placement="uniform", margin=0.0),
             emission,
             AttenuationSettings(inverse_distance=True),
             raster=RasterSettings(projection, backend=backend),
