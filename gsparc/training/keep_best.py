@@ -36,15 +36,21 @@ class KeepBest(L.Callback):
         self.patience, self.error = patience, float("inf")
         self.step = self.position = 0
         self._kept: dict[str, Any] | None = None
+        self._looked_at = -1  # step
 
     def on_train_start(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """What the initialiser has reached."""
+        if self._kept is None:
+            self._measure(trainer, module)
+
+    def _measure(self, trainer: L.Trainer, module: GaussianModule) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
-        if self._kept is None and len(data.fold.val):
+        if len(data.fold.val):
             module.prepare_validation(data)
             with torch.no_grad():
                 parts = [(len(b), module.error(b.to(module.device)).mean()) for b in data.val_dataloader()]
-            self._look(module, sum(n * float(e) for n, e in parts) / sum(n for n, _ in parts), 0)
+            error = sum(n * float(e) for n, e in parts) / sum(n for n, _ in parts)
+            self._look(module, error, trainer.global_step)
 
     def on_validation_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Keep what is better; end training when nothing was for long."""
@@ -55,12 +61,15 @@ class KeepBest(L.Callback):
             trainer.should_stop = True
 
     def _look(self, module: GaussianModule, error: float, step: int) -> None:
+        self._looked_at = step
         if error < (1 - LEAST_GAIN) * self.error:
             self.error, self.step, self.position = error, step, module.position
             self._kept = copy.deepcopy(module.model.state_dict())
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Back to the best; also after a checkpoint with every step done."""
+        if self._looked_at != trainer.global_step:  # a checkpoint is written before its step's validation
+            self._measure(trainer, module)
         if self._kept is None:
             return
         for name, value in zip(KEPT, (self.step, self.position), strict=True):  # also from another process

@@ -127,7 +127,7 @@ class LearnedField(Method):
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
-        if self._solved():
+        if self._solved(fold):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             seconds = self._stage("train", origin, data, fold, context, budget, seconds)
@@ -148,9 +148,11 @@ class LearnedField(Method):
         self.frozen = None
         return FitReport(seconds, limited_by=self._limited_by)
 
-    def _solved(self) -> bool:
-        """Whether the closed-form start is the answer."""
-        return self.most_steps == 0 and self.choices is not None and self.choices.closed_form
+    def _solved(self, fold: Fold) -> bool:
+        """Whether a closed-form start is the answer: without validation rows nobody knows which steps pay."""
+        assert self.choices is not None
+        untold = self.keep_best and not len(fold.val)
+        return self.choices.closed_form and (self.most_steps == 0 or untold)
 
     def _stage(
         self, stage: str, origin: Origin, data: Measurements, fold: Fold, context: FitContext,
@@ -189,7 +191,7 @@ class LearnedField(Method):
         budget.pause()
         prepared = (budget.counted - started).wall
         self.init_s += prepared
-        if self._solved():
+        if stage == "train" and self._solved(fold):
             return prepared
         steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None
         if context.budget_s is not None:

@@ -26,7 +26,9 @@ COUNT = "model.field.count=64"
 
 
 def _trained(data, fold, folder, *overrides: str, steps: int = 10):
-    method = build(compose("logger=none", "model.effects.array=splat", *overrides).model)
+    method = build(
+        compose("logger=none", "model.effects.array=true", "model.effects.residual=false", *overrides).model
+    )
     method.fit(data, fold, short(folder, steps, 16, validate_every=steps))
     return method
 
@@ -101,7 +103,7 @@ def test_the_frozen_field_is_the_rasterized_one_and_has_gradients(trained):
 def test_it_is_stored_and_read_back(trained, tmp_path):
     method, data, fold = trained
     checkpoint.save(tmp_path / "model.ckpt", method)
-    again = build(compose("model.effects.array=splat", COUNT).model)
+    again = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model)
     again.restore(data.site, checkpoint.read(tmp_path / "model.ckpt").state)
     one, two = (m.predict(*_ends(data, fold.test)) for m in (method, again))
     for part in ("mean", "confidence", "variance"):
@@ -114,7 +116,7 @@ def test_steps_are_taken_where_asked_for(known_campaign, tmp_path):
     more = _trained(data, fold, tmp_path, COUNT, "+model.response.refine=true", "model.refit=false", steps=6)
     none = _trained(data, fold, tmp_path, COUNT, "model.refit=false")
     moved = (more.fitted().gaussians.means - none.fitted().gaussians.means).abs().max()
-    assert moved > 1e-4 and more.effects == "array (splat)"
+    assert moved > 1e-4 and more.effects == "array"
     errors = [
         (m.predict(*_ends(data, fold.test)).mean - data.targets(fold.test)).square().mean()
         for m in (more, none)
@@ -136,7 +138,7 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
     data, _ = known_campaign
     found = splat_init.learn(data, np.arange(20), 1024, 0, tmp_path)
     method, _, _ = trained
-    model = build(compose("model.effects.array=splat", COUNT).model)
+    model = build(compose("model.effects.array=true", "model.effects.residual=false", COUNT).model)
     model.restore(data.site, method.state())
     with torch.no_grad():
         model.fitted().gaussians.opacity_logits.fill_(-40.0)
@@ -152,7 +154,7 @@ def test_a_closed_form_that_cannot_be_is_refused(known_campaign, tmp_path):
     for setting in ("emission.hidden=4", "attenuation.inverse_distance=true"):
         with pytest.raises(ValueError, match="solves a linear read-out"):
             _trained(
-                data, fold, tmp_path, "model.warm_start=true", "model.field.count=20", f"model.{setting}"
+                data, fold, tmp_path, "init=vectors", "model.field.count=20", f"model.{setting}"
             )
 
 

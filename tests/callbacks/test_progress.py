@@ -24,9 +24,7 @@ FIGURES = {"train/task_loss": 0.0123, "val/ssim_gauss": 0.9315, "val/psnr_db": 2
 
 def run(step: int = 400) -> tuple[SimpleNamespace, SimpleNamespace]:
     trainer = SimpleNamespace(max_steps=400, global_step=step, callback_metrics=FIGURES, is_global_zero=True)
-    return trainer, SimpleNamespace(
-        model=SimpleNamespace(gaussians=[0] * 500), run_dir=Path("run"), pace=None
-    )
+    return trainer, SimpleNamespace(count=500, run_dir=Path("run"), pace=None)
 
 
 def test_one_line_of_80_columns_says_how_far_and_how_good(screen):

@@ -14,7 +14,7 @@ def module():
     field = GaussianField(torch.zeros(4, 3), torch.ones(4, 3), 0.5)
     with torch.no_grad():
         field.opacity_logits.copy_(torch.tensor([3.0, 0.0, -9.0, 5.0]))
-    return SimpleNamespace(model=SimpleNamespace(gaussians=field), total_steps=60)
+    return SimpleNamespace(model=SimpleNamespace(gaussians=field), total_steps=60, conditional=False)
 
 
 def trainer(module, step: int) -> SimpleNamespace:

@@ -73,7 +73,7 @@ def test_a_typo_gets_the_nearest_right_name(override, hint):
 
 
 def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
-    """A new `auto` must be settled (training/auto_settings.py, auto/decide.py) and be named here."""
+    """A new `auto` must be settled (training/auto_settings.py, training/terms.py) and be named here."""
 
     def still_open(node: dict, prefix: str = ""):
         for key, value in node.items():
@@ -84,8 +84,9 @@ def test_what_is_auto_in_the_defaults_is_what_is_settled_per_site():
 
     model = OmegaConf.to_container(compose().model, resolve=False)
     assert set(still_open(model)) == {
-        "warm_start", "field.init", "emission.encoding.kind", "emission.activation", "emission.init_bias",
-        "effects.phase", "effects.array", "effects.directions", "effects.hybrid",
+        "emission.encoding.kind", "emission.activation", "emission.init_bias", "effects.image",
+        "effects.array", "effects.moving_array", "effects.phase", "effects.power", "effects.visibility",
+        "effects.residual",
     }  # fmt: skip
 
 
@@ -93,7 +94,7 @@ def test_defaults_in_code_are_those_of_the_configuration():
     """A field made in Python was another one than `model=gsparc` with its effects off."""
     config = compose()
     composed, own = build(config.model), LearnedField()
-    for name in ("settings", "loss", "rates", "warm_start", "refit", "guesses", "name"):
+    for name in ("settings", "loss", "rates", "init", "refit", "keep_best", "guesses", "name"):
         assert getattr(composed, name) == getattr(own, name), name
     trainer = OmegaConf.to_container(config.trainer)
     del trainer["_target_"], trainer["gradient_clip_val"]
@@ -103,8 +104,8 @@ def test_defaults_in_code_are_those_of_the_configuration():
 def test_the_paper_leaves_nothing_to_auto():
     config = compose("paper=gsparc")
     settings = build(config.model).settings
-    values = [settings.field.init, settings.emission.activation, settings.emission.encoding.kind]
-    assert "auto" not in [*values, settings.emission.init_bias, config.model.warm_start]
+    values = [config.init.name, settings.emission.activation, settings.emission.encoding.kind]
+    assert "auto" not in [*values, settings.emission.init_bias, *config.model.effects.values()]
     assert len(config.model.guesses) > 5
 
 
@@ -153,4 +154,4 @@ def test_a_sweep_over_hidden_units_has_a_directory_per_job(tmp_path):
     assert len(folders) == 2 and "hidden-0" in folders[0] and "hidden-8" in folders[1]
     logs = [(tmp_path / "sweep" / folder / "training.log") for folder in folders]
     said = [next(path.parent.glob("*.log")).read_text() for path in logs]
-    assert "warm_start=auto -> true" in said[0] and "warm_start=auto -> false" in said[1]
+    assert "init=auto -> images" in said[0] and "init=auto -> sphere" in said[1]

@@ -62,13 +62,19 @@ def compose(*overrides: str, config: str = "train"):
         return hydra_compose(config, overrides=["hydra.run.dir=.", *overrides])
 
 
+RENDERED = tuple(
+    f"model.effects.{name}={str(name == 'image').lower()}"
+    for name in ("image", "array", "moving_array", "phase", "power", "residual")
+)  # Gaussians as powers, nothing beside them
+
+
 def brief(file: Path, *more: str) -> list[str]:
     """Overrides that train the splatted field for a second: few Gaussians, few steps, the mean beside it."""
     return [
         "dataset=own",
         f"dataset.file='{file}'",
-        "model.effects.phase=false",
-        "model.effects.array=false",
+        *RENDERED,
+        "model.keep_best=false",
         "model.field.count=40",
         "trainer.max_steps=20",
         "dataset.batch_size=8",

@@ -11,7 +11,7 @@ from contexts import short
 from gsparc.data.load import load, split_for
 from gsparc.methods.registry import build
 
-COLD = ("init=sphere", "model.effects.residual=false", "model.refit=false")
+COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 
 
 @pytest.fixture(scope="module")
@@ -42,16 +42,16 @@ def test_steps_that_pay_are_kept(measured, tmp_path):
 
 def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
     """A rate at which every step overshoots."""
-    wild = tuple(f"model.optimizer.{name}=50.0" for name in ("emission", "opacities", "scales"))
+    wild = ("init=images", "model.optimizer.emission=50.0")
     caplog.set_level("INFO")
     method = fitted(measured, tmp_path / "wild", *wild)
-    start = fitted(measured, tmp_path / "start", "model.keep_best=false", steps=1)
+    start = fitted(measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false")
     assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
     assert "none kept" in caplog.text and "40 taken" not in caplog.text
 
 
 def test_the_second_stage_takes_the_steps_that_paid_in_the_first(measured, tmp_path):
-    wild = tuple(f"model.optimizer.{name}=50.0" for name in ("emission", "opacities", "scales"))
+    wild = ("init=images", "model.optimizer.emission=50.0")
     assert fitted(measured, tmp_path / "wild", *wild, "model.refit=true").steps == 0
     assert fitted(measured, tmp_path / "tame", "model.refit=true").steps >= 10
 

@@ -53,5 +53,5 @@ def test_validation_names_its_figures(campaign, tmp_path, kind):
     trained.log = lambda name, value, **k: found.update({name: float(value)})
     trained.validation_step(data.batch(np.arange(4)), 0)
     figures = {"val/ssim_gauss", "val/psnr_db"} if kind == "spectrum" else {"val/mse"}
-    assert set(found) == {*figures, "time/train_s"}  # seconds beside every figure
+    assert set(found) == {*figures, "val/error", "time/train_s"}  # seconds beside every figure
     assert np.isfinite(list(found.values())).all()
