@@ -174,4 +174,4 @@ def test_untrained_says_so():
 
 def test_a_closed_form_start_that_cannot_be_says_what_it_needs(tmp_path):
     with pytest.raises(ValueError, match="needs spectra, a static receiver"):
-        fitted(channels(tmp_path / "own.npz"), tmp_path, "model.warm_start=true")
+        fitted(channels(tmp_path / "own.npz"), tmp_path, "init=images")
