@@ -60,14 +60,15 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
     """
     middle = rows.position.mean(0)
     per_metre = (rows.frequency / LIGHT).float()
-    if rows.element is None:
-        parts = [(slice(None), candidates)]
-    else:
-        parts = [(torch.nonzero(rows.element == e).flatten(), each) for e, each in enumerate(candidates)]
+    element = torch.zeros(len(rows), dtype=torch.long) if rows.element is None else rows.element
+    images = candidates[None] if rows.element is None else candidates
+    parts = [(torch.nonzero(element == e).flatten(), image) for e, image in enumerate(images)]
     scores = []
     for start in range(0, candidates.shape[-2], BLOCK):
         ask()
-        real, imag, power = 0.0, 0.0, 0.0
+        count = len(parts[0][1][start : start + BLOCK])
+        real, imag = torch.zeros(2, count, alpha.shape[1])
+        power = torch.zeros(count)
         for mine, points in parts:
             block = (points[start : start + BLOCK] - middle).float()
             places = (rows.position[mine] - middle).float()
@@ -78,9 +79,9 @@ def quick_score(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
             loss = distance.reciprocal_()
             cosine, sine = phase.cos().mul_(loss), phase.sin_().mul_(loss)
             here, across = alpha.real[mine], alpha.imag[mine]
-            real = real + cosine @ here - sine @ across
-            imag = imag + cosine @ across + sine @ here
-            power = power + loss.square_().sum(1)
+            real += cosine @ here - sine @ across
+            imag += cosine @ across + sine @ here
+            power += loss.square_().sum(1)
         scores.append((real.square() + imag.square()).sum(1) / power)
     return torch.cat(scores)
 

@@ -55,7 +55,7 @@ log = logging.getLogger(__name__)
 SECONDS_PER_ROW = 0.02  # [s], times measurements^1.5: 130 s for 350 in a conference room, 370 s for 700
 MIN_BUDGET_S, MAX_BUDGET_S = 120.0, 400.0
 MAX_EDGE_ERROR = 0.8  # leave-one-out error with edges over that without, above which edges are dropped
-EDGE_BUDGET = 0.2  # share of the budget kept for edges and the search beside them
+EDGE_BUDGET = 0.1  # share of the budget kept for edges and the search beside them
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_SHARE = 0.25  # of the budget, for each of these searches
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
@@ -158,20 +158,11 @@ class ImageSourceGP(FramedMethod):
         found = self._search(row_sets, self.settings, searching, self.clutter, cache)
         budget.limited |= searching.limited
         if held.array is not None and self.offsets == "none":
-            more = self._calibrated(data, row_sets[0], found[0].phased.scene)
-            if more is not data:
-                data, row_sets = more, self._row_sets(more, known, self.searches)
+            again = self._calibrated(data, row_sets[0], found[0].phased.scene)
+            if again is not data:
+                data, row_sets = again, self._row_sets(again, known, self.searches)
                 held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-                found = [
-                    refined(rows, member, self.noise_floor)
-                    for rows, member in zip(row_sets, found, strict=False)
-                ]
-            if (self.factors != 1).any():
-                turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
-                notes.append(
-                    f"{self.name}: factors of the {self.antennas} antennas estimated, "
-                    f"phases up to {turned:.0f} degrees from the first's"
-                )
+                found = [refined(*pair, self.noise_floor) for pair in zip(row_sets, found, strict=False)]
         if self.look_for_edges and not at_noise_floor([found[0].left_out], self.noise_floor, least=1):
             found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
@@ -182,23 +173,32 @@ class ImageSourceGP(FramedMethod):
             held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
+        notes += self._described(found, budget)
+        limited = less_repeatable(budget.limited_by, cache.limited_by)
+        return FitReport(budget.counted.wall, tuple(notes), limited)
+
+    def _described(self, found: list[Member], budget: TimeBudget) -> list[str]:
+        """What was found, and what ended the search."""
+        scene, notes = self.members[0].scene, []
         counts = ", ".join(str(len(member.scene.words)) for member in self.members)
         agree = at_noise_floor([member.left_out for member in found], self.noise_floor)
         ended = "noise floor reached" if agree else f"within {budget.seconds:.0f} s"
         ended += ", ended by the time budget" if budget.limited else ""
-        notes.append(f"{self.name}: {len(found)} of {self.searches} searches ({ended}), {counts} sources")
-        scene = self.members[0].scene
-        counted = Counter(kinds(scene.sources, box_of(held, scene.transmitter)))
+        notes.append(f"{len(found)} of {self.searches} searches ({ended}), {counts} sources")
+        counted = Counter(kinds(scene.sources, box_of(self.members[0].rows, scene.transmitter)))
         counted[SourceKind.EDGE] = len(self.edges)
-        notes.append(
-            f"{self.name}: the best search has " + ", ".join(f"{counted[k]} {k}s" for k in SourceKind)
-        )
+        notes.append("the best search has " + ", ".join(f"{counted[k]} {k}s" for k in SourceKind))
         clutter = scene.clutter
         if len(clutter):
             these = f"{len(clutter.boxes)} occluding boxes, {len(clutter.patches)} finite mirrors"
-            notes.append(f"{self.name}: clutter: {these}")
-        limited = less_repeatable(budget.limited_by, cache.limited_by)
-        return FitReport(budget.counted.wall, tuple(notes), limited)
+            notes.append(f"clutter: {these}")
+        if (self.factors != 1).any():
+            turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
+            notes.append(
+                f"factors of the {self.antennas} antennas estimated, phases up to {turned:.0f} degrees "
+                "from the first's"
+            )
+        return [f"{self.name}: {note}" for note in notes]
 
     def _calibrated(self, data: Measurements, rows: Rows, scene: Scene) -> Measurements:
         """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
@@ -340,8 +340,8 @@ class ImageSourceGP(FramedMethod):
             # elements differ in diffraction points: their mean
             met = met.view(count, -1, len(self.edges), 3).mean(1)
             towards = torch.cat([towards, met - middle[:, None]], 1)
-        gains, *rest = self._stored_paths(gain.movedim(0, -1), away, towards)
-        return gains / self.factors[:, None], *rest
+        gains, delay, unit, carrier = self._stored_paths(gain.movedim(0, -1), away, towards)
+        return gains / self.factors[:, None], delay, unit, carrier
 
     def _static_ends(self, flat: Tensor) -> Tensor:
         """The static end (3,), or the antenna (m, 3) of each of queries (m, 6)."""

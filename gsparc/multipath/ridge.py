@@ -34,8 +34,8 @@ def cholesky(covariance: Tensor) -> Tensor:
     if not failed:
         return lower
     exact = covariance.to(torch.complex128 if covariance.is_complex() else torch.float64)
-    bound = ROUNDING * exact.diagonal().real.sum() if exact.is_complex() else ROUNDING * exact.trace()
-    added = 0.0
+    trace = exact.diagonal().real.sum() if exact.is_complex() else exact.trace()
+    bound, added = ROUNDING * float(trace), 0.0
     for share in RIDGES:
         exact.diagonal().add_(share * bound - added)
         added = share * bound

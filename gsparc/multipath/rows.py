@@ -39,8 +39,8 @@ class Rows:
     def take(self, index: Tensor) -> Rows:
         """The rows with these numbers."""
         element = None if self.element is None else self.element[index]
-        mine = (self.position, self.frequency, self.target, self.receiver)
-        return Rows(*(column[index] for column in mine), self.array, element)
+        measured = (self.target[index], self.receiver[index])
+        return Rows(self.position[index], self.frequency[index], *measured, self.array, element)
 
     @property
     def places(self) -> Tensor:
