@@ -22,6 +22,7 @@ from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods import checkpoint
+from gsparc.methods.label import common_label
 from gsparc.methods.method import FitReport, Method
 from gsparc.methods.registry import build
 from gsparc.methods.timing import machine_facts
@@ -152,6 +153,7 @@ def fill(prepared: Prepared) -> Filled:
         "time/train_cpu_s": statistics.fmean(found.train_cpu_s),
         "time/score_s": found.score_s,
         "model/name": prepared.cell.method,
+        "model/label": common_label(found.methods[0].name, found.methods),
         "model/num_gaussians": found.methods[0].size(),
         "model/effects": found.methods[0].effects,
         "model/notes": "; ".join(found.notes),

@@ -1,0 +1,337 @@
+"""`model=auto`: of several models the one, or the mixture, that errs least on rows left out as the test's."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from gsparc.auto import stacking
+from gsparc.auto.mixture import mixed
+from gsparc.auto.trials import Course, Trial, attempt, course, products, variances
+from gsparc.data.inner_folds import cut_inside
+from gsparc.data.instantiate import suggest
+from gsparc.data.limits import POSITIVE, SettingError, check_arguments, or_null, whole
+from gsparc.data.schema import Batch, Kind, Measurements, Site
+from gsparc.data.splits import Fold
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
+from gsparc.methods.registry import METHODS, method_class
+from gsparc.methods.time_budget import TimeBudget, less_repeatable
+from gsparc.ops import Pose
+
+log = logging.getLogger(__name__)
+
+CANDIDATES = (
+    "distance_law", "idw", "kriging", "gp", "complex_gp", "uplink", "directional_gp", "array", "moving_array",
+    "image_source_gp", "gsparc",
+)  # fmt: skip
+"""Tried by default, the cheapest first; those whose seconds can be chosen come last in any order."""
+ENOUGH = 2  # folds of a candidate that takes long: of many rows these tell the better
+MANY, FEW = 5, 3  # folds without, and with candidates whose seconds can be chosen
+LEAST_S = 0.5  # seconds below which no such candidate is fitted
+LONG_S = 20.0  # of one candidate's trials, from which on `ENOUGH` folds are enough
+MARGIN = 0.04  # of the budget that is kept back: seconds are not kept to exactly
+FIGURE: dict[Kind, str] = {"rssi": "rmse {:.3g} dB", "csi": "nmse {:.3g}", "spectrum": "mse {:.3g}"}
+
+
+@dataclass(frozen=True)
+class Member:
+    """A candidate that was chosen.
+
+    Attributes:
+        name: of the candidate.
+        weight: in the mixture.
+        error: its left-out mean squared error in the judged unit, the variance of one that says none.
+    """
+
+    name: str
+    weight: float
+    error: float
+
+
+class Auto(PredictsVariance):
+    """Candidates compared by their errors of training rows left out as the split leaves out its test rows.
+
+    Args:
+        candidates: names of models, or models; those that do not serve the data are left out.
+        models: what these names mean, where it is not the model with its default settings.
+        budget_s: seconds of everything, where the seconds of a candidate can be chosen [s].
+        folds: that rows are left out in; None: 5, or 3 where the seconds of a candidate can be chosen.
+        name: as it appears in tables.
+
+    Raises:
+        ValueError: no candidate, one twice, or a name that no method has.
+    """
+
+    takes_budget = True
+
+    def __init__(
+        self,
+        candidates: Sequence[str | Method] = CANDIDATES,
+        models: Mapping[str, Method] | None = None,
+        budget_s: float = 60.0,
+        folds: int | None = None,
+        name: str = "auto",
+    ) -> None:
+        check_arguments(locals(), budget_s=POSITIVE, folds=or_null(whole(2)))
+        self.name, self.budget_s, self.folds = name, float(budget_s), folds
+        self._models = dict(models or {})
+        self.candidates: list[str] = []
+        if isinstance(candidates, str):
+            candidates = [candidates]
+        for one in candidates:
+            self.candidates.append(self._known(one))
+        if not candidates:
+            raise SettingError("candidates=[]: at least one model is needed")
+        self.members: tuple[Member, ...] = ()
+        self.scale = 1.0
+        self._fitted: list[Method] = []
+
+    def _known(self, one: str | Method) -> str:
+        """The name under which a candidate is kept."""
+        name = one.name if isinstance(one, Method) else str(one)
+        if isinstance(one, Method):
+            self._models[name] = one
+        known = sorted({*METHODS, *self._models} - {"auto"})
+        if name not in known:
+            raise SettingError(f"candidates: no model is called {name!r}{suggest(name, known)}")
+        if name in self.candidates:
+            raise SettingError(f"candidates: {name} is named twice")
+        return name
+
+    def _fresh(self, name: str) -> Method:
+        """A candidate that nothing was fitted to."""
+        return copy.deepcopy(self._models[name]) if name in self._models else method_class(name)()
+
+    @property
+    def both_ends(self) -> bool:  # type: ignore[override]
+        """Whether a candidate takes both ends for moving."""
+        kinds = (type(self._models[n]) if n in self._models else method_class(n) for n in self.candidates)
+        return any(kind.both_ends for kind in kinds)
+
+    @property
+    def own_budget_s(self) -> float | None:  # type: ignore[override]
+        """Seconds of everything, where a candidate's can be chosen [s]."""
+        return self.budget_s if any(self._fresh(n).takes_budget for n in self.candidates) else None
+
+    @property
+    def label(self) -> str:
+        """With what was chosen: `auto (complex_gp .7 + gsparc .3)`."""
+        return self.name if self.effects is None else f"{self.name} ({self.effects})"
+
+    @property
+    def effects(self) -> str | None:  # type: ignore[override]
+        """What was chosen, with its weights."""
+        if len(self.members) < 2:
+            return self.members[0].name if self.members else None
+        return " + ".join(f"{m.name} {_short(m.weight)}" for m in self.members)
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
+        """Try the candidates on inner folds, choose, and fit what was chosen to all training rows.
+
+        Raises:
+            ValueError: no candidate serves these data, or they are too few to leave any out.
+        """
+        started, site = time.perf_counter(), data.site
+        able = [n for n in self.candidates if site.static_end is not None or self._fresh(n).both_ends]
+        quick = [name for name in able if not self._fresh(name).takes_budget]
+        timed = [name for name in able if name not in quick]
+        seconds = self.budget_s if timed and context.budget_s is None else context.budget_s
+        budget = context.time_budget(math.inf if seconds is None else seconds)
+        count = self.folds or (FEW if timed else MANY)
+        way = course(data, cut_inside(data, fold, context.split, count, context.seed), context.seed)
+        contest = _Contest(way, replace(context, budget_s=None), budget)
+        for name in quick:
+            contest.try_out(name, lambda name=name: self._fresh(name))
+        for number, name in enumerate(timed):
+            contest.try_out(name, lambda name=name: self._fresh(name), len(timed) - number)
+        missing = [n for n in self.candidates if n not in able]
+        missing += [trial.name for trial in contest.trials if trial.refusal is not None]
+        if missing:
+            log.info("%s: not for these data: %s", self.name, ", ".join(missing))
+        usable = [trial for trial in contest.trials if trial.usable]
+        if not usable:
+            reasons = "; ".join(t.refusal for t in contest.trials if t.refusal is not None)
+            raise ValueError(f"{self.name}: no candidate serves these data ({reasons or 'none was tried'})")
+        note = self._choose(usable, way)
+        log.info("%s", note)
+        reports = self._fit_members(data, fold, context, contest, {t.name: t for t in usable}, set(timed))
+        self.site = site
+        limited = [trial.limited_by for trial in contest.trials] + [report.limited_by for report in reports]
+        notes = [note, *(text for report in reports for text in report.notes)]
+        found = less_repeatable(budget.clock if timed else budget.limited_by, *limited)
+        return FitReport(time.perf_counter() - started, tuple(notes), found)
+
+    def _choose(self, usable: list[Trial], way: Course) -> str:
+        """Settle weights and the scale of the variance; returns what was found, one line."""
+        folds = min(len(trial.residual) for trial in usable)
+        gram, unit = products(usable, way, folds), way.units(folds)
+        errors = np.einsum("nkk->k", gram) / len(gram)
+        weights = stacking.choose(gram, unit)
+        said = variances(usable, list(errors), folds) @ weights + stacking.spread(weights, gram)
+        left = stacking.squared(weights, gram)
+        self.scale = stacking.variance_scale(left, said)
+        chosen = [(t.name, float(w), float(e)) for t, w, e in zip(usable, weights, errors, strict=True) if w]
+        self.members = tuple(Member(*one) for one in sorted(chosen, key=lambda one: -one[1]))
+        shown = _shown(way, float(left.mean()), folds)
+        return f"{self.label}: {shown} left out ({folds} folds, split={way.inner.name})"
+
+    def _fit_members(
+        self, data: Measurements, fold: Fold, context: FitContext, contest: _Contest,
+        trials: Mapping[str, Trial], timed: set[str],
+    ) -> list[FitReport]:  # fmt: skip
+        """Fit what was chosen, each open-ended one with its share of the seconds that are left."""
+        reports, self._fitted = [], []
+        waiting = [member.name for member in self.members if member.name in timed]
+        first = [member.name for member in self.members if member.name not in timed]
+        found: dict[str, Method] = {}
+        for name in (*first, *waiting):
+            seconds = None
+            if name in timed:
+                seconds = max(contest.left() / (len(waiting) - len(found) + len(first)), LEAST_S)
+            folder = context.run_dir if len(self.members) == 1 else context.run_dir / name
+            found[name] = self._fresh(name)
+            reports.append(found[name].fit(data, fold, replace(context, budget_s=seconds, run_dir=folder)))
+        self._fitted = [found[member.name] for member in self.members]
+        return reports
+
+    # -- answering ---------------------------------------------------------------------------------
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        return self._mixed([method.predict(tx, rx) for method in self._fitted])
+
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`; every chosen candidate's own."""
+        return self._mixed([method.answer(batch) for method in self._fitted])
+
+    def _mixed(self, parts: list[Prediction]) -> Prediction:
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        weights, errors = zip(*((m.weight, m.error) for m in self.members), strict=True)
+        return mixed(parts, weights, errors, self.scale, self.site.kind)
+
+    # -- storing -----------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """What was chosen, and the states of that."""
+        members = [
+            {**vars(member), "state": method.state()}
+            for member, method in zip(self.members, self._fitted, strict=True)
+        ]
+        return {"members": members, "scale": self.scale}
+
+    def restore(self, site: Site, state: dict[str, Any]) -> None:
+        """See `Method.restore`."""
+        self.site, self.scale, self._fitted = site, float(state["scale"]), []
+        self.members = tuple(
+            Member(str(m["name"]), float(m["weight"]), float(m["error"])) for m in state["members"]
+        )
+        for stored in state["members"]:
+            method = self._fresh(str(stored["name"]))
+            method.restore(site, stored["state"])
+            self._fitted.append(method)
+
+    def size(self) -> int:
+        """That of all that was chosen."""
+        return sum(method.size() for method in self._fitted)
+
+
+class _Contest:
+    """Candidates tried one after the other, within the seconds of a budget.
+
+    Args:
+        way: where.
+        context: of every trial but for its seconds.
+        budget: of everything, the fits of what is chosen included.
+    """
+
+    def __init__(self, way: Course, context: FitContext, budget: TimeBudget) -> None:
+        self.way, self.context, self.budget = way, context, budget
+        self.trials: list[Trial] = []
+
+    def left(self, reserved: float = 0.0) -> float:
+        """Seconds that are left [s]."""
+        return self.budget.seconds * (1 - MARGIN) - self.budget.spent - reserved
+
+    def try_out(self, name: str, make: Any, waiting: int = 0) -> None:
+        """Fit a candidate on the folds, as long as it is worth it.
+
+        Args:
+            name: of the candidate.
+            make: a fresh one.
+            waiting: candidates whose seconds can be chosen, this one included; 0: this one's cannot be.
+        """
+        trial, folds = Trial(name), len(self.way.asked)
+        self.trials.append(trial)
+        share = self.left(self._final_s()) / max(waiting, 1) if waiting else math.inf
+        share = min(share, self.left()) if math.isfinite(self.budget.seconds) else share
+        before = self.budget.spent
+        while len(trial.residual) < folds and trial.refusal is None and not trial.stopped:
+            rest = share - (self.budget.spent - before)  # of which the fit to all rows is to have its part
+            seconds = rest / (folds - len(trial.residual) + 1) if waiting else None
+            slowest = max(trial.seconds, default=0.0)
+            if rest < max(2 * slowest, LEAST_S if waiting else 0.0):
+                self.budget.limited = True
+                break
+            if not waiting and len(trial.residual) >= ENOUGH and sum(trial.seconds) + slowest > LONG_S:
+                break
+            attempt(trial, make, self.way, replace(self.context, budget_s=seconds))
+            trial.stopped = trial.refusal is None and len(trial.residual) == 1 and self._hopeless(trial)
+        self._say(trial)
+
+    def _final_s(self) -> float:
+        """Seconds that the fit of the best so far will take [s], where they cannot be chosen."""
+        best = self._best()
+        return 0.0 if best is None else 1.5 * max(best.seconds)
+
+    def _best(self, other: Trial | None = None) -> Trial | None:
+        usable = [trial for trial in self.trials if trial.usable and trial is not other]
+        return min(usable, key=lambda trial: float(self._squares([trial])[:, 0, 0].mean()), default=None)
+
+    def _squares(self, trials: Sequence[Trial]) -> np.ndarray:
+        return products(trials, self.way, min(len(trial.residual) for trial in trials))
+
+    def _hopeless(self, trial: Trial) -> bool:
+        best = self._best(other=trial)
+        if best is None or len(self.way.asked) == 1:
+            return False
+        gram = self._squares([trial, best])
+        return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], self.way.units(1))
+
+    def _say(self, trial: Trial) -> None:
+        """One line of what was found."""
+        if trial.refusal is not None:
+            log.debug("%s: %s", trial.name, trial.refusal)
+            return
+        done = len(trial.residual)
+        if not done:
+            log.info("auto: %s: no time was left for it", trial.name)
+            return
+        error = float(self._squares([trial])[:, 0, 0].mean())
+        stopped = ", given up as clearly worse" if trial.stopped else ""
+        log.info(
+            "auto: %s: %s left out (%d of %d folds, %.1f s%s)",
+            trial.name, _shown(self.way, error, done), done, len(self.way.asked), sum(trial.seconds), stopped,
+        )  # fmt: skip
+
+
+def _shown(way: Course, error: float, folds: int) -> str:
+    """A mean squared error in the unit that is judged, as people read it."""
+    kind = way.data.site.kind
+    value = {"rssi": math.sqrt(error), "csi": error / max(way.powers(folds), 1e-300), "spectrum": error}[kind]
+    return FIGURE[kind].format(value)
+
+
+def _short(weight: float) -> str:
+    """`.7`, or `.35`."""
+    return f"{weight:.2f}".strip("0")
