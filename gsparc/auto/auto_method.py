@@ -172,11 +172,21 @@ class Auto(PredictsVariance):
         return FitReport(time.perf_counter() - started, tuple(notes), found)
 
     def _choose(self, usable: list[Trial], way: Course) -> str:
-        """Settle weights and the scale of the variance; returns what was found, one line."""
-        folds = min(len(trial.residual) for trial in usable)
-        gram, unit = products(usable, way, folds), way.units(folds)
+        """Settle weights and the scale of the variance; returns what was found, one line.
+
+        Where seconds ended the trials of some early, all are compared on the folds that these came to; once
+        none of them is wanted, the others on all of theirs.
+        """
+        while True:
+            folds = min(len(trial.residual) for trial in usable)
+            gram = products(usable, way, folds)
+            weights = stacking.choose(gram, way.units(folds))
+            longer = [trial for trial in usable if len(trial.residual) > folds]
+            wanted = {trial.name for trial, weight in zip(usable, weights, strict=True) if weight}
+            if not longer or not wanted <= {trial.name for trial in longer}:
+                break
+            usable = longer
         errors = np.einsum("nkk->k", gram) / len(gram)
-        weights = stacking.choose(gram, unit)
         said = variances(usable, list(errors), folds) @ weights + stacking.spread(weights, gram)
         left = stacking.squared(weights, gram)
         self.scale = stacking.variance_scale(left, said)
