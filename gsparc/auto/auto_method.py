@@ -37,6 +37,7 @@ ENOUGH = 2  # folds of a candidate that takes long: of many rows these tell the 
 MANY, FEW = 5, 3  # folds without, and with candidates whose seconds can be chosen
 LEAST_S = 0.5  # seconds below which no such candidate is fitted
 LONG_S = 20.0  # of one candidate's trials, from which on `ENOUGH` folds are enough
+LEAST_SHARE = 0.3  # of the seconds of its first trial, below which a candidate is tried no further
 MARGIN = 0.04  # of the budget that is kept back: seconds are not kept to exactly
 FIGURE: dict[Kind, str] = {"rssi": "rmse {:.3g} dB", "csi": "nmse {:.3g}", "spectrum": "mse {:.3g}"}
 
@@ -288,16 +289,34 @@ class _Contest:
         before = self.budget.spent
         while len(trial.residual) < folds and trial.refusal is None and not trial.stopped:
             rest = share - (self.budget.spent - before)  # of which the fit to all rows is to have its part
-            seconds = rest / (folds - len(trial.residual) + 1) if waiting else None
-            slowest = max(trial.seconds, default=0.0)
-            if rest < max(2 * slowest, LEAST_S if waiting else 0.0):
-                self.budget.limited = True
+            seconds = self._seconds(trial, rest, folds) if waiting else None
+            if self._too_long(trial, rest, seconds):
                 break
-            if not waiting and len(trial.residual) >= ENOUGH and sum(trial.seconds) + slowest > LONG_S:
-                break
+            began = self.budget.spent
             attempt(trial, make, self.way, replace(self.context, budget_s=seconds))
+            trial.seconds.append(self.budget.spent - began)
+            trial.over_s = max(trial.over_s, trial.seconds[-1] - (seconds or 0.0))
             trial.stopped = trial.refusal is None and len(trial.residual) == 1 and self._hopeless(trial)
         self._say(trial)
+
+    def _seconds(self, trial: Trial, rest: float, folds: int) -> float:
+        """Of the next fit [s], so that those that follow, and one to all rows, have as many.
+
+        What the first one takes beyond its seconds is not known before: it gets less.
+        """
+        coming = folds - len(trial.residual) + 1
+        return rest / coming - trial.over_s if trial.residual else rest / (coming + 1)
+
+    def _too_long(self, trial: Trial, rest: float, seconds: float | None) -> bool:
+        """Whether the trials of a candidate end here, for want of seconds or because enough is known."""
+        if seconds is not None:
+            first = trial.seconds[0] - trial.over_s if trial.seconds else 0.0
+            short = seconds < max(LEAST_S, LEAST_SHARE * first)
+        else:
+            short = rest < 2 * max(trial.seconds, default=0.0) or rest <= 0
+        self.budget.limited |= short
+        known = seconds is None and len(trial.residual) >= ENOUGH
+        return short or (known and sum(trial.seconds) + trial.seconds[-1] > LONG_S)
 
     def _final_s(self) -> float:
         """Seconds that the fit of the best so far will take [s], where they cannot be chosen."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -55,7 +54,8 @@ class Trial:
         name: of the candidate.
         residual: of each fold (n, D), measured less predicted, 0 where nothing was measured.
         variance: of each fold (n,), in the judged unit; None where it says none.
-        seconds: of each fit by the clock on the wall [s].
+        seconds: of each fit and its predictions, by the clock of the budget [s].
+        over_s: the most that one took beyond the seconds it was given [s].
         limited_by: see `FitReport`.
         refusal: why it does not serve these data; None where it does.
         stopped: whether it was given up as hopeless.
@@ -65,6 +65,7 @@ class Trial:
     residual: list[Tensor] = field(default_factory=list)
     variance: list[Tensor | None] = field(default_factory=list)
     seconds: list[float] = field(default_factory=list)
+    over_s: float = 0.0
     limited_by: Clock | None = None
     refusal: str | None = None
     stopped: bool = False
@@ -127,7 +128,7 @@ def course(data: Measurements, inner: InnerFolds, seed: int) -> Course:
 
 def attempt(trial: Trial, make: Callable[[], Method], course: Course, context: FitContext) -> None:
     """Fit a fresh candidate on the next fold and predict what is left out; refusals are kept in `trial`."""
-    number, started = len(trial.residual), time.perf_counter()
+    number = len(trial.residual)
     asked = course.asked[number]
     try:
         with tempfile.TemporaryDirectory() as aside, _quiet():  # what a trial writes is no part of the run
@@ -147,7 +148,6 @@ def attempt(trial: Trial, make: Callable[[], Method], course: Course, context: F
         return
     trial.residual.append(residual)
     trial.variance.append(variance)
-    trial.seconds.append(time.perf_counter() - started)
     trial.limited_by = less_repeatable(trial.limited_by, report.limited_by)
 
 
