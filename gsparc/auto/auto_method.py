@@ -14,32 +14,27 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.auto import stacking
+from gsparc.auto.contest import LEAST_S, Contest, figure_of
 from gsparc.auto.mixture import mixed
-from gsparc.auto.trials import Course, Trial, attempt, course, products, variances
+from gsparc.auto.trials import Course, Trial, course, products, variances
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, or_null, whole
-from gsparc.data.schema import Batch, Kind, Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
 from gsparc.methods.registry import METHODS, method_class
-from gsparc.methods.time_budget import TimeBudget, less_repeatable
+from gsparc.methods.time_budget import less_repeatable
 from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
 CANDIDATES = (
-    "distance_law", "idw", "kriging", "gp", "complex_gp", "uplink", "directional_gp", "array", "moving_array",
-    "image_source_gp", "gsparc",
+    "distance_law", "idw", "kriging", "gp", "complex_gp", "uplink", "directional_gp", "array", "gsparc",
+    "moving_array", "image_source_gp",
 )  # fmt: skip
 """Tried by default, the cheapest first; those whose seconds can be chosen come last in any order."""
-ENOUGH = 2  # folds of a candidate that takes long: of many rows these tell the better
 MANY, FEW = 5, 3  # folds without, and with candidates whose seconds can be chosen
-LEAST_S = 0.5  # seconds below which no such candidate is fitted
-LONG_S = 20.0  # of one candidate's trials, from which on `ENOUGH` folds are enough
-LEAST_SHARE = 0.3  # of the seconds of its first trial, below which a candidate is tried no further
-MARGIN = 0.04  # of the budget that is kept back: seconds are not kept to exactly
-FIGURE: dict[Kind, str] = {"rssi": "rmse {:.3g} dB", "csi": "nmse {:.3g}", "spectrum": "mse {:.3g}"}
 
 
 @dataclass(frozen=True)
@@ -150,7 +145,7 @@ class Auto(PredictsVariance):
         budget = context.time_budget(math.inf if seconds is None else seconds)
         count = self.folds or (FEW if timed else MANY)
         way = course(data, cut_inside(data, fold, context.split, count, context.seed), context.seed)
-        contest = _Contest(way, replace(context, budget_s=None), budget)
+        contest = Contest(way, replace(context, budget_s=None), budget)
         for name in quick:
             contest.try_out(name, lambda name=name: self._fresh(name))
         for number, name in enumerate(timed):
@@ -165,7 +160,7 @@ class Auto(PredictsVariance):
             raise ValueError(f"{self.name}: no candidate serves these data ({reasons or 'none was tried'})")
         note = self._choose(usable, way)
         log.info("%s", note)
-        reports = self._fit_members(data, fold, context, contest, {t.name: t for t in usable}, set(timed))
+        reports = self._fit_members(data, fold, context, contest, {t.name: t for t in usable}, timed)
         self.site = site
         limited = [trial.limited_by for trial in contest.trials] + [report.limited_by for report in reports]
         notes = [note, *(text for report in reports for text in report.notes)]
@@ -193,23 +188,32 @@ class Auto(PredictsVariance):
         self.scale = stacking.variance_scale(left, said)
         chosen = [(t.name, float(w), float(e)) for t, w, e in zip(usable, weights, errors, strict=True) if w]
         self.members = tuple(Member(*one) for one in sorted(chosen, key=lambda one: -one[1]))
-        shown = _shown(way, float(left.mean()), folds)
+        shown = figure_of(way, float(left.mean()), folds)
         return f"{self.label}: {shown} left out ({folds} folds, split={way.inner.name})"
 
     def _fit_members(
-        self, data: Measurements, fold: Fold, context: FitContext, contest: _Contest,
-        trials: Mapping[str, Trial], timed: set[str],
+        self, data: Measurements, fold: Fold, context: FitContext, contest: Contest,
+        trials: Mapping[str, Trial], timed: Sequence[str],
     ) -> list[FitReport]:  # fmt: skip
-        """Fit what was chosen, each open-ended one with its share of the seconds that are left."""
-        reports, self._fitted = [], []
-        waiting = [member.name for member in self.members if member.name in timed]
-        first = [member.name for member in self.members if member.name not in timed]
-        found: dict[str, Method] = {}
-        for name in (*first, *waiting):
-            seconds = None
+        """Fit what was chosen, those whose seconds can be chosen last, with what is left of the budget.
+
+        Where one's trial took so far beyond its seconds that none are left, what that trial learned from a
+        part of the rows is kept.
+        """
+        reports, found = [], dict[str, Method]()
+        names = sorted((member.name for member in self.members), key=lambda name: name in timed)
+        for number, name in enumerate(names):
+            trial, seconds, kept = trials[name], None, None
             if name in timed:
-                seconds = max(contest.left() / (len(waiting) - len(found) + len(first)), LEAST_S)
-            folder = context.run_dir if len(self.members) == 1 else context.run_dir / name
+                seconds = contest.left() / (len(names) - number) - trial.over_s
+                kept = trial.method if seconds < LEAST_S else None
+            if kept is not None:
+                known = len(contest.way.inner.folds[len(trial.residual) - 1].train)
+                said = f"{name}: no seconds were left to learn from all rows; it knows {known} training rows"
+                found[name] = kept
+                reports.append(FitReport(0.0, (said,), context.budget_clock))
+                continue
+            folder = context.run_dir if len(names) == 1 else context.run_dir / name
             found[name] = self._fresh(name)
             reports.append(found[name].fit(data, fold, replace(context, budget_s=seconds, run_dir=folder)))
         self._fitted = [found[member.name] for member in self.members]
@@ -255,110 +259,6 @@ class Auto(PredictsVariance):
     def size(self) -> int:
         """That of all that was chosen."""
         return sum(method.size() for method in self._fitted)
-
-
-class _Contest:
-    """Candidates tried one after the other, within the seconds of a budget.
-
-    Args:
-        way: where.
-        context: of every trial but for its seconds.
-        budget: of everything, the fits of what is chosen included.
-    """
-
-    def __init__(self, way: Course, context: FitContext, budget: TimeBudget) -> None:
-        self.way, self.context, self.budget = way, context, budget
-        self.trials: list[Trial] = []
-
-    def left(self, reserved: float = 0.0) -> float:
-        """Seconds that are left [s]."""
-        return self.budget.seconds * (1 - MARGIN) - self.budget.spent - reserved
-
-    def try_out(self, name: str, make: Any, waiting: int = 0) -> None:
-        """Fit a candidate on the folds, as long as it is worth it.
-
-        Args:
-            name: of the candidate.
-            make: a fresh one.
-            waiting: candidates whose seconds can be chosen, this one included; 0: this one's cannot be.
-        """
-        trial, folds = Trial(name), len(self.way.asked)
-        self.trials.append(trial)
-        share = self.left(self._final_s()) / max(waiting, 1) if waiting else math.inf
-        share = min(share, self.left()) if math.isfinite(self.budget.seconds) else share
-        before = self.budget.spent
-        while len(trial.residual) < folds and trial.refusal is None and not trial.stopped:
-            rest = share - (self.budget.spent - before)  # of which the fit to all rows is to have its part
-            seconds = self._seconds(trial, rest, folds) if waiting else None
-            if self._too_long(trial, rest, seconds):
-                break
-            began = self.budget.spent
-            attempt(trial, make, self.way, replace(self.context, budget_s=seconds))
-            trial.seconds.append(self.budget.spent - began)
-            trial.over_s = max(trial.over_s, trial.seconds[-1] - (seconds or 0.0))
-            trial.stopped = trial.refusal is None and len(trial.residual) == 1 and self._hopeless(trial)
-        self._say(trial)
-
-    def _seconds(self, trial: Trial, rest: float, folds: int) -> float:
-        """Of the next fit [s], so that those that follow, and one to all rows, have as many.
-
-        What the first one takes beyond its seconds is not known before: it gets less.
-        """
-        coming = folds - len(trial.residual) + 1
-        return rest / coming - trial.over_s if trial.residual else rest / (coming + 1)
-
-    def _too_long(self, trial: Trial, rest: float, seconds: float | None) -> bool:
-        """Whether the trials of a candidate end here, for want of seconds or because enough is known."""
-        if seconds is not None:
-            first = trial.seconds[0] - trial.over_s if trial.seconds else 0.0
-            short = seconds < max(LEAST_S, LEAST_SHARE * first)
-        else:
-            short = rest < 2 * max(trial.seconds, default=0.0) or rest <= 0
-        self.budget.limited |= short
-        known = seconds is None and len(trial.residual) >= ENOUGH
-        return short or (known and sum(trial.seconds) + trial.seconds[-1] > LONG_S)
-
-    def _final_s(self) -> float:
-        """Seconds that the fit of the best so far will take [s], where they cannot be chosen."""
-        best = self._best()
-        return 0.0 if best is None else 1.5 * max(best.seconds)
-
-    def _best(self, other: Trial | None = None) -> Trial | None:
-        usable = [trial for trial in self.trials if trial.usable and trial is not other]
-        return min(usable, key=lambda trial: float(self._squares([trial])[:, 0, 0].mean()), default=None)
-
-    def _squares(self, trials: Sequence[Trial]) -> np.ndarray:
-        return products(trials, self.way, min(len(trial.residual) for trial in trials))
-
-    def _hopeless(self, trial: Trial) -> bool:
-        best = self._best(other=trial)
-        if best is None or len(self.way.asked) == 1:
-            return False
-        gram = self._squares([trial, best])
-        return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], self.way.units(1))
-
-    def _say(self, trial: Trial) -> None:
-        """One line of what was found."""
-        if trial.refusal is not None:
-            log.debug("%s: %s", trial.name, trial.refusal)
-            return
-        done = len(trial.residual)
-        if not done:
-            log.info("auto: %s: no time was left for it", trial.name)
-            return
-        error = float(self._squares([trial])[:, 0, 0].mean())
-        stopped = ", given up as clearly worse" if trial.stopped else ""
-        log.info(
-            "auto: %s: %s left out (%d of %d folds, %.1f s%s)",
-            trial.name, _shown(self.way, error, done), done, len(self.way.asked), sum(trial.seconds), stopped,
-        )  # fmt: skip
-
-
-def _shown(way: Course, error: float, folds: int) -> str:
-    """A mean squared error in the unit that is judged, as people read it."""
-    kind = way.data.site.kind
-    value = {"rssi": math.sqrt(error), "csi": error / max(way.powers(folds), 1e-300), "spectrum": error}[kind]
-    return FIGURE[kind].format(value)
 
 
 def _short(weight: float) -> str:

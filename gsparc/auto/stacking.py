@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.stats import norm, t
 
 LEAST_WEIGHT = 0.05  # of a prediction in a mixture, below which it is left out
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
@@ -30,14 +31,16 @@ def best_weights(gram: np.ndarray) -> np.ndarray:
 def paired(difference: np.ndarray, unit: np.ndarray) -> tuple[float, float]:
     """Mean of differences (n,) and its standard error, rows of one unit (n,) not being independent.
 
-    The error is infinite where all rows are of one unit: then nothing tells how far to trust the mean.
+    Of few units it is larger, so that as many normal means lie within it (Student's t). It is infinite where
+    all rows are of one unit: then nothing tells how far to trust the mean.
     """
     which = np.unique(unit, return_inverse=True)[1].reshape(-1)
     mean, units = float(difference.mean()), int(which.max()) + 1
     if units < 2:
         return mean, float("inf")
     sums = np.bincount(which, difference - mean)
-    return mean, float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
+    few = float(t.ppf(norm.cdf(1.0), units - 1))
+    return mean, few * float(np.sqrt(units / (units - 1) * (sums**2).sum())) / len(difference)
 
 
 def hopeless(own: np.ndarray, best: np.ndarray, both: np.ndarray, unit: np.ndarray) -> bool:

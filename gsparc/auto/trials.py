@@ -57,6 +57,7 @@ class Trial:
         seconds: of each fit and its predictions, by the clock of the budget [s].
         over_s: the most that one took beyond the seconds it was given [s].
         limited_by: see `FitReport`.
+        method: as the last of the fits left it.
         refusal: why it does not serve these data; None where it does.
         stopped: whether it was given up as hopeless.
     """
@@ -67,6 +68,7 @@ class Trial:
     seconds: list[float] = field(default_factory=list)
     over_s: float = 0.0
     limited_by: Clock | None = None
+    method: Method | None = None
     refusal: str | None = None
     stopped: bool = False
 
@@ -148,6 +150,7 @@ def attempt(trial: Trial, make: Callable[[], Method], course: Course, context: F
         return
     trial.residual.append(residual)
     trial.variance.append(variance)
+    trial.method = method
     trial.limited_by = less_repeatable(trial.limited_by, report.limited_by)
 
 

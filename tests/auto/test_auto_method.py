@@ -131,6 +131,21 @@ def test_a_hopeless_candidate_is_given_up_after_one_fold(tmp_path):
     assert max(rows for rows, _ in good.fits[:-1]) < good.fits[-1][0]
 
 
+def test_what_ignores_its_seconds_is_kept_as_its_trial_left_it(tmp_path, monkeypatch):
+    clock = wound(monkeypatch).monotonic
+
+    class Endless(Shared):
+        def fit(self, data, fold, context):
+            clock.wind(40.0)
+            return super().fit(data, fold, context)
+
+    endless = Endless("endless", 1.0, 0, 1.0)
+    before = clock.now
+    _, report = fitted(Auto([endless, Shared("quick", 9.0, 1)], budget_s=45.0), street(150), tmp_path)
+    assert len(endless.fits) == 1 and clock.now - before < 49.5
+    assert any("no seconds were left" in note for note in report.notes)
+
+
 @pytest.mark.parametrize("given", [None, 30.0])
 def test_the_budget_is_kept_and_the_rest_goes_to_the_last_fit(given, tmp_path, monkeypatch):
     clock = wound(monkeypatch).monotonic
@@ -158,13 +173,15 @@ def test_a_candidate_that_ignores_its_seconds_is_compared_on_what_it_came_to(tmp
 
     class Endless(Shared):
         def fit(self, data, fold, context):
-            clock.wind(20.0)
+            clock.wind(14.0)
             return super().fit(data, fold, context)
 
     endless, quick = Endless("endless", 1.0, 0, 1.0), Shared("quick", 4.0, 1)
     method = Auto([endless, quick], budget_s=45.0)
-    fitted(method, street(150), tmp_path)
-    assert len(endless.fits) == 2 and "endless" in method.label  # a fold, and all rows
+    before = clock.now
+    _, report = fitted(method, street(150), tmp_path)
+    assert len(endless.fits) == 3 and "endless" in method.label  # two folds, and all rows
+    assert "(2 folds" in report.notes[0] and clock.now - before < 49.5
 
 
 def test_what_does_not_serve_the_data_is_left_out_in_one_line(tmp_path, caplog):
