@@ -34,7 +34,8 @@ CANDIDATES = (
     "moving_array", "image_source_gp",
 )  # fmt: skip
 """Tried by default, the cheapest first; those whose seconds can be chosen come last in any order."""
-MANY, FEW = 5, 3  # folds without, and with candidates whose seconds can be chosen
+FOLDS = ((2_000, 5), (8_000, 3))  # up to so many training rows, of more 2: they take longer and tell more
+FEW = 3  # at most, with candidates whose seconds can be chosen
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ class Auto(PredictsVariance):
         candidates: names of models, or models; those that do not serve the data are left out.
         models: what these names mean, where it is not the model with its default settings.
         budget_s: seconds of everything, where the seconds of a candidate can be chosen [s].
-        folds: that rows are left out in; None: 5, or 3 where the seconds of a candidate can be chosen.
+        folds: that rows are left out in; None: 5, or 3 where the seconds of a candidate can be chosen or of
+            many rows, and 2 of very many.
         name: as it appears in tables.
 
     Raises:
@@ -143,7 +145,7 @@ class Auto(PredictsVariance):
         timed = [name for name in able if name not in quick]
         seconds = self.budget_s if timed and context.budget_s is None else context.budget_s
         budget = context.time_budget(math.inf if seconds is None else seconds)
-        count = self.folds or (FEW if timed else MANY)
+        count = self.folds or _folds(len(fold.train) + len(fold.val), FEW if timed else FOLDS[0][1])
         way = course(data, cut_inside(data, fold, context.split, count, context.seed), context.seed)
         contest = Contest(way, replace(context, budget_s=None), budget)
         for name in quick:
@@ -259,6 +261,11 @@ class Auto(PredictsVariance):
     def size(self) -> int:
         """That of all that was chosen."""
         return sum(method.size() for method in self._fitted)
+
+
+def _folds(rows: int, most: int) -> int:
+    """Folds for so many training rows."""
+    return min(next((folds for limit, folds in FOLDS if rows <= limit), 2), most)
 
 
 def _short(weight: float) -> str:

@@ -17,9 +17,7 @@ from gsparc.methods.time_budget import TimeBudget
 
 log = logging.getLogger(__name__)
 
-ENOUGH = 2  # folds of a candidate that takes long: of many rows these tell the better
 LEAST_S = 0.5  # seconds below which no such candidate is fitted
-LONG_S = 20.0  # of one candidate's trials, from which on `ENOUGH` folds are enough
 LEAST_SHARE = 0.3  # of the seconds of its first trial, below which a candidate is tried no further
 MARGIN = 0.04  # of the budget that is kept back: seconds are not kept to exactly
 FIGURE: dict[Kind, str] = {"rssi": "rmse {:.3g} dB", "csi": "nmse {:.3g}", "spectrum": "mse {:.3g}"}
@@ -76,15 +74,14 @@ class Contest:
         return rest / coming - trial.over_s if trial.residual else rest / (coming + 1)
 
     def _too_long(self, trial: Trial, rest: float, seconds: float | None) -> bool:
-        """Whether the trials of a candidate end here, for want of seconds or because enough is known."""
+        """Whether the trials of a candidate end here for want of seconds."""
         if seconds is not None:
             first = trial.seconds[0] - trial.over_s if trial.seconds else 0.0
             short = seconds < max(LEAST_S, LEAST_SHARE * first)
         else:
             short = rest < 2 * max(trial.seconds, default=0.0) or rest <= 0
         self.budget.limited |= short
-        known = seconds is None and len(trial.residual) >= ENOUGH
-        return short or (known and sum(trial.seconds) + trial.seconds[-1] > LONG_S)
+        return short
 
     def _final_s(self) -> float:
         """Seconds that the fit of the best so far will take [s], where they cannot be chosen."""
