@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -149,9 +150,9 @@ class Auto(PredictsVariance):
         way = course(data, cut_inside(data, fold, context.split, count, context.seed), context.seed)
         contest = Contest(way, replace(context, budget_s=None), budget)
         for name in quick:
-            contest.try_out(name, lambda name=name: self._fresh(name))
+            contest.try_out(name, partial(self._fresh, name))
         for number, name in enumerate(timed):
-            contest.try_out(name, lambda name=name: self._fresh(name), len(timed) - number)
+            contest.try_out(name, partial(self._fresh, name), len(timed) - number)
         missing = [n for n in self.candidates if n not in able]
         missing += [trial.name for trial in contest.trials if trial.refusal is not None]
         if missing:

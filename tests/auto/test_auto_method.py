@@ -234,6 +234,17 @@ def test_every_station_chooses_for_itself_within_the_seconds_of_all(tmp_path):
     assert torch.allclose(again.answer(data.batch(split.folds[0].test)).mean, found)
 
 
+def test_the_seconds_are_those_of_all_stations(tmp_path):
+    walk = np.random.default_rng(0).uniform([0, 0, 1], [20, 20, 2], (40, 3))
+    posts = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
+    far = np.linalg.norm(walk[:, None] - posts, axis=-1)
+    arrays = {"tx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)}
+    data, timed = from_arrays(arrays), Shared("timed", 1.0, 0, 1.0)
+    fold = make_split(data.moving, split_settings(CUTS["random"]), place=data.place).folds[0]
+    for_links(lambda: Auto([timed], budget_s=60.0), data).fit(data, fold, FitContext(tmp_path))
+    assert len(timed.fits) == 3 * 4 and all(0 < seconds < 20 for _, seconds in timed.fits)
+
+
 def test_an_interrupt_is_not_swallowed(tmp_path):
     class Interrupted(Known):
         def fit(self, data, fold, context):
@@ -268,7 +279,8 @@ def test_wrong_settings_are_a_line(override, hint):
     assert one_line(raised.value).startswith(hint)
 
 
-def test_candidates_of_the_command_line_are_cut_as_the_run_is(tmp_path):
+def test_candidates_of_the_command_line_are_cut_as_the_run_is(tmp_path, caplog):
+    caplog.set_level(logging.INFO, "gsparc")
     file = powers(tmp_path / "own.npz")
     config = compose(
         "model=auto", "model.candidates=[gp,idw]", "model.models.gp.components=7", "dataset=own",
@@ -276,6 +288,7 @@ def test_candidates_of_the_command_line_are_cut_as_the_run_is(tmp_path):
     )  # fmt: skip
     facts, objects = train(config, tmp_path)
     method = objects.methods[0]
+    assert f"{method.label}: rmse" in caplog.text and "split=blocks" in caplog.text
     assert facts["model/name"] == "auto" and facts["model/label"] == method.label
     assert {m.name for m in method.members} <= {"gp", "idw"} and method.label in objects.methods[0].label
     assert checkpoint.load(objects.checkpoints[0])[0].label == method.label
