@@ -11,6 +11,8 @@ from hydra.utils import instantiate
 from lightning import Callback, Trainer
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.commands.settings import plain
+from gsparc.data.load import split_settings
 from gsparc.methods.method import FitContext
 
 
@@ -20,7 +22,7 @@ def context_of(
     callbacks: Callable[[], Sequence[Callback]] | None = None,
     **others: Any,
 ) -> FitContext:
-    """The context of a fit: seed, budget, `init_from`, `dataset.batch_size`, and what is given.
+    """The context of a fit: seed, budget, split, `init_from`, `dataset.batch_size`, and what is given.
 
     Args:
         config: a composed configuration.
@@ -28,12 +30,13 @@ def context_of(
         callbacks: makes them anew, once per Trainer; None: as `config` says.
         **others: of `FitContext`: `run_dir`, `datamodule`, `loggers`, `resume`.
     """
-    init_from = config.get("init_from")
+    init_from, split = config.get("init_from"), config.get("split")
     return FitContext(
         seed=int(config.seed),
         budget_s=config.budget_s,
         budget_clock=config.get("budget_clock", "wall"),
         stations=config.get("stations", "each"),
+        split=None if split is None else split_settings(plain(split)),
         init_from=None if init_from is None else Path(init_from),
         batch_size=config.dataset.get("batch_size", 16),
         trainer=trainer or instantiate(config.trainer, _partial_=True),

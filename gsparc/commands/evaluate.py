@@ -68,6 +68,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.name}, {config.eval_on}"
-    shown = results_table(facts, facts["model/name"], title, config.eval_on)
+    shown = results_table(facts, facts["model/label"], title, config.eval_on)
     show(run_dir, shown, lines=remarks(facts, config.eval_on))
     return facts

@@ -107,7 +107,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         facts = {**found.facts, **provenance(), **run}
         for logger in loggers:
             logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
-    title = f"{data.site.name}: test rows of {methods[0].name}"
+    title = f"{data.site.name}: test rows of {methods[0].label}"
     draw_predictions(methods[0], data, split.folds[0], title, run_dir / "test.png")
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_summary(run_dir / "summary.json", facts)
@@ -221,7 +221,7 @@ def task(config: DictConfig) -> float:
     facts, objects = train(config, run_dir)
     figure = objective_of(config, objects.data.site.kind)
     title = f"{objects.data.site.name}, split {objects.split.name}, {config.eval_on}, seed {config.seed}"
-    shown = results_table(facts, facts["model/name"], title, config.eval_on)
+    shown = results_table(facts, facts["model/label"], title, config.eval_on)
     show(run_dir, shown, lines=remarks(facts, config.eval_on))
     value = facts[f"{config.eval_on}/{figure}"]
     if value is None:

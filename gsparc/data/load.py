@@ -87,14 +87,24 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     Raises:
         DataError: unknown name or key, impossible shares, or a file made for other data.
     """
+    settings = split_settings(config)
     wrong = np.concatenate([np.zeros(0, np.int64), *outliers(data).values()])
-    if config.get("name") == "file":
-        file = FileSettings(**known_keys(config, FileSettings, "split", "setting of split=file"))
-        split = read_split(file.path, len(data), data.site.sha256)
-        absent = left_out(file.leave_out, wrong, len(data))
+    if isinstance(settings, FileSettings):
+        split = read_split(settings.path, len(data), data.site.sha256)
+        absent = left_out(settings.leave_out, wrong, len(data))
         return without(split, absent) if len(absent) else split
-    settings = SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
     return make_split(data.moving, settings, data.release_split, wrong, data.place, data.station)
+
+
+def split_settings(config: Mapping[str, Any]) -> SplitSettings | FileSettings:
+    """What the config group `split` says.
+
+    Raises:
+        DataError: unknown name or key, or impossible shares.
+    """
+    if config.get("name") == "file":
+        return FileSettings(**known_keys(config, FileSettings, "split", "setting of split=file"))
+    return SplitSettings(**known_keys(config, SplitSettings, "split", "setting"))
 
 
 def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from gsparc.evaluation.metrics import paired_values
 from gsparc.evaluation.pooled import pooled
 from gsparc.evaluation.scores import Scores, rows_of, score
 from gsparc.methods import timing
+from gsparc.methods.label import common_label
 from gsparc.methods.method import Method
 from gsparc.methods.timing import COPY, ClockSettings, cycling, interleaved
 
@@ -91,7 +92,8 @@ def evaluate(
     facts |= timing.machine_facts()
     facts |= latencies(contenders, data, rows_of(split.folds[0], eval_on), clock)
     first = methods[0]
-    facts |= {"model/name": first.name, "model/effects": first.effects, **first.facts()}
+    facts |= {"model/name": first.name, "model/label": common_label(first.name, methods)}
+    facts |= {"model/effects": first.effects, **first.facts()}
     facts |= dataset_facts(data) | split_facts(split) | timing.peak_memory()
     return Evaluation(facts, _columns(scores, others, data))
 

@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.data.splits import Fold
+from gsparc.data.splits import FileSettings, Fold, SplitSettings
 from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget
 from gsparc.ops import Pose
 
@@ -64,6 +64,7 @@ class FitContext:
         budget_s: seconds of training; None: as the method is configured.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         stations: of several, whether `each` has a model or all are one's `together`.
+        split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
         resume: what an interrupted run left, to go on from.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -82,6 +83,7 @@ class FitContext:
     budget_s: float | None = None
     budget_clock: Clock = "wall"
     stations: StationModels = "each"
+    split: SplitSettings | FileSettings | None = None
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16
@@ -121,6 +123,12 @@ class Method(ABC):
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts
     takes_budget = False  # whether the seconds of its fit can be chosen (`FitContext.budget_s`)
+    own_budget_s: float | None = None  # of all stations together, where `FitContext.budget_s` says nothing
+
+    @property
+    def label(self) -> str:
+        """The name as people read it, with what the fit chose where it chose between methods."""
+        return self.name
 
     @abstractmethod
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:

@@ -18,6 +18,7 @@ from torch import Tensor
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.methods.censored import heard
+from gsparc.methods.label import common_label
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.ops import Pose
@@ -77,6 +78,11 @@ class PerStation(Method):
         self.wrapped = first
         self._copies: dict[int, Method] = {}
 
+    @property
+    def label(self) -> str:
+        """That of the copies."""
+        return common_label(self.name, list(self._copies.values()))
+
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit every station that is asked for, or all together as if both ends moved; seconds are shared.
 
@@ -99,7 +105,8 @@ class PerStation(Method):
                 names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
-        share = None if context.budget_s is None else context.budget_s / len(numbers)
+        whole = self.wrapped.own_budget_s if context.budget_s is None else context.budget_s
+        share = None if whole is None else whole / len(numbers)
         seconds, notes = 0.0, []
         limited: Clock | None = None
         for number in numbers:

@@ -22,6 +22,7 @@ from gsparc.commands.study.run import fit_and_score, in_folders
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.methods import checkpoint
+from gsparc.methods.label import common_label
 from gsparc.methods.method import FitReport, Method
 from gsparc.methods.registry import build
 from gsparc.methods.timing import machine_facts
@@ -153,6 +154,7 @@ def fill(prepared: Prepared) -> Filled:
         "time/score_s": found.score_s,
         "model/name": prepared.cell.method,
         **found.methods[0].facts(),
+        "model/label": common_label(found.methods[0].name, found.methods),
         "model/effects": found.methods[0].effects,
         "model/notes": "; ".join(found.notes),
         "problem/drawn": prepared.problem.draw is not None,

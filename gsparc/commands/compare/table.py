@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -48,6 +49,7 @@ class Row:
         to_copy: the median in units of a 16 MiB copy of the same rounds.
         load: 1-minute load per core at the end of the training, mean over seeds.
         earlier: commits of earlier program text that it was measured with; empty for today's.
+        chosen: what a method that chooses between models chose most often, ` (gp .7 + idw .3)`; else empty.
     """
 
     dataset: str
@@ -74,6 +76,7 @@ class Row:
     to_copy: float | None
     load: float | None
     earlier: str = ""
+    chosen: str = ""
 
 
 def score_db(kind: Kind, facts: Mapping[str, Any]) -> float:
@@ -152,7 +155,14 @@ def _row(same: list[Filled], latency: Latency | None, best: Mapping[int | None, 
         query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
         to_copy=latency.to_copy if latency else None, load=mean("machine/load"),
         earlier=" ".join(sorted({one.earlier for one in same if one.earlier})),
+        chosen=_chosen(facts),
     )  # fmt: skip
+
+
+def _chosen(facts: Sequence[Mapping[str, Any]]) -> str:
+    """What stands behind the name of the method in the label that most of its draws have."""
+    label, _ = Counter(str(f.get("model/label") or "") for f in facts).most_common(1)[0]
+    return label[label.find(" (") :] if " (" in label else ""
 
 
 @dataclass(frozen=True)
@@ -287,7 +297,7 @@ def _columns(block: Block) -> dict[str, Callable[[Row], str]]:
         return shown(value, form) + ("" if error is None else f" ± {error:{form}}")
 
     found: dict[str, Callable[[Row], str]] = {
-        "method": lambda r: r.method,
+        "method": lambda r: r.method + r.chosen,
         SCORE[some.figure]: lambda r: near(r.score_db, r.spread_db, ".2f"),
     }
     if drawn:

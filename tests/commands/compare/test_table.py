@@ -129,3 +129,13 @@ def test_page_sheet_and_picture_show_every_method(tmp_path):
     assert "**29.50 ± 0.71**" in page and "| gsrf | 21.00 ± 1.41 | 0.9 |" in page
     draw(found, tmp_path / "compare.png", "gsparc")
     assert (tmp_path / "compare.png").stat().st_size > 10_000
+
+
+def test_what_a_method_chose_stands_behind_its_name():
+    chose = ["auto (gp)", "auto (gp .7 + idw .3)", "auto (gp)"]
+    found = [filled("auto", 30.0 + i, i, 60.0) for i in range(3)]
+    for one, label in zip(found, chose, strict=True):
+        one.facts["model/label"] = label
+    (row,) = rows([*found], {})
+    assert (row.method, row.chosen) == ("auto", " (gp)")
+    assert "auto (gp)" in markdown(blocks([row]), "gsparc")

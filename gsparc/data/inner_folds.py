@@ -1,0 +1,256 @@
+"""Folds inside the training and validation rows, cut as the test rows were cut from all: for choosing models.
+
+Errors of rows left out otherwise rank models wrongly: what interpolates well between neighbours (a random
+cut) may extrapolate badly into a square of floor that nobody walked (blocks), and the other way round.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.data.errors import DataError
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
+
+FARTHER = 2.0  # times the usual distance to the nearest training row, from which validation rows are apart
+SIDES = np.sqrt(2) ** np.arange(9)  # of squares tried for a file's gap, in units of that gap
+HALVINGS = 6  # of the side of squares, where too few squares hold training rows
+DRAWS = 12  # of squares per fold, of which those are taken that share the fewest rows
+CORNERS = ("--", "-+", "+-", "++")
+NOT_TESTED = -1  # unit of a row that no fold leaves out
+
+
+@dataclass(frozen=True)
+class InnerFolds:
+    """Folds of the training and validation rows; `test` are rows left out.
+
+    Attributes:
+        name: of the split they are cut by, one of `gsparc.data.splits.NAMES`.
+        folds: one or more, of rows as the outer fold counts them.
+        unit: (S,) int64 of all rows, which were left out together as one: a place, a square, a station or a
+            stretch; errors within a unit are not independent. `NOT_TESTED` of the rest.
+    """
+
+    name: str
+    folds: tuple[Fold, ...]
+    unit: np.ndarray
+
+
+def inner_folds(
+    positions: np.ndarray,
+    fold: Fold,
+    split: SplitSettings | FileSettings | None,
+    count: int,
+    seed: int,
+    place: np.ndarray | None = None,
+    station: np.ndarray | None = None,
+) -> InnerFolds:
+    """Cut the training and validation rows of a fold as `split` cut the test rows off; a pure function.
+
+    `random` and `sparse` leave out pieces of one permutation of the places, so that folds share none where
+    `count` pieces fit; `sparse` does not thin again, as its training rows are thin already. `blocks` leaves
+    out squares of the same side, `grouped` stretches as long, `corner` the other corners first, `stations`
+    as many stations at a time. Folds of a file are random, unless its validation rows lie clearly farther
+    from training rows than these from one another: then squares as far apart. Where too few squares,
+    stretches or stations remain, squares are made smaller, then rows are drawn at random; `name` says so.
+
+    Args:
+        positions: (S, 3) [m] of the moving end, or (S, 6) of both, of all rows.
+        fold: whose training and validation rows are cut.
+        split: as the fold was made; None: at random.
+        count: folds wanted; of stretches, corners and stations there may be fewer.
+        seed: of the draws.
+        place: (S,) int64; rows of one place stay together. None where every row is one.
+        station: (S,) int64, of which station a row is.
+
+    Raises:
+        DataError: fewer than 2 places to cut.
+    """
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    number = np.arange(len(known)) if place is None else np.unique(place[known], return_inverse=True)[1]
+    _, first, which = np.unique(number, return_index=True, return_inverse=True)
+    which, where = which.reshape(-1), positions[known][first]
+    if len(where) < 2:
+        raise DataError(f"{len(where)} training places are too few to leave any out; measure more")
+    settings = _inside(positions, fold, split)
+    rng = np.random.default_rng([seed, 4])
+    unit = np.full(len(positions), NOT_TESTED)
+    if settings.name == "stations":
+        stations = None if station is None else np.unique(station[known], return_inverse=True)[1].reshape(-1)
+        cut = None if stations is None or stations.max() == 0 else _stations(stations, settings, count, rng)
+        if stations is not None and cut is not None:
+            return _of_all(known, "stations", cut, stations, unit)
+        settings = replace(settings, name="random", leave_out=())
+    found = _cut(where, settings, count, rng)
+    folds = [Fold(*(np.flatnonzero(np.isin(which, p)) for p in vars(one).values())) for one in found.folds]
+    return _of_all(known, found.name, folds, found.unit[which], unit)
+
+
+def cut_inside(
+    data: Measurements, fold: Fold, split: SplitSettings | FileSettings | None, count: int, seed: int
+) -> InnerFolds:
+    """`inner_folds` of measurements.
+
+    Where both ends are taken for moving only because stations are learned together, what moves is the other
+    end than theirs, as it was for the split.
+    """
+    positions = data.moving
+    if data.site.static_end is None and data.station is not None:
+        positions = data.rx_position if _still(data.tx, data.station) else data.tx
+    return inner_folds(positions, fold, split, count, seed, data.place, data.station)
+
+
+def _still(places: np.ndarray, station: np.ndarray) -> bool:
+    """Whether places (S, 3) are the stations' (S,) own."""
+    _, first, which = np.unique(station, return_index=True, return_inverse=True)
+    return bool(np.allclose(places, places[first][which.reshape(-1)]))
+
+
+def _inside(positions: np.ndarray, fold: Fold, split: SplitSettings | FileSettings | None) -> SplitSettings:
+    """The settings that cut inside what a split left: nothing is thinned or left out again."""
+    if split is None:
+        return SplitSettings()
+    if isinstance(split, FileSettings):
+        return _like_a_file(positions, fold)
+    whole: dict[str, object] = {"thin": 1.0, "train_count": None, "spacing_m": None, "redraw": False}
+    if split.name != "stations":
+        whole["leave_out"] = ()
+    if split.name == "sparse":  # as dense as what is learned from: thinned again it would be another task
+        whole["name"] = "random"
+    if split.name == "blocks" and split.side_m is None:
+        whole["side_m"] = max(float(np.ptp(positions[:, :2], axis=0).max()) / 10, np.finfo(float).tiny)
+    if split.name == "grouped":  # stretches as long as those of the test
+        whole["folds"] = max(split.folds - 1, 2)
+    return replace(split, **whole)  # type: ignore[arg-type]
+
+
+def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
+    """Random, or squares that leave rows as far from the others as validation rows are from training rows."""
+    share = min(max(len(fold.val) / max(len(fold.train) + len(fold.val), 1), 0.1), 0.5)
+    settings = SplitSettings(test_fraction=share, val_fraction=share)
+    if not len(fold.val) or len(fold.train) < 2:
+        return settings
+    places = np.unique(positions[fold.train], axis=0)
+    tree = cKDTree(places)
+    gap = float(np.median(tree.query(positions[fold.val])[0]))
+    usual = float(np.median(tree.query(places, k=2)[0][:, 1])) if len(places) > 1 else gap
+    if not gap > FARTHER * usual:
+        return settings
+    known = np.sort(np.concatenate([fold.train, fold.val]))
+    where = positions[known]
+    best, nearest = settings, np.inf
+    for side in gap * SIDES:
+        squares = SplitSettings("blocks", side_m=float(side), share=share, val_fraction=share)
+        try:
+            cut = make_split(where, squares).folds[0]
+        except DataError:
+            break
+        learned = where[np.concatenate([cut.train, cut.val])]
+        apart = float(np.median(cKDTree(learned).query(where[cut.test])[0]))
+        if abs(np.log(max(apart, 1e-12) / gap)) < nearest:
+            best, nearest = squares, abs(np.log(max(apart, 1e-12) / gap))
+    return best
+
+
+def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator) -> InnerFolds:
+    """Folds of places (P, D), as the settings say or the nearest that is possible."""
+    if settings.name == "blocks":
+        side = settings.side_m or 0.0
+        for _ in range(HALVINGS):
+            try:
+                folds = _least_shared(_drawn(where, replace(settings, side_m=side), count, rng), count)
+            except DataError:
+                side /= 2
+                continue
+            squares = np.unique(np.floor(where[:, :2] / side), axis=0, return_inverse=True)[1]
+            return InnerFolds("blocks", folds, squares.reshape(-1))
+    if settings.name == "grouped":
+        try:
+            every = make_split(where, settings).folds
+        except DataError:
+            every = ()
+        if every:
+            return _by_fold("grouped", [every[i] for i in rng.permutation(len(every))[:count]], len(where))
+    if settings.name == "corner":
+        others = [corner for corner in CORNERS if corner != settings.corner]
+        corners = [*rng.permutation(others), settings.corner][:count]
+        try:
+            cut = [make_split(where, replace(settings, corner=str(c))).folds[0] for c in corners]
+        except DataError:
+            cut = []
+        if cut:
+            return _by_fold("corner", cut, len(where))
+    settings = replace(settings, name="random")
+    folds = tuple(
+        make_split(where, settings, pair).folds[0] for pair in _pieces(len(where), settings, count, rng)
+    )
+    return InnerFolds("random", folds, np.arange(len(where)))
+
+
+def _pieces(
+    places: int, settings: SplitSettings, count: int, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """(training, test) places of each fold: pieces of one permutation, overlapping only where they must."""
+    order = rng.permutation(places)
+    size = min(max(round(settings.test_fraction * places), 1), places - 1)
+    for number in range(min(count, places)):
+        turned = np.roll(order, -round(number * places / min(count, places)))
+        yield np.sort(turned[size:]), np.sort(turned[:size])
+
+
+def _drawn(where: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator) -> list[Fold]:
+    """Draws of a split by seeds of their own, distinct ones."""
+    seeds = rng.integers(2**31, size=DRAWS * count)
+    drawn = [make_split(where, replace(settings, seed=int(one))).folds[0] for one in seeds]
+    return list({fold.test.tobytes(): fold for fold in drawn}.values())
+
+
+def _least_shared(drawn: list[Fold], count: int) -> tuple[Fold, ...]:
+    """`count` of the draws, one after the other that leaves out the fewest rows again."""
+    chosen, rest = [drawn[0]], drawn[1:]
+    while rest and len(chosen) < count:
+        seen = np.concatenate([fold.test for fold in chosen])
+        shared = [float(np.isin(fold.test, seen).mean()) for fold in rest]
+        chosen.append(rest.pop(int(np.argmin(shared))))
+    return tuple(chosen)
+
+
+def _stations(
+    station: np.ndarray, settings: SplitSettings, count: int, rng: np.random.Generator
+) -> list[Fold]:
+    """Folds of rows of stations (n,), at least two of them, that leave out whole ones."""
+    number = int(station.max()) + 1
+    if number == 2:  # one to learn from; none is left to choose on
+        none = np.zeros(0, np.int64)
+        return [Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)]
+    together = min(settings.leave_out if isinstance(settings.leave_out, int) else 0, number - 2)
+    where = np.zeros((len(station), 3))
+    settings = replace(settings, leave_out=together)
+    if together <= 1:
+        every = make_split(where, replace(settings, leave_out=0), station=station).folds
+        return [every[i] for i in rng.permutation(number)[:count]]
+    seeds = rng.integers(2**31, size=DRAWS * count)
+    drawn = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
+    return list(_least_shared(list({fold.test.tobytes(): fold for fold in drawn}.values()), count))
+
+
+def _by_fold(name: str, folds: list[Fold], places: int) -> InnerFolds:
+    """Each fold's test rows are one unit; a row of two is counted with the first."""
+    unit = np.full(places, NOT_TESTED)
+    for number, fold in reversed(list(enumerate(folds))):
+        unit[fold.test] = number
+    return InnerFolds(name, tuple(folds), unit)
+
+
+def _of_all(
+    known: np.ndarray, name: str, folds: Sequence[Fold], unit: np.ndarray, every: np.ndarray
+) -> InnerFolds:
+    """Folds of rows counted within `known` (n,) as rows of all, their units (n,) among those of all (S,)."""
+    whole = tuple(Fold(*(known[part] for part in vars(fold).values())) for fold in folds)
+    tested = np.isin(known, np.concatenate([fold.test for fold in whole]))
+    every[known[tested]] = unit[tested]
+    return InnerFolds(name, whole, every)

@@ -1,0 +1,190 @@
+"""Folds inside the training rows are cut as the test rows were cut from all."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from gsparc.data.errors import DataError
+from gsparc.data.inner_folds import NOT_TESTED, cut_inside, inner_folds
+from gsparc.data.own import from_arrays
+from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
+from gsparc.methods.per_station import UNHEARD, of_station
+
+KINDS = ("random", "grouped", "corner", "blocks", "sparse")
+SIDE = 0.2
+
+
+def floor(rows: int = 600, seed: int = 0) -> np.ndarray:
+    """Places all over a square of 1 m."""
+    return np.random.default_rng(seed).uniform(0, 1, (rows, 3)) * [1, 1, 0.01]
+
+
+def settings_of(name: str, **more) -> SplitSettings:
+    return SplitSettings(name, **{"side_m": SIDE, "train_fraction": 0.3, "buffer_m": 0.01, **more})
+
+
+def both(name: str, positions: np.ndarray, count: int = 3, seed: int = 0, **more):
+    settings = settings_of(name, **more)
+    outer = make_split(positions, settings).folds[0]
+    return outer, inner_folds(positions, outer, settings, count, seed)
+
+
+def apart(positions: np.ndarray, fold: Fold) -> float:
+    """Median distance of a test row to the nearest row that is learned from [m]."""
+    known = positions[np.concatenate([fold.train, fold.val])]
+    return float(np.median(cKDTree(known).query(positions[fold.test])[0]))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_left_out_rows_lie_as_far_from_the_others_as_test_rows_do(name):
+    positions = floor()
+    outer, inner = both(name, positions)
+    assert inner.name == ("random" if name == "sparse" else name) and len(inner.folds) == 3
+    far = np.mean([apart(positions, fold) for fold in inner.folds])
+    assert far == pytest.approx(apart(positions, outer), rel=0.45)
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_they_are_of_training_rows_alone_and_a_pure_function(name):
+    positions = floor()
+    outer, inner = both(name, positions)
+    known = np.union1d(outer.train, outer.val)
+    for fold in inner.folds:
+        every = np.concatenate([fold.train, fold.val, fold.test])
+        assert len(np.unique(every)) == len(every) and np.isin(every, known).all()
+        assert len(fold.train) and len(fold.val) and len(fold.test)
+    assert (inner.unit[outer.test] == NOT_TESTED).all()
+    tested = np.unique(np.concatenate([fold.test for fold in inner.folds]))
+    assert (inner.unit[tested] != NOT_TESTED).all()
+    again, other = both(name, positions)[1], both(name, positions, seed=1)[1]
+    assert all(np.array_equal(a.test, b.test) for a, b in zip(inner.folds, again.folds, strict=True))
+    assert any(not np.array_equal(a.test, b.test) for a, b in zip(inner.folds, other.folds, strict=True))
+
+
+def test_random_folds_share_no_row_where_they_need_not():
+    positions = floor()
+    _, inner = both("random", positions, 5)
+    tested = np.concatenate([fold.test for fold in inner.folds])
+    assert len(np.unique(tested)) == len(tested) == 480
+    assert [len(fold.test) for fold in inner.folds] == [96] * 5  # a fifth each, as of all rows
+
+
+def test_blocks_are_the_same_squares_of_floor():
+    positions = floor()
+    outer, inner = both("blocks", positions, share=0.15)
+    square = np.unique(np.floor(positions[:, :2] / SIDE), axis=0, return_inverse=True)[1].reshape(-1)
+    for fold in (outer, *inner.folds):
+        assert not np.isin(square[fold.test], square[np.union1d(fold.train, fold.val)]).any()
+    tested = np.concatenate([fold.test for fold in inner.folds])
+    shared = 1 - len(np.unique(tested)) / len(tested)
+    assert shared < 0.15  # draws that overlap little are taken
+    units = inner.unit[tested]
+    assert len(np.unique(units)) == len(np.unique(square[tested]))
+
+
+def test_the_side_of_squares_is_the_outer_one_where_it_was_not_said():
+    positions = floor()
+    settings = SplitSettings("blocks")  # a tenth of the site
+    outer = make_split(positions, settings).folds[0]
+    inner = inner_folds(positions, outer, settings, 3, 0)
+    side = np.ptp(positions[:, :2], axis=0).max() / 10
+    square = np.unique(np.floor(positions[:, :2] / side), axis=0, return_inverse=True)[1].reshape(-1)
+    for fold in inner.folds:
+        assert not np.isin(square[fold.test], square[fold.train]).any()
+
+
+def test_squares_are_made_smaller_where_two_are_left():
+    positions = floor() * [1, 0.3, 1]
+    _, inner = both("blocks", positions, side_m=0.34)
+    assert inner.name == "blocks" and len(inner.folds) == 3
+    assert all(len(fold.val) and len(fold.test) for fold in inner.folds)
+
+
+def test_stretches_are_as_long_as_the_test_is():
+    walk = np.cumsum(np.random.default_rng(0).normal(size=(500, 3)) * 0.006, axis=0)
+    outer, inner = both("grouped", walk, 4)
+    for fold in inner.folds:
+        assert len(fold.test) == pytest.approx(len(outer.test), rel=0.1)
+
+
+def test_thinned_rows_are_not_thinned_again():
+    positions = floor()
+    outer, inner = both("random", positions, train_count=100, spacing_m=0.01)
+    known = len(outer.train) + len(outer.val)
+    assert known == 100
+    assert all(len(fold.train) + len(fold.val) == 80 for fold in inner.folds)
+    outer, inner = both("sparse", positions)
+    assert all(len(f.train) + len(f.val) == 0.8 * 180 for f in inner.folds)
+
+
+@pytest.mark.parametrize("name", ["random", "blocks"])
+def test_a_place_visited_again_is_left_out_whole(name):
+    places = floor(200)
+    place = np.repeat(np.arange(200), 3)
+    positions, settings = places[place], settings_of(name)
+    outer = make_split(positions, settings, place=place).folds[0]
+    for fold in inner_folds(positions, outer, settings, 3, 0, place).folds:
+        assert not np.isin(place[fold.test], place[np.union1d(fold.train, fold.val)]).any()
+        assert not np.isin(place[fold.val], place[fold.train]).any()
+
+
+@pytest.mark.parametrize("together", [0, 2])
+def test_whole_stations_are_left_out(together):
+    station = np.repeat(np.arange(8), 30)
+    positions, settings = floor(240), SplitSettings("stations", leave_out=together)
+    outer = make_split(positions, settings, station=station).folds[0]
+    inner = inner_folds(positions, outer, settings, 3, 0, station=station)
+    assert inner.name == "stations" and len(inner.folds) == 3
+    for fold in inner.folds:
+        assert len(np.unique(station[fold.test])) == max(together, 1)
+        assert not np.isin(station[fold.test], station[np.union1d(fold.train, fold.val)]).any()
+
+
+def test_of_two_stations_each_is_left_out_and_of_one_rows_are():
+    station, positions = np.repeat([3, 5], 20), floor(40)
+    rows, none = np.arange(40), np.zeros(0, np.int64)
+    settings = SplitSettings("stations")
+    inner = inner_folds(positions, Fold(rows, none, none), settings, 3, 0, station=station)
+    assert [set(station[f.test]) for f in inner.folds] == [{3}, {5}]
+    alone = inner_folds(positions, Fold(rows[:20], none, none), settings, 3, 0, station=station)
+    assert alone.name == "random" and len(alone.folds) == 3
+
+
+def test_of_stations_learned_together_squares_are_those_of_what_moves():
+    walk = floor(90) * [20, 20, 1]
+    posts = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
+    far = np.linalg.norm(walk[:, None] - posts, axis=-1)
+    data = from_arrays({"rx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)})
+    settings = SplitSettings("blocks", side_m=5.0)
+    outer = make_split(data.moving, settings, place=data.place, station=data.station).folds[0]
+    together = data.subset(np.arange(len(data)), of_station(data.site, UNHEARD))
+    assert together.moving.shape[1] == 6
+    inner, plain = (cut_inside(d, outer, settings, 3, 0) for d in (together, data))
+    assert inner.name == "blocks"
+    assert all(np.array_equal(a.test, b.test) for a, b in zip(inner.folds, plain.folds, strict=True))
+
+
+@pytest.mark.parametrize("name", ["random", "blocks"])
+def test_a_files_own_rows_say_how_they_were_cut(name):
+    positions = floor(1200)
+    outer = make_split(positions, settings_of(name)).folds[0]
+    inner = inner_folds(positions, outer, FileSettings(path="split.json"), 3, 0)
+    assert inner.name == name
+    gap = apart(positions, Fold(outer.train, outer.train[:0], outer.val))
+    assert np.mean([apart(positions, fold) for fold in inner.folds]) == pytest.approx(gap, rel=0.5)
+
+
+def test_a_file_without_validation_rows_is_cut_at_random():
+    rows, none = np.arange(60), np.zeros(0, np.int64)
+    inner = inner_folds(floor(60), Fold(rows, none, none), FileSettings(path="split.json"), 3, 0)
+    assert inner.name == "random"
+
+
+def test_too_few_places_are_refused():
+    rows, none = np.arange(3), np.zeros(0, np.int64)
+    with pytest.raises(DataError, match="1 training places are too few"):
+        inner_folds(floor(3), Fold(rows, none, none), None, 3, 0, place=np.zeros(3, np.int64))
+    few = inner_folds(floor(3), Fold(rows, none, none), None, 5, 0)
+    assert all(len(fold.train) and len(fold.test) for fold in few.folds)
