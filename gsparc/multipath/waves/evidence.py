@@ -1,0 +1,223 @@
+"""Powers of all terms by marginal likelihood, with covariances compressed to what places can tell apart.
+
+The degrees of freedom of waves over a patch grow with its size in wavelengths (R. A. Kennedy et al.,
+"Intrinsic limits of dimensionality and richness in random multipath fields", IEEE Trans. Signal Process. 55
+(2007)) and are often far fewer than rows; the eigenvectors U of the isotropic field hold all of them, and
+outside of them there is noise alone. Each group's scale is profiled out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from gsparc.multipath.ridge import cholesky
+from gsparc.multipath.waves.columns import Group
+from gsparc.multipath.waves.covariance import Shape, Values, apart, direct_wave, source_waves
+from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth
+
+FLOOR = 0.01  # of the noise: powers of eigenvectors that are left out
+WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
+LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left out
+LOWEST, HIGHEST = -14.0, 7.0  # logarithms of powers
+WEAK = 1e-3  # pull of every log power to where it started, which holds those that nothing depends on
+STEPS = 40
+
+
+@dataclass(frozen=True)
+class Compressed:
+    """A group's terms in the basis.
+
+    Attributes:
+        group: whose, with targets of unit mean square.
+        basis: (n, r) float64 of orthonormal columns.
+        room: (1 + M, r, r) complex128, the isotropic field and those of directions.
+        factors: F (r, q) complex128 of the terms F F^H, in the order of `Shape.names`.
+        target: (r, D) complex128.
+        rest: sum of squares outside the basis.
+    """
+
+    group: Group
+    basis: Tensor
+    room: Tensor
+    factors: tuple[Tensor, ...]
+    target: Tensor
+    rest: float
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A group's covariance with one set of powers, factored.
+
+    Attributes:
+        nll: negative log marginal likelihood of complex targets [nats], but for a constant.
+        inverse: (r, r) complex128.
+        alpha: (r, D) complex128.
+        scale: mean square of the whitened targets: the group's own power.
+    """
+
+    nll: float
+    inverse: Tensor
+    alpha: Tensor
+    scale: float
+
+
+def normalised(group: Group) -> Group:
+    """The same with targets of unit mean square."""
+    level = group.target.abs().square().mean().sqrt().clamp_min(1e-150)
+    return replace(group, target=group.target / level)
+
+
+def compressed(groups: tuple[Group, ...], shape: Shape, values: Values) -> tuple[Compressed, ...]:
+    """Terms of all groups; those of one set of displacements and one wavelength share the diffuse field's."""
+    fields: dict[tuple[bytes, float], tuple[Tensor, Tensor]] = {}
+    gains: dict[bytes, tuple[Tensor, Tensor]] = {}
+    found = []
+    noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
+    for group in groups:
+        key = (group.places - group.places[0]).mul(1e6).round().numpy().tobytes()
+        if (key, group.slot.wavenumber) not in fields:
+            fields[key, group.slot.wavenumber] = _field(group, shape, values, noise)
+        if key not in gains:
+            distance = apart(group.places, group.places)
+            gains[key] = _roots(smooth(distance, shape.reach)), _roots(smooth(distance, values.gain))
+        basis, room = fields[key, group.slot.wavenumber]
+        target = basis.T.to(torch.complex128) @ group.target
+        rest = float(group.target.abs().square().sum() - target.abs().square().sum())
+        factors = _factors(group, shape, values, basis, *gains[key])
+        found.append(Compressed(group, basis, room, factors, target, max(rest, 0.0)))
+    return tuple(found)
+
+
+def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Tensor, Tensor]:
+    distance = apart(group.places, group.places)
+    bound = envelope(distance, values.envelope)
+    plain = isotropic(distance, group.slot.wavenumber) * bound
+    size, vectors = torch.linalg.eigh(plain)
+    kept = size > FLOOR * noise
+    whole = int(kept.sum()) > WORTH * len(group)
+    basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
+    room = [plain.to(torch.complex128)]
+    room += [
+        directed(group.step, group.slot.wavenumber, u, shape.concentration) * bound for u in shape.angles
+    ]
+    if whole:
+        return basis, torch.stack(room)
+    wide = basis.to(torch.complex128)
+    return basis, torch.stack([wide.T @ each @ wide for each in room])
+
+
+def _roots(correlation: Tensor) -> Tensor:
+    size, vectors = torch.linalg.eigh(correlation)
+    kept = size > LOW_RANK * size[-1]
+    return vectors[:, kept] * size[kept].sqrt()
+
+
+def _factors(
+    group: Group, shape: Shape, values: Values, basis: Tensor, fixed: Tensor, varying: Tensor
+) -> tuple[Tensor, ...]:
+    wide, slot, places = basis.T.to(torch.complex128), group.slot, group.places
+    found = [wide @ fixed.to(torch.complex128)] if shape.constant else []
+    if shape.direct:
+        wave = direct_wave(shape, values, slot, places)[:, None]
+        found += [wide @ (wave * fixed), wide @ (wave * varying)]
+    waves = source_waves(shape, values, slot, places)[:, :, None]
+    found += [wide @ (wave * fixed) for wave in waves]
+    found += [wide @ (wave * varying) for wave in waves]
+    return tuple(found)
+
+
+def solved(part: Compressed, power: Tensor) -> Solved:
+    """With powers (P,), those of correlated noise ignored."""
+    room = len(part.room)
+    noise = power[room + len(part.factors)]
+    covariance = torch.einsum("b,bij->ij", power[:room].to(torch.complex128), part.room)
+    for level, factor in zip(power[room:], part.factors, strict=False):
+        covariance = covariance.addmm(factor * level, factor.mH)
+    covariance.diagonal().add_(noise)
+    lower = cholesky(covariance)
+    inverse = torch.cholesky_inverse(lower)
+    alpha = inverse @ part.target
+    count, outputs = part.group.target.shape
+    quadratic = float((part.target.conj() * alpha).real.sum()) + part.rest / float(noise)
+    scale = max(quadratic / (count * outputs), 1e-300)
+    determinant = 2 * float(lower.diagonal().real.log().sum())
+    determinant += (count - len(lower)) * math.log(float(noise))
+    return Solved(outputs * (count * math.log(scale) + determinant), inverse, alpha, scale)
+
+
+def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
+    """Gradient (P,) of the negative log likelihood by log powers."""
+    count, outputs = part.group.target.shape
+    weight = outputs * at.inverse - at.alpha @ at.alpha.mH / at.scale
+    room = len(part.room)
+    found = torch.zeros_like(power)
+    found[:room] = (part.room.reshape(room, -1) @ weight.T.reshape(-1)).real
+    for number, factor in enumerate(part.factors, room):
+        found[number] = (factor.conj() * (weight @ factor)).real.sum()
+    noise = room + len(part.factors)
+    found[noise] = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[noise]
+    found[noise] -= part.rest / (at.scale * power[noise] ** 2)
+    return found * power
+
+
+def evidence(parts: tuple[Compressed, ...], power: Tensor) -> float:
+    """Negative log marginal likelihood of all groups [nats]."""
+    return sum(solved(part, power).nll for part in parts)
+
+
+def fit_powers(
+    parts: tuple[Compressed, ...], shape: Shape, start: Tensor, shrinkage: float, steps: int = STEPS
+) -> tuple[Tensor, float]:
+    """Powers (P,) of largest evidence, and its negative logarithm [nats] without the priors.
+
+    Args:
+        start: (P,) powers.
+        shrinkage: rows that an inverse Gamma prior of directions' powers about their mean counts for.
+    """
+    begin = start.log().clamp(LOWEST, HIGHEST)
+    angles = shape.where("direction")
+
+    def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        log = torch.from_numpy(logs)
+        power, total = log.exp(), 0.0
+        gradient = torch.zeros_like(log)
+        for part in parts:
+            at = solved(part, power)
+            total += at.nll
+            gradient += slope(part, power, at)
+        if angles and shrinkage > 0:
+            mean = power[angles].mean()
+            ratio = mean / power[angles]
+            total += shrinkage * float((ratio - ratio.log()).sum())
+            pull = (ratio.sum() / mean - len(angles) / mean) * power[angles] / len(angles)
+            gradient[angles] += shrinkage * (1 - ratio + pull)
+        total += WEAK * float((log - begin).square().sum())
+        return total, (gradient + 2 * WEAK * (log - begin)).numpy()
+
+    bounds = [(LOWEST, HIGHEST)] * len(begin)
+    found = minimize(
+        objective, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps}
+    )
+    power = torch.from_numpy(found.x).exp()
+    return power, evidence(parts, power)
+
+
+def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
+    """Errors (n, D) of rows predicted without any of their cell (n,) (Rasmussen and Williams 2006, 5.12)."""
+    at, noise = solved(part, power), power[len(part.room) + len(part.factors)]
+    wide = part.basis.to(torch.complex128)
+    alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise
+    error = torch.empty_like(alpha)
+    for number in np.unique(cell):
+        mine = torch.from_numpy(np.flatnonzero(cell == number))
+        own = wide[mine]
+        block = own @ (at.inverse @ own.mH) - own @ own.mH / noise
+        block.diagonal().add_(1 / noise)
+        error[mine] = torch.linalg.solve(block, alpha[mine])
+    return error
