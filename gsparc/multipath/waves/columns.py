@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -62,7 +63,7 @@ class Group:
         places: (n, 3) float64 [m].
         target: (n, D) complex128, stored units.
         run: (n,) int64 numbers of runs.
-        order: (n,) float64 numbers of measurements, in the order in which they were taken.
+        order: (n,) float64 numbers among the static end's measurements, in the order they were taken.
     """
 
     slot: Slot
@@ -80,10 +81,10 @@ class Group:
         parts = (self.rows, self.places, self.target, self.run, self.order)
         return Group(self.slot, *(part[kept] for part in parts))
 
-    @property
-    def step(self) -> Tensor:
-        """Displacements (n, n, 3) [m] between all places."""
-        return self.places[:, None] - self.places[None]
+    @cached_property
+    def displacements(self) -> bytes:
+        """Equal for groups whose places differ by one displacement at most, to a micrometre."""
+        return (self.places - self.places[0]).mul(1e6).round().numpy().tobytes()
 
 
 def refuse(site: Site) -> None:
@@ -109,6 +110,7 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
     else:
         run = np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
     station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    taken = _taken(data)
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
     target = torch.from_numpy(np.asarray(data.target[rows])).to(torch.complex128)
@@ -123,9 +125,20 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
             here = torch.from_numpy(measured)
             chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
             places = slot.places(moving[here], turned[here])
-            order = torch.from_numpy(rows[measured].astype(np.float64))
+            order = torch.from_numpy(taken[rows[measured]])
             found.append(Group(slot, here, places, chosen, torch.from_numpy(run[measured]), order))
     return tuple(found)
+
+
+def _taken(data: Measurements) -> np.ndarray:
+    """Each measurement's number (S,) float64 among those of its station."""
+    if data.station is None:
+        return np.arange(len(data), dtype=np.float64)
+    found = np.empty(len(data))
+    for number in np.unique(data.station):
+        mine = np.flatnonzero(data.station == number)
+        found[mine] = np.arange(len(mine))
+    return found
 
 
 def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> list[Slot]:

@@ -10,6 +10,7 @@ long that it only ends far outside. Noise, and what is correlated over the order
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -107,10 +108,20 @@ def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tenso
     distance = apart(a, b)
     found = shape.of("isotropic", values.power)[0] * isotropic(distance, wavenumber)
     if len(shape.angles):
-        step = a[:, None] - b[None]
-        for power, angle in zip(shape.of("direction", values.power), shape.angles, strict=True):
-            found = found + power * directed(step, wavenumber, angle, shape.concentration)
+        found = found.to(torch.complex128)
+        correlations = directions(shape, wavenumber, a, b, distance)
+        for power, correlation in zip(shape.of("direction", values.power), correlations, strict=True):
+            found = found + power * correlation
     return (found * envelope(distance, values.envelope)).to(torch.complex128)
+
+
+def directions(shape: Shape, wavenumber: float, a: Tensor, b: Tensor, distance: Tensor) -> Iterator[Tensor]:
+    """Correlations (n, m) complex128 of waves from each direction, over distances (n, m) [m]."""
+    squared = (wavenumber * distance).square()
+    middle = b[:1]  # differences of small numbers, wherever the origin is
+    before, after = (wavenumber * (places - middle) @ shape.angles.T for places in (a, b))
+    for first, second in zip(before.T, after.T, strict=True):
+        yield directed(squared, first[:, None] - second[None], shape.concentration)
 
 
 def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,7 +17,8 @@ from torch import Tensor
 
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
-from gsparc.multipath.waves.covariance import Shape, Values, diffuse, disturbance, temporal, told
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse, temporal, told
+from gsparc.multipath.waves.evidence import Kept
 
 STRETCH = 400  # rows looked at
 COLUMNS = 3  # groups looked at
@@ -36,9 +38,16 @@ def stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
     return tuple(found)
 
 
-def with_drift(groups: tuple[Group, ...], shape: Shape, values: Values) -> tuple[Shape, Values, float]:
-    """The shape and values with correlated noise, and what evidence gains on `groups` [nats]."""
-    signals = [_signal(group, shape, values) for group in groups]
+def with_drift(
+    groups: tuple[Group, ...], signals: list[Tensor], shape: Shape, values: Values
+) -> tuple[Shape, Values, float]:
+    """The shape and values with correlated noise, and what evidence gains on `groups` [nats].
+
+    Args:
+        groups: see `stretches`.
+        signals: covariances (n, n) of theirs, see `signals_of`.
+        shape, values: without correlated noise.
+    """
     noise = float(shape.of("noise", values.power)[0])
     eye = [torch.eye(len(group), dtype=torch.float64) for group in groups]
     terms = [[one, *temporal(values.envelope, group)] for one, group in zip(eye, groups, strict=True)]
@@ -65,13 +74,27 @@ def with_drift(groups: tuple[Group, ...], shape: Shape, values: Values) -> tuple
     return fresh, replace(values, power=power), before - float(found.fun)
 
 
-def left_out_cells(group: Group, shape: Shape, values: Values, cell: np.ndarray) -> Tensor:
-    """Errors (n, D) of rows whose signal is predicted without any of their cell (n,)."""
-    other = disturbance(shape, values, group).to(torch.complex128)
-    inverse = torch.cholesky_inverse(cholesky(_signal(group, shape, values) + other))
+def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.ndarray]) -> list[Tensor]:
+    """Errors (n, D) of rows whose signal is predicted without any of their cell, for each of some cells (n,).
+
+    Args:
+        group: rows.
+        signal: (n, n) covariance of the signal.
+        other: (n, n) covariance of what disturbs it.
+        cells: numbers (n,) of cells.
+    """
+    other = other.to(torch.complex128)
+    inverse = torch.cholesky_inverse(cholesky(signal + other))
+    return [_left_out(group, other, inverse, cell) for cell in cells]
+
+
+def _left_out(group: Group, other: Tensor, inverse: Tensor, cell: np.ndarray) -> Tensor:
     alpha = inverse @ group.target
     known = group.target - other @ alpha
     mixed = other @ inverse
+    if len(np.unique(cell)) == len(cell):
+        own = (1 - mixed.diagonal()) / inverse.diagonal()
+        return group.target - known + own[:, None] * alpha
     error = torch.empty_like(alpha)
     for number in np.unique(cell):
         mine = torch.from_numpy(np.flatnonzero(cell == number))
@@ -81,10 +104,15 @@ def left_out_cells(group: Group, shape: Shape, values: Values, cell: np.ndarray)
     return error
 
 
-def _signal(group: Group, shape: Shape, values: Values) -> Tensor:
-    places, slot = group.places, group.slot
-    found = diffuse(shape, values, slot.wavenumber, places, places)
-    return found + told(shape, values, slot, places, places)
+def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """Covariances (n, n) of the groups' signals."""
+    fields, found = Kept(), []
+    for group in groups:
+        places, slot = group.places, group.slot
+        make = partial(diffuse, shape, values, slot.wavenumber, places, places)
+        field = fields.of((group.displacements, slot.wavenumber), make)
+        found.append(field + told(shape, values, slot, places, places))
+    return found
 
 
 def _likelihood(

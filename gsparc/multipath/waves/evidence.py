@@ -9,7 +9,10 @@ outside of them there is noise alone. Each group's scale is profiled out.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,8 +21,8 @@ from torch import Tensor
 
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
-from gsparc.multipath.waves.covariance import Shape, Values, apart, direct_wave, source_waves
-from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth
+from gsparc.multipath.waves.covariance import Shape, Values, apart, direct_wave, directions, source_waves
+from gsparc.multipath.waves.kernels import envelope, isotropic, smooth
 
 FLOOR = 0.01  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
@@ -73,47 +76,62 @@ def normalised(group: Group) -> Group:
     return replace(group, target=group.target / level)
 
 
-def compressed(groups: tuple[Group, ...], shape: Shape, values: Values) -> tuple[Compressed, ...]:
+class Kept:
+    """Matrices of places that further candidates and groups need again."""
+
+    def __init__(self) -> None:
+        self._found: dict[tuple[bytes | float, ...], Any] = {}
+
+    def of(self, key: tuple[bytes | float, ...], make: Callable[[], Any]) -> Any:
+        """What `make` returned the first time."""
+        if key not in self._found:
+            self._found[key] = make()
+        return self._found[key]
+
+
+def compressed(
+    groups: tuple[Group, ...], shape: Shape, values: Values, kept: Kept | None = None
+) -> tuple[Compressed, ...]:
     """Terms of all groups; those of one set of displacements and one wavelength share the diffuse field's."""
-    fields: dict[tuple[bytes, float], tuple[Tensor, Tensor]] = {}
-    gains: dict[bytes, tuple[Tensor, Tensor]] = {}
-    found = []
+    kept, found = kept or Kept(), []
     noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
     for group in groups:
-        key = (group.places - group.places[0]).mul(1e6).round().numpy().tobytes()
-        if (key, group.slot.wavenumber) not in fields:
-            fields[key, group.slot.wavenumber] = _field(group, shape, values, noise)
-        if key not in gains:
-            distance = apart(group.places, group.places)
-            gains[key] = _roots(smooth(distance, shape.reach)), _roots(smooth(distance, values.gain))
-        basis, room = fields[key, group.slot.wavenumber]
+        key, wavenumber, length = group.displacements, group.slot.wavenumber, float(values.envelope)
+        basis, room = kept.of(
+            (key, wavenumber, length, noise, shape.angles.numpy().tobytes(), shape.concentration),
+            partial(_field, group, shape, values, noise),
+        )
+        fixed = kept.of((key, shape.reach), partial(_roots, group, shape.reach))
+        varying = kept.of((key, float(values.gain)), partial(_roots, group, float(values.gain)))
         target = basis.T.to(torch.complex128) @ group.target
         rest = float(group.target.abs().square().sum() - target.abs().square().sum())
-        factors = _factors(group, shape, values, basis, *gains[key])
+        factors = _factors(group, shape, values, basis, fixed, varying)
         found.append(Compressed(group, basis, room, factors, target, max(rest, 0.0)))
     return tuple(found)
 
 
 def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Tensor, Tensor]:
-    distance = apart(group.places, group.places)
+    places, wavenumber = group.places, group.slot.wavenumber
+    distance = apart(places, places)
     bound = envelope(distance, values.envelope)
-    plain = isotropic(distance, group.slot.wavenumber) * bound
+    plain = isotropic(distance, wavenumber) * bound
     size, vectors = torch.linalg.eigh(plain)
     kept = size > FLOOR * noise
     whole = int(kept.sum()) > WORTH * len(group)
     basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
     room = [plain.to(torch.complex128)]
-    room += [
-        directed(group.step, group.slot.wavenumber, u, shape.concentration) * bound for u in shape.angles
-    ]
+    room += [each * bound for each in directions(shape, wavenumber, places, places, distance)]
     if whole:
         return basis, torch.stack(room)
-    wide = basis.to(torch.complex128)
-    return basis, torch.stack([wide.T @ each @ wide for each in room])
+    # The basis is real: two real products take half the time of a complex one.
+    return basis, torch.stack(
+        [torch.complex(basis.T @ each.real @ basis, basis.T @ each.imag @ basis) for each in room]
+    )
 
 
-def _roots(correlation: Tensor) -> Tensor:
-    size, vectors = torch.linalg.eigh(correlation)
+def _roots(group: Group, length: float) -> Tensor:
+    """F (n, q) with F F^T the correlation of gains that vary over `length` [m]."""
+    size, vectors = torch.linalg.eigh(smooth(apart(group.places, group.places), length))
     kept = size > LOW_RANK * size[-1]
     return vectors[:, kept] * size[kept].sqrt()
 
@@ -213,6 +231,9 @@ def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
     at, noise = solved(part, power), power[len(part.room) + len(part.factors)]
     wide = part.basis.to(torch.complex128)
     alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise
+    if len(np.unique(cell)) == len(cell):
+        own = ((wide @ at.inverse) * wide.conj()).sum(1) + (1 - wide.abs().square().sum(1)) / noise
+        return alpha / own[:, None]
     error = torch.empty_like(alpha)
     for number in np.unique(cell):
         mine = torch.from_numpy(np.flatnonzero(cell == number))

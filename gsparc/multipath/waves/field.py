@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
 from gsparc.multipath.waves.columns import Group, Slot, asked, gather
 from gsparc.multipath.waves.covariance import Shape, Values, diffuse, disturbance, explained, prior, told
+from gsparc.multipath.waves.evidence import Kept
 from gsparc.ops import Pose
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
@@ -118,7 +120,7 @@ class ChannelField(ConditionalField):
             run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
             places = slot.places(moving[here], turned[here])
             group = Group(slot, here, places, _entries(target, here, slot), run, order)
-            inverse = torch.linalg.inv(self._covariance(group, shape, values))
+            inverse = torch.linalg.inv(self._covariance(group, shape, values, Kept()))
             variance = known.scale / inverse.diagonal().real
             error = (inverse @ group.target) / inverse.diagonal()[:, None]
             density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
@@ -146,7 +148,8 @@ class ChannelField(ConditionalField):
     def _solve(self, groups: tuple[Group, ...], factors: Tensor | None) -> None:
         """Set the weights; factors of runs (runs,), as measured, are estimated unless given."""
         shape, values = self.shape, self.values
-        lowers = [cholesky(self._covariance(group, shape, values)) for group in groups]
+        fields = Kept()
+        lowers = [cholesky(self._covariance(group, shape, values, fields)) for group in groups]
         if factors is None:
             factors = torch.ones(len(self.runs), dtype=torch.complex128)
             if len(self.runs) > 1:
@@ -159,14 +162,15 @@ class ChannelField(ConditionalField):
             found.append(Weights(aligned, lower, alpha, max(scale, 1e-300)))
         self.weights = tuple(found)
 
-    def _covariance(self, group: Group, shape: Shape, values: Values) -> Tensor:
-        """(n, n) complex128 of a group's rows with what disturbs them, relative to its scale."""
-        signal = self._signal(group.slot, group.places, group.places, shape, values)
-        return signal + disturbance(shape, values, group)
-
     @staticmethod
-    def _signal(slot: Slot, a: Tensor, b: Tensor, shape: Shape, values: Values) -> Tensor:
-        return diffuse(shape, values, slot.wavenumber, a, b) + told(shape, values, slot, a, b)
+    def _covariance(group: Group, shape: Shape, values: Values, fields: Kept) -> Tensor:
+        """(n, n) complex128 of a group's rows with what disturbs them, relative to its scale."""
+        slot, places = group.slot, group.places
+        field = fields.of(
+            (group.displacements, slot.wavenumber),
+            partial(diffuse, shape, values, slot.wavenumber, places, places),
+        )
+        return field + told(shape, values, slot, places, places) + disturbance(shape, values, group)
 
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """See `ConditionalField`; in the phase and level of the largest run, see `run_factor`."""

@@ -21,9 +21,10 @@ from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
 from gsparc.multipath.waves import drift
 from gsparc.multipath.waves.columns import Group, gather, thinned
-from gsparc.multipath.waves.covariance import BEYOND, Shape, Values
+from gsparc.multipath.waves.covariance import BEYOND, Shape, Values, disturbance
 from gsparc.multipath.waves.evidence import (
     Compressed,
+    Kept,
     compressed,
     evidence,
     fit_powers,
@@ -37,10 +38,11 @@ from gsparc.multipath.waves.settings import ChannelSettings
 
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
-LEAST = 1e-4  # of all powers: those below are dropped
+NEW = 0.2  # of the isotropic field's power, where that of a new term starts
+SHORT = 12  # steps of a fit that compares lengths
+WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.02  # largest of any one of them
-STARTS = {"constant": 0.1, "direct": 0.1, "direct_smooth": 0.1}  # powers, relative to the diffuse field's
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,18 @@ def _grid_point(
     return nll, 1 / turn
 
 
+def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
+    """What all directions have in common, and weak ones, made part of the isotropic field."""
+    power, numbers = values.power, shape.where("direction")
+    beyond = power[numbers] - power[numbers].min()
+    everywhere = power[shape.where("isotropic") + numbers].sum()
+    strong = beyond > WEAKEST * everywhere
+    isotropic_power = everywhere - beyond[strong].sum()
+    rest = power[len(numbers) + 1 :]
+    kept = torch.cat([isotropic_power[None], beyond[strong], rest])
+    return replace(shape, angles=shape.angles[strong]), replace(values, power=kept)
+
+
 @dataclass(frozen=True)
 class _Search:
     """What every candidate of a fit has in common."""
@@ -175,6 +189,7 @@ class _Search:
     plain: tuple[Shape, Values]
     sources: Tensor
     wavelength: float
+    kept: Kept
 
     @staticmethod
     def of(
@@ -188,19 +203,21 @@ class _Search:
         every = gather(data, rows, True)
         every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
         groups = thinned(every, settings.columns, settings.rows)
-        return _Search(settings, groups, every, plain, sources, 2 * math.pi / every[0].slot.wavenumber)
+        wavelength = 2 * math.pi / every[0].slot.wavenumber
+        return _Search(settings, groups, every, plain, sources, wavelength, Kept())
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes."""
         wanted, notes = self.settings, []
         best = self._measured(*self.plain, self._compressed(*self.plain))
-        best = self._step(best, self._fitted(*self.plain)[0], "auto", "powers by likelihood", notes)
-        ends = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
-        told = wanted.constant is not False or (ends and wanted.direct is not False) or len(self.sources) > 0
-        if told and not budget.over():
-            fresh = self._with_told(best, ends and wanted.direct is not False)
-            forced = wanted.constant is True or wanted.direct is True or len(self.sources) > 0
-            best = self._step(best, fresh, forced or "auto", "leakage, direct wave, sources", notes)
+        best = self._step(best, self._fitted(*self.plain), "auto", "powers by likelihood", notes)
+        known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
+        direct = known and wanted.direct is not False
+        if (direct or wanted.constant is not False) and not budget.over():
+            forced = wanted.constant is True or wanted.direct is True or "auto"
+            best = self._step(best, self._with_told(best, direct), forced, "leakage and direct wave", notes)
+        if len(self.sources) and not budget.over():
+            best = self._step(best, self._with_sources(best), "auto", "sources", notes)
         if wanted.directions is not False and not budget.over():
             best = self._step(best, self._with_directions(best), wanted.directions, "directions", notes)
         if wanted.correlated is not False and not budget.over():
@@ -220,7 +237,7 @@ class _Search:
         return after if keep else before
 
     def _compressed(self, shape: Shape, values: Values) -> tuple[Compressed, ...]:
-        return compressed(self.groups, shape, values)
+        return compressed(self.groups, shape, values, self.kept)
 
     def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
         """With what left-out rows say."""
@@ -233,49 +250,56 @@ class _Search:
                 errors[number] += float(error.abs().square().mean()) / len(parts)
         return Candidate(shape, values, evidence(parts, values.power), errors)
 
-    def _fitted(self, shape: Shape, values: Values) -> tuple[Candidate, tuple[Compressed, ...]]:
+    def _fitted(self, shape: Shape, values: Values) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(shape, values)
         power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage)
-        fresh = replace(values, power=power)
-        return self._measured(shape, fresh, parts), parts
+        return self._measured(shape, replace(values, power=power), parts)
 
     def _with_told(self, before: Candidate, direct: bool) -> Candidate:
-        """With leakage, the direct wave and sources; the best of a few lengths."""
-        shape = replace(
-            before.shape,
-            constant=self.settings.constant is not False,
-            direct=direct,
-            sources=len(self.sources),
-        )
-        level = float(before.shape.of("isotropic", before.values.power)[0])
-        noise = float(before.shape.of("noise", before.values.power)[0])
-        starts = {**STARTS, "isotropic": 1.0, "noise": noise / level}
-        share = 0.3 / max(len(self.sources), 1)
-        power = torch.tensor([starts.get(name, share) for name in shape.names], dtype=torch.float64)
-        values = replace(before.values, power=power, sources=self.sources)
-        found = []
-        lengths = {float(before.values.envelope), LENGTHS[-1] * self.wavelength}
-        gains = GAINS if direct or len(self.sources) else GAINS[:1]
-        for bound in sorted(lengths):
-            for gain in gains:
-                tried = replace(
-                    values,
-                    envelope=torch.tensor(bound).double(),
-                    gain=torch.tensor(gain * self.wavelength).double(),
-                )
-                found.append(self._fitted(shape, tried))
-        best, parts = min(found, key=lambda each: each[0].nll)
-        if direct and self.settings.offset:
-            offset = best_offset(parts, shape, best.values, self.wavelength)
-            if offset is not None:
-                moved, _ = self._fitted(shape, replace(best.values, offset=offset))
-                if moved.nll + 1.5 * math.log(sum(g.target.numel() for g in self.groups)) < best.nll:
-                    best = moved
-        return self._pruned(best)
+        """With leakage and the direct wave; the best of a few lengths."""
+        shape = replace(before.shape, constant=self.settings.constant is not False, direct=direct)
+        return self._moved(self._of_lengths(shape, before.values, before.shape, direct))
+
+    def _of_lengths(self, shape: Shape, values: Values, old: Shape, gains: bool) -> Candidate:
+        """Lengths of the envelope and of gains from a short fit each, then powers."""
+        powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
+        start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
+        values = replace(values, power=torch.tensor(start, dtype=torch.float64))
+        tried = []
+        for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
+            for gain in GAINS if gains else GAINS[:1]:
+                lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
+                trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
+                power, nll = fit_powers(self._compressed(shape, trial), shape, trial.power, 0.0, SHORT)
+                tried.append((nll, replace(trial, power=power)))
+        return self._fitted(shape, min(tried, key=lambda each: each[0])[1])
+
+    def _moved(self, found: Candidate) -> Candidate:
+        """With static ends where they really are."""
+        shape, values = found.shape, found.values
+        if not shape.direct or not self.settings.offset:
+            return found
+        offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
+        if offset is None:
+            return found
+        moved = self._fitted(shape, replace(values, offset=offset))
+        worth = 1.5 * math.log(sum(group.target.numel() for group in self.groups))
+        return moved if moved.nll + worth < found.nll else found
+
+    def _with_sources(self, before: Candidate) -> Candidate:
+        shape = replace(before.shape, sources=len(self.sources))
+        values = replace(before.values, sources=self.sources)
+        if before.shape.direct:
+            power = before.values.power
+            level = NEW * float(before.shape.of("isotropic", power)[0])
+            fresh = torch.full((2 * len(self.sources),), level, dtype=torch.float64)
+            end = before.shape.where("noise")[0]
+            return self._fitted(shape, replace(values, power=torch.cat([power[:end], fresh, power[end:]])))
+        return self._of_lengths(shape, values, before.shape, True)
 
     def _with_directions(self, before: Candidate) -> Candidate:
-        """With unequal powers of directions, which start equal."""
+        """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
         group = max(self.groups, key=len)
         angles = directions(group.places, group.slot.wavenumber, self.settings.angles)
         shape = replace(before.shape, angles=angles, concentration=self.settings.concentration)
@@ -283,38 +307,23 @@ class _Search:
         level = float(before.shape.of("isotropic", old)[0])
         power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
         values = replace(before.values, power=torch.cat([power, old[1:]]))
-        return self._pruned(self._fitted(shape, values)[0])
-
-    def _pruned(self, found: Candidate) -> Candidate:
-        """Without directions and other terms whose powers vanish."""
-        shape, power = found.shape, found.values.power
-        weak = power < LEAST * power.sum()
-        if not bool(weak[shape.where("direction")].any()):
-            return found
-        kept = [i for i, name in enumerate(shape.names) if name != "direction" or not weak[i]]
-        angles = shape.angles[~weak[shape.where("direction")]]
-        return replace(
-            found, shape=replace(shape, angles=angles), values=replace(found.values, power=power[kept])
-        )
+        parts = self._compressed(shape, values)
+        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage)
+        return self._fitted(*_strongest(shape, replace(values, power=power)))
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
         groups = drift.stretches(self.every)
-        shape, values, gain = drift.with_drift(groups, before.shape, before.values)
-        errors = [
-            self._drift_errors(groups, *each) for each in ((before.shape, before.values), (shape, values))
-        ]
-        spread = replace(before, nll=0.0, errors=errors[0])
-        after = Candidate(shape, values, -gain, errors[1])
-        kept = self._step(spread, after, self.settings.correlated, "noise correlated over rows", notes)
-        return after if kept is after else before
-
-    @staticmethod
-    def _drift_errors(groups: tuple[Group, ...], shape: Shape, values: Values) -> np.ndarray:
-        errors = np.zeros(1 + len(DEPTHS))
-        for group in groups:
+        signals = drift.signals_of(groups, before.shape, before.values)
+        shape, values, gain = drift.with_drift(groups, signals, before.shape, before.values)
+        errors = [np.zeros(1 + len(DEPTHS)), np.zeros(1 + len(DEPTHS))]
+        for group, signal in zip(groups, signals, strict=True):
             places = group.places.numpy()
             grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
-            for number, cell in enumerate(grouping):
-                error = drift.left_out_cells(group, shape, values, cell)
-                errors[number] += float(error.abs().square().mean()) / len(groups)
-        return errors
+            for found, of, at in zip(errors, (before.shape, shape), (before.values, values), strict=True):
+                other = disturbance(of, at, group)
+                left = drift.left_out_cells(group, signal, other, grouping)
+                found += [float(error.abs().square().mean()) / len(groups) for error in left]
+        known = replace(before, nll=0.0, errors=errors[0])
+        after = Candidate(shape, values, -gain, errors[1])
+        kept = self._step(known, after, self.settings.correlated, "noise correlated over rows", notes)
+        return after if kept is after else before

@@ -35,12 +35,25 @@ def isotropic(distance: Tensor, wavenumber: float) -> Tensor:
     return torch.sinc(distance * (wavenumber / math.pi))
 
 
-def directed(step: Tensor, wavenumber: float, direction: Tensor, concentration: float) -> Tensor:
-    """Correlation (...) complex128 over displacements (..., 3) [m] of waves *from* `direction` (3,)."""
-    turn = wavenumber * step
-    squared = concentration**2 - turn.square().sum(-1)
-    root = torch.complex(squared, 2 * concentration * (turn @ direction)).sqrt() + 1e-9
-    return root.sinh() / root * (concentration / math.sinh(concentration))
+def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
+    """Correlation (...) complex128 of waves that come from about one direction; no gradients.
+
+    Args:
+        squared: (...) float64, (k d)^2 of displacements d.
+        along: (...) k d's component towards the direction.
+        concentration: about it.
+    """
+    # In real numbers: complex sqrt and sinh take four times as long.
+    with torch.no_grad():
+        real, imag = concentration**2 - squared, 2 * concentration * along
+        size = (real.square() + imag.square()).sqrt_()
+        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(1e-12)
+        smaller = imag.div_(2 * larger)
+        a, b = torch.where(real > 0, larger, smaller), torch.where(real > 0, smaller, larger)
+        rising, falling = a.exp(), (-a).exp()
+        x, y = (rising - falling).mul_(b.cos()), rising.add_(falling).mul_(b.sin())
+        share = size.clamp_min_(1e-24).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
+        return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
 
 
 def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:

@@ -32,5 +32,5 @@ class ChannelSettings(Checked):
     angles: int = setting(24, whole(4, 200))
     concentration: float = setting(8.0, POSITIVE)
     shrinkage: float = setting(0.5, number(0))
-    rows: int = setting(600, whole(8))
+    rows: int = setting(400, whole(8))
     columns: int = setting(8, whole(1))
