@@ -42,7 +42,7 @@ NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 12  # steps of a fit that compares lengths
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
-NO_WORSE = 1.02  # largest of any one of them
+NO_WORSE = 1.1  # largest of any one of them
 
 
 @dataclass(frozen=True)
