@@ -28,8 +28,40 @@ FLOOR = 0.01  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
 LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left out
 LOWEST, HIGHEST = -14.0, 7.0  # logarithms of powers
+LOW = 0.3  # of the rows, columns of a factor up to which its product is not kept
 WEAK = 1e-3  # pull of every log power to where it started, which holds those that nothing depends on
-STEPS = 40
+STEPS = 30
+SETTLED = 1e-6  # relative change of the objective at which steps end
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term F F^H of a covariance (r, r).
+
+    Attributes:
+        factor: F (r, q) complex128.
+        product: (r, r) complex128, kept where F has so many columns that it saves time.
+    """
+
+    factor: Tensor
+    product: Tensor | None
+
+    @staticmethod
+    def of(factor: Tensor) -> Term:
+        """From F."""
+        return Term(factor, factor @ factor.mH if factor.shape[1] > LOW * len(factor) else None)
+
+    def added(self, covariance: Tensor, power: Tensor) -> Tensor:
+        """The covariance with this term of some power."""
+        if self.product is not None:
+            return covariance.add_(self.product * power)
+        return covariance.addmm_(self.factor * power, self.factor.mH)
+
+    def trace(self, weight: Tensor) -> Tensor:
+        """Trace () of its product with a Hermitian matrix (r, r)."""
+        if self.product is not None:
+            return torch.view_as_real(self.product).mul(torch.view_as_real(weight)).sum()
+        return (self.factor.conj() * (weight @ self.factor)).real.sum()
 
 
 @dataclass(frozen=True)
@@ -40,7 +72,7 @@ class Compressed:
         group: whose, with targets of unit mean square.
         basis: (n, r) float64 of orthonormal columns.
         room: (1 + M, r, r) complex128, the isotropic field and those of directions.
-        factors: F (r, q) complex128 of the terms F F^H, in the order of `Shape.names`.
+        terms: of leakage, direct wave and sources, in the order of `Shape.names`.
         target: (r, D) complex128.
         rest: sum of squares outside the basis.
     """
@@ -48,7 +80,7 @@ class Compressed:
     group: Group
     basis: Tensor
     room: Tensor
-    factors: tuple[Tensor, ...]
+    terms: tuple[Term, ...]
     target: Tensor
     rest: float
 
@@ -105,9 +137,17 @@ def compressed(
         varying = kept.of((key, float(values.gain)), partial(_roots, group, float(values.gain)))
         target = basis.T.to(torch.complex128) @ group.target
         rest = float(group.target.abs().square().sum() - target.abs().square().sum())
-        factors = _factors(group, shape, values, basis, fixed, varying)
-        found.append(Compressed(group, basis, room, factors, target, max(rest, 0.0)))
+        terms = tuple(map(Term.of, _factors(group, shape, values, basis, fixed, varying)))
+        found.append(Compressed(group, basis, room, terms, target, max(rest, 0.0)))
     return tuple(found)
+
+
+def compressible(group: Group, shape: Shape, values: Values) -> bool:
+    """Whether the places tell far fewer waves apart than there are rows."""
+    noise = float(shape.of("noise", values.power)[0] / shape.of("isotropic", values.power)[0])
+    distance = apart(group.places, group.places)
+    plain = isotropic(distance, group.slot.wavenumber) * envelope(distance, values.envelope)
+    return int((torch.linalg.eigvalsh(plain) > FLOOR * noise).sum()) <= WORTH * len(group)
 
 
 def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Tensor, Tensor]:
@@ -153,10 +193,11 @@ def _factors(
 def solved(part: Compressed, power: Tensor) -> Solved:
     """With powers (P,), those of correlated noise ignored."""
     room = len(part.room)
-    noise = power[room + len(part.factors)]
-    covariance = torch.einsum("b,bij->ij", power[:room].to(torch.complex128), part.room)
-    for level, factor in zip(power[room:], part.factors, strict=False):
-        covariance = covariance.addmm(factor * level, factor.mH)
+    noise = power[room + len(part.terms)]
+    size = part.room.shape[1:]
+    covariance = (power[:room].to(torch.complex128) @ part.room.view(room, -1)).view(size)
+    for level, term in zip(power[room:], part.terms, strict=False):
+        covariance = term.added(covariance, level)
     covariance.diagonal().add_(noise)
     lower = cholesky(covariance)
     inverse = torch.cholesky_inverse(lower)
@@ -176,9 +217,9 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     room = len(part.room)
     found = torch.zeros_like(power)
     found[:room] = (part.room.reshape(room, -1) @ weight.T.reshape(-1)).real
-    for number, factor in enumerate(part.factors, room):
-        found[number] = (factor.conj() * (weight @ factor)).real.sum()
-    noise = room + len(part.factors)
+    for number, term in enumerate(part.terms, room):
+        found[number] = term.trace(weight)
+    noise = room + len(part.terms)
     found[noise] = weight.diagonal().real.sum() + outputs * (count - len(weight)) / power[noise]
     found[noise] -= part.rest / (at.scale * power[noise] ** 2)
     return found * power
@@ -220,7 +261,12 @@ def fit_powers(
 
     bounds = [(LOWEST, HIGHEST)] * len(begin)
     found = minimize(
-        objective, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": steps}
+        objective,
+        begin.numpy(),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": steps, "ftol": SETTLED},
     )
     power = torch.from_numpy(found.x).exp()
     return power, evidence(parts, power)
@@ -228,7 +274,7 @@ def fit_powers(
 
 def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
     """Errors (n, D) of rows predicted without any of their cell (n,) (Rasmussen and Williams 2006, 5.12)."""
-    at, noise = solved(part, power), power[len(part.room) + len(part.factors)]
+    at, noise = solved(part, power), power[len(part.room) + len(part.terms)]
     wide = part.basis.to(torch.complex128)
     alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise
     if len(np.unique(cell)) == len(cell):

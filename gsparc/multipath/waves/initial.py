@@ -26,6 +26,7 @@ from gsparc.multipath.waves.evidence import (
     Compressed,
     Kept,
     compressed,
+    compressible,
     evidence,
     fit_powers,
     left_out_cells,
@@ -39,7 +40,8 @@ from gsparc.multipath.waves.settings import ChannelSettings
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
-SHORT = 12  # steps of a fit that compares lengths
+SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
+DENSE_ROWS, DENSE_COLUMNS = 256, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
@@ -203,6 +205,8 @@ class _Search:
         every = gather(data, rows, True)
         every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
         groups = thinned(every, settings.columns, settings.rows)
+        if not compressible(groups[0], *plain):
+            groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
         wavelength = 2 * math.pi / every[0].slot.wavenumber
         return _Search(settings, groups, every, plain, sources, wavelength, Kept())
 
@@ -308,7 +312,7 @@ class _Search:
         power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
         values = replace(before.values, power=torch.cat([power, old[1:]]))
         parts = self._compressed(shape, values)
-        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage)
+        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage, 2 * SHORT)
         return self._fitted(*_strongest(shape, replace(values, power=power)))
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
