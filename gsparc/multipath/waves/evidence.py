@@ -24,7 +24,7 @@ from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import Shape, Values, apart, direct_wave, directions, source_waves
 from gsparc.multipath.waves.kernels import envelope, isotropic, smooth
 
-FLOOR = 0.01  # of the noise: powers of eigenvectors that are left out
+FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
 WORTH = 0.8  # of the rows, number of eigenvectors from which compression is not worth it
 LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left out
 LOWEST, HIGHEST = -14.0, 7.0  # logarithms of powers
@@ -188,6 +188,19 @@ def _factors(
     found += [wide @ (wave * fixed) for wave in waves]
     found += [wide @ (wave * varying) for wave in waves]
     return tuple(found)
+
+
+def without(part: Compressed, left: Tensor) -> Compressed:
+    """The rows but those of `left` (n,) bool, from the same matrices."""
+    rest = torch.nonzero(~left).flatten()
+    basis, mixed = torch.linalg.qr(part.basis[rest])
+    room = torch.complex(mixed @ part.room.real @ mixed.T, mixed @ part.room.imag @ mixed.T)
+    wide = mixed.to(torch.complex128)
+    group = part.group.take(rest)
+    target = basis.T.to(torch.complex128) @ group.target
+    outside = float(group.target.abs().square().sum() - target.abs().square().sum())
+    terms = tuple(Term.of(wide @ term.factor) for term in part.terms)
+    return Compressed(group, basis, room, terms, target, max(outside, 0.0))
 
 
 def solved(part: Compressed, power: Tensor) -> Solved:

@@ -1,8 +1,9 @@
 """Which terms a field of channels has, and their powers, from training rows.
 
 The isotropic process comes first, chosen as `model=complex_gp` chooses. Every further term is kept where the
-marginal likelihood gains and rows are predicted better without their neighbours: each alone, in 32 cells of
-nearby places and in 8.
+marginal likelihood gains more than its parameters are worth (G. Schwarz, "Estimating the dimension of a
+model", Ann. Statist. 6 (1978)) and rows are predicted better without their neighbours: each alone, in 32
+cells of nearby places and in 8. Powers of many directions fit any field: theirs are those of other cells.
 """
 
 from __future__ import annotations
@@ -31,17 +32,19 @@ from gsparc.multipath.waves.evidence import (
     fit_powers,
     left_out_cells,
     normalised,
+    without,
 )
 from gsparc.multipath.waves.field import ChannelField
 from gsparc.multipath.waves.kernels import cells, directions, envelope, isotropic
 from gsparc.multipath.waves.offset import best_offset
 from gsparc.multipath.waves.settings import ChannelSettings
 
+FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
-DENSE_ROWS, DENSE_COLUMNS = 256, 2  # learned on where places are so far apart that nothing can be compressed
+DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
@@ -52,7 +55,8 @@ class Candidate:
     """Terms with their powers, and how well they do.
 
     Attributes:
-        nll: negative log marginal likelihood [nats], the same rows for all candidates.
+        nll: negative log marginal likelihood [nats], the same rows for all candidates, plus what the
+            parameters must gain.
         errors: squared errors, left out one by one and in the cells of `DEPTHS`, relative to the power.
     """
 
@@ -181,6 +185,13 @@ def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
     return replace(shape, angles=shape.angles[strong]), replace(values, power=kept)
 
 
+def _left_out(part: Compressed, power: Tensor) -> np.ndarray:
+    """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
+    places = part.group.places.numpy()
+    grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
+    return np.stack([left_out_cells(part, power, cell).abs().square().mean(1).numpy() for cell in grouping])
+
+
 @dataclass(frozen=True)
 class _Search:
     """What every candidate of a fit has in common."""
@@ -245,20 +256,22 @@ class _Search:
 
     def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
         """With what left-out rows say."""
-        errors = np.zeros(1 + len(DEPTHS))
-        for part in parts:
-            places = part.group.places.numpy()
-            grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
-            for number, cell in enumerate(grouping):
-                error = left_out_cells(part, values.power, cell)
-                errors[number] += float(error.abs().square().mean()) / len(parts)
-        return Candidate(shape, values, evidence(parts, values.power), errors)
+        errors = np.mean([_left_out(part, values.power).mean(1) for part in parts], axis=0)
+        return Candidate(
+            shape, values, evidence(parts, values.power) + self._worth(shape, values.offset), errors
+        )
 
     def _fitted(self, shape: Shape, values: Values) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(shape, values)
         power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage)
         return self._measured(shape, replace(values, power=power), parts)
+
+    def _worth(self, shape: Shape, offset: Tensor) -> float:
+        """What the terms beside the isotropic field must gain [nats]."""
+        parameters = len(shape.names) - 2 + shape.direct + 3 * bool(offset.any())
+        numbers = sum(2 * group.target.numel() for group in self.groups)
+        return 0.5 * parameters * math.log(numbers)
 
     def _with_told(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; the best of a few lengths."""
@@ -288,8 +301,7 @@ class _Search:
         if offset is None:
             return found
         moved = self._fitted(shape, replace(values, offset=offset))
-        worth = 1.5 * math.log(sum(group.target.numel() for group in self.groups))
-        return moved if moved.nll + worth < found.nll else found
+        return moved if moved.nll < found.nll else found
 
     def _with_sources(self, before: Candidate) -> Candidate:
         shape = replace(before.shape, sources=len(self.sources))
@@ -312,8 +324,24 @@ class _Search:
         power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
         values = replace(before.values, power=torch.cat([power, old[1:]]))
         parts = self._compressed(shape, values)
+        errors = self._crossed(parts, shape, values)
         power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage, 2 * SHORT)
-        return self._fitted(*_strongest(shape, replace(values, power=power)))
+        found = self._fitted(*_strongest(shape, replace(values, power=power)))
+        return replace(found, errors=np.maximum(found.errors, errors))
+
+    def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
+        """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
+        number = [cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
+        errors = np.zeros(1 + len(DEPTHS))
+        for fold in range(FOLDS):
+            held = [fold == each for each in number]
+            rest = tuple(
+                without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
+            )
+            power, _ = fit_powers(rest, shape, values.power, self.settings.shrinkage, 2 * SHORT)
+            for part, left in zip(parts, held, strict=True):
+                errors += _left_out(part, power)[:, left].sum(1) / len(left) / len(parts)
+        return errors
 
     def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
         groups = drift.stretches(self.every)
@@ -327,7 +355,8 @@ class _Search:
                 other = disturbance(of, at, group)
                 left = drift.left_out_cells(group, signal, other, grouping)
                 found += [float(error.abs().square().mean()) / len(groups) for error in left]
+        worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         known = replace(before, nll=0.0, errors=errors[0])
-        after = Candidate(shape, values, -gain, errors[1])
+        after = Candidate(shape, values, worth - gain, errors[1])
         kept = self._step(known, after, self.settings.correlated, "noise correlated over rows", notes)
         return after if kept is after else before
