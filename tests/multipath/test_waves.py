@@ -196,7 +196,24 @@ def test_far_away_nothing_is_known():
     shape, values, known = field.shape, field.values, field.weights[0]
     place = torch.tensor([[3e4, 0.0, 0.0]], dtype=torch.float64)
     expected = prior(shape, values, known.group.slot, place) + shape.of("noise", values.power)
-    assert found.variance.item() == pytest.approx(float(known.scale * expected), rel=1e-3)
+    assert found.variance.item() == pytest.approx(known.scale * expected.item(), rel=1e-3)
+
+
+def test_slopes_over_places():
+    data = _sent(60)
+    field, place = _whole(data), torch.from_numpy(data.moving[45]).float()
+    tx = torch.from_numpy(data.tx[:1]).float()
+
+    def level(x):
+        found = field(tx, Pose(x, torch.eye(3)))
+        return found.mean.real.sum() + found.variance.sum()
+
+    known = place.clone().requires_grad_()
+    level(known).backward()
+    for axis in range(3):
+        step = 2e-3 * torch.eye(3)[axis]
+        expected = float(level(place + step) - level(place - step)) / 4e-3
+        assert float(known.grad[axis]) == pytest.approx(expected, rel=0.02, abs=0.02)
 
 
 def test_leakage_and_direct_wave_are_found():

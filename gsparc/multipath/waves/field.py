@@ -76,6 +76,11 @@ class ChannelField(ConditionalField):
         return Values(self.log_power.exp(), *lengths, self.offset, self.sources)
 
     @property
+    def _held(self) -> Values:
+        """The parameters as they are, as constants."""
+        return Values(**{name: value.detach() for name, value in vars(self.values).items()})
+
+    @property
     def apart(self) -> bool:
         """Whether antennas and tones have covariances of their own."""
         return self.shape.direct or self.count > 0
@@ -105,7 +110,8 @@ class ChannelField(ConditionalField):
         Raises:
             ValueError: not conditioned yet.
         """
-        moving, turned, station = asked(self.site, batch.tx, batch.rx)
+        moving, turned, nearest = asked(self.site, batch.tx, batch.rx)
+        station = nearest if batch.station is None else batch.station.cpu()
         target = batch.target.cpu().to(torch.complex128) / self.run_factor(batch.run)[:, None, None]
         shape, values = self.shape, self.values
         total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
@@ -172,9 +178,17 @@ class ChannelField(ConditionalField):
         )
         return field + told(shape, values, slot, places, places) + disturbance(shape, values, group)
 
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`; in the phase and level of the largest run, see `run_factor`."""
-        moving, turned, station = asked(self.site, tx, rx)
+    def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
+        """See `ConditionalField`; in the phase and level of the largest run, see `run_factor`.
+
+        Differentiable in the places, not in the parameters, which the weights depend on as well.
+
+        Args:
+            tx, rx: see `ConditionalField`.
+            station: (B,) int64 static ends; None takes the nearest, the first of those at one place.
+        """
+        moving, turned, nearest = asked(self.site, tx, rx)
+        station = nearest if station is None else station.cpu()
         count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
             self._answer(moving[part], turned[part], station[part])
@@ -193,7 +207,7 @@ class ChannelField(ConditionalField):
         self, moving: Tensor, turned: Tensor, station: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and sources' share of it (B, A, K), variance after and before learning (B,)."""
-        shape, values, size = self.shape, self.values, math.prod(self.channel)
+        shape, values, size = self.shape, self._held, math.prod(self.channel)
         mean = torch.zeros(len(moving), *self.channel, dtype=torch.complex64)
         share = torch.zeros_like(mean) if self.count else mean
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))

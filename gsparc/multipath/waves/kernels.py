@@ -36,14 +36,18 @@ def isotropic(distance: Tensor, wavenumber: float) -> Tensor:
 
 
 def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
-    """Correlation (...) complex128 of waves that come from about one direction; no gradients.
+    """Correlation (...) complex128 of waves that come from about one direction.
 
     Args:
         squared: (...) float64, (k d)^2 of displacements d.
         along: (...) k d's component towards the direction.
         concentration: about it.
     """
-    # In real numbers: complex sqrt and sinh take four times as long.
+    if squared.requires_grad or along.requires_grad:
+        root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
+        root = torch.where(root.abs() < 1e-9, root + 1e-9, root)
+        return root.sinh() / root * (concentration / math.sinh(concentration))
+    # In real numbers and in place: complex sqrt and sinh take four times as long.
     with torch.no_grad():
         real, imag = concentration**2 - squared, 2 * concentration * along
         size = (real.square() + imag.square()).sqrt_()
