@@ -118,7 +118,7 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
     for number in np.unique(station):
         mine = np.flatnonzero(station == number)
         for slot in _slots(data, int(number), rows[mine], apart):
-            entries = np.ix_(mine, slot.antennas, slot.tones)
+            entries = np.ix_(mine, np.array(slot.antennas), np.array(slot.tones))
             measured = mine if data.mask is None else mine[data.mask[rows][entries].all((1, 2))]
             if not len(measured):
                 continue

@@ -223,7 +223,8 @@ class _Search:
 
     def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
         """The terms that are kept, and notes."""
-        wanted, notes = self.settings, []
+        wanted = self.settings
+        notes: list[str] = []
         best = self._measured(*self.plain, self._compressed(*self.plain))
         best = self._step(best, self._fitted(*self.plain), "auto", "powers by likelihood", notes)
         known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
@@ -334,7 +335,7 @@ class _Search:
         number = [cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
         errors = np.zeros(1 + len(DEPTHS))
         for fold in range(FOLDS):
-            held = [fold == each for each in number]
+            held = [np.equal(each, fold) for each in number]
             rest = tuple(
                 without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
             )
