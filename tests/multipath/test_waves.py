@@ -247,8 +247,11 @@ def test_sources_at_their_places_explain_a_room():
     images = trace.images.of(trace.tx[0]) - data.site.origin
     rows, batch = np.concatenate([fold.train, fold.val]), data.batch(fold.test)
     settings = ChannelSettings(directions=False, correlated=False)
-    with_sources, _ = initialise(data, rows, settings, sources=images)
-    assert with_sources.count == len(images)
+    wrong = images[:2] + np.array([[3.1, 2.7, 4.0]])
+    with_sources, _ = initialise(data, rows, settings, sources=np.concatenate([images, wrong]))
+    assert with_sources.count >= len(images) - 1  # the direct wave's is one of them
+    kept = with_sources.sources.detach().numpy()
+    assert np.linalg.norm(kept[:, None] - wrong, axis=-1).min() > 0.1
     assert "sources" in with_sources.terms
     found = with_sources(batch.tx, batch.rx)
     assert nmse(found.mean.detach().numpy(), batch.target.numpy()) < 0.1

@@ -42,6 +42,7 @@ from gsparc.multipath.waves.settings import ChannelSettings
 FOLDS = 4  # of cells, whose directions' powers are found from the others
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
+LEAST = 1e-3  # of all powers: sources below are dropped
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
 DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
@@ -305,6 +306,19 @@ class _Search:
         return moved if moved.nll < found.nll else found
 
     def _with_sources(self, before: Candidate) -> Candidate:
+        """With those sources that have power."""
+        found = self._with_all_sources(before)
+        shape, power = found.shape, found.values.power
+        fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
+        heard = power[fixed] + power[varying] > LEAST * power.sum()
+        if bool(heard.all()) or not bool(heard.any()):
+            return found
+        silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
+        rest = power[[i for i in range(len(power)) if i not in silent]]
+        values = replace(found.values, power=rest, sources=found.values.sources[heard])
+        return self._fitted(replace(shape, sources=int(heard.sum())), values)
+
+    def _with_all_sources(self, before: Candidate) -> Candidate:
         shape = replace(before.shape, sources=len(self.sources))
         values = replace(before.values, sources=self.sources)
         if before.shape.direct:
