@@ -1,0 +1,1 @@
+"""Complex channels as a Gaussian field in closed form: leakage, direct wave, sources and a diffuse field."""

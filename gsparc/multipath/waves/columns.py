@@ -1,0 +1,219 @@
+"""Channels as groups of columns: those of one static place, one set of moving places and one wavelength.
+
+Columns of one group share a covariance. Groups share its parameters but not their scales, and are otherwise
+independent: an antenna half a metre on hears another field.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import LIGHT, Measurements, Site
+from gsparc.ops import Pose
+
+BAND_RAD = 1.0  # tones whose phases turn no more than this against each other over all places are one band
+
+
+@dataclass(frozen=True)
+class Slot:
+    """Which entries of a channel a group is, and where they are measured.
+
+    Attributes:
+        station: number of the static end, 0 where there is one.
+        antennas, tones: entries of the channel (A, K), which are all pairs of the two.
+        end: (3,) float64 static place [m], local; NaN where unknown.
+        element: (3,) float64 place of the moving antenna in the receiver's frame [m].
+        wavenumber: [rad/m].
+    """
+
+    station: int
+    antennas: tuple[int, ...]
+    tones: tuple[int, ...]
+    end: Tensor
+    element: Tensor
+    wavenumber: float
+
+    def put(self, whole: Tensor, rows: Tensor, values: Tensor) -> None:
+        """Write values (n, D) to `rows` of `whole` (S, A, K)."""
+        antennas, tones = torch.tensor(self.antennas), torch.tensor(self.tones)
+        whole[rows[:, None, None], antennas[None, :, None], tones[None, None]] = values.reshape(
+            len(rows), len(antennas), len(tones)
+        ).to(whole.dtype)
+
+    def places(self, moving: Tensor, rotation: Tensor) -> Tensor:
+        """Places (B, 3) float64 [m] of this antenna; of the moving end (B, 3) and its turns (B, 3, 3)."""
+        if not self.element.any():
+            return moving
+        return moving + rotation @ self.element
+
+
+@dataclass(frozen=True)
+class Group:
+    """Training rows of one slot.
+
+    Attributes:
+        slot: whose.
+        rows: (n,) int64 into the rows that were gathered.
+        places: (n, 3) float64 [m].
+        target: (n, D) complex128, stored units.
+        run: (n,) int64 numbers of runs.
+        order: (n,) float64 numbers among the static end's measurements, in the order they were taken.
+    """
+
+    slot: Slot
+    rows: Tensor
+    places: Tensor
+    target: Tensor
+    run: Tensor
+    order: Tensor
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def take(self, kept: Tensor) -> Group:
+        """The rows (m,) of these numbers."""
+        parts = (self.rows, self.places, self.target, self.run, self.order)
+        return Group(self.slot, *(part[kept] for part in parts))
+
+    @cached_property
+    def displacements(self) -> bytes:
+        """Equal for groups whose places differ by one displacement at most, to a micrometre."""
+        return (self.places - self.places[0]).mul(1e6).round().numpy().tobytes()
+
+
+def refuse(site: Site) -> None:
+    """`ValueError` for data that waves of a known length cannot explain."""
+    if site.kind != "csi" or site.wavelength is None:
+        raise ValueError(f"{site.name}: waves need complex channels (csi) of a known carrier")
+    if site.static_end is None:
+        raise ValueError(f"{site.name}: both ends move; waves need one that stands still")
+
+
+def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ...]:
+    """Groups of the given rows (n,).
+
+    Args:
+        data: kind csi; one end is static, or there are several static stations.
+        rows: measurements; those with a masked entry of a group are no rows of that group.
+        apart: whether antennas with places of their own and tones far apart are groups of their own; if not,
+            all columns of a station are one, measured at the moving end's place at the carrier.
+    """
+    refuse(data.site)
+    if data.run is None:
+        run = np.zeros(len(rows), np.int64)
+    else:
+        run = np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
+    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    taken = _taken(data)
+    moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
+    turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))
+    target = torch.from_numpy(np.asarray(data.target[rows])).to(torch.complex128)
+    found = []
+    for number in np.unique(station):
+        mine = np.flatnonzero(station == number)
+        for slot in _slots(data, int(number), rows[mine], apart):
+            entries = np.ix_(mine, np.array(slot.antennas), np.array(slot.tones))
+            measured = mine if data.mask is None else mine[data.mask[rows][entries].all((1, 2))]
+            if not len(measured):
+                continue
+            here = torch.from_numpy(measured)
+            chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
+            places = slot.places(moving[here], turned[here])
+            order = torch.from_numpy(taken[rows[measured]])
+            found.append(Group(slot, here, places, chosen, torch.from_numpy(run[measured]), order))
+    return tuple(found)
+
+
+def _taken(data: Measurements) -> np.ndarray:
+    """Each measurement's number (S,) float64 among those of its station."""
+    if data.station is None:
+        return np.arange(len(data), dtype=np.float64)
+    found = np.empty(len(data))
+    for number in np.unique(data.station):
+        mine = np.flatnonzero(data.station == number)
+        found[mine] = np.arange(len(mine))
+    return found
+
+
+def _slots(data: Measurements, station: int, rows: np.ndarray, apart: bool) -> list[Slot]:
+    site, (antennas, tones) = data.site, data.target.shape[1:]
+    centre, carrier = static_place(site, station), carrier_of(site, station)
+    zero, every = torch.zeros(3, dtype=torch.float64), tuple(range(antennas))
+    if not apart:
+        return [Slot(station, every, tuple(range(tones)), centre, zero, 2 * math.pi * carrier / LIGHT)]
+    reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
+    frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
+    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, zero)]
+    if site.array is not None and antennas == len(site.array) and antennas > 1:
+        offsets = torch.from_numpy(np.asarray(site.array, np.float64))
+        rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
+        elements = [
+            ((a,), centre, offsets[a])
+            if site.static_end == "tx"
+            else ((a,), centre + rotation @ offsets[a], zero)
+            for a in range(antennas)
+        ]
+    found = []
+    for band in bands(frequency, reach):
+        wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
+        found += [Slot(station, own, band, end, element, wavenumber) for own, end, element in elements]
+    return found
+
+
+def bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
+    """Tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
+    width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, 1e-3))
+    number = np.floor((frequency - frequency.min()) / width).astype(int)
+    return [tuple(np.flatnonzero(number == n).tolist()) for n in np.unique(number)]
+
+
+def static_place(site: Site, station: int) -> Tensor:
+    """(3,) float64 [m], local; NaN where unknown."""
+    if site.stations is not None:
+        return torch.from_numpy(np.asarray(site.stations.position[station], np.float64))
+    if site.static_position is None:
+        return torch.full((3,), math.nan, dtype=torch.float64)
+    return torch.from_numpy(np.asarray(site.static_position, np.float64))
+
+
+def carrier_of(site: Site, station: int) -> float:
+    """Carrier [Hz] of a station."""
+    if site.stations is not None and site.stations.carrier_hz is not None:
+        return float(site.stations.carrier_hz[station])
+    assert site.carrier_hz is not None
+    return float(site.carrier_hz)
+
+
+def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
+    """Moving end's places (B, 3) float64, the receiver's turns (B, 3, 3) and stations (B,) of queries."""
+    count = len(tx)
+    receiver = rx.position.reshape(-1, 3).expand(count, 3).cpu().double()
+    turned = rx.rotation.reshape(-1, 3, 3).expand(count, 3, 3).cpu().double()
+    sender = tx.cpu().double()
+    moving, static = (sender, receiver) if site.moving_end == "tx" else (receiver, sender)
+    if site.stations is None:
+        return moving, turned, torch.zeros(count, dtype=torch.long)
+    known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
+    return moving, turned, torch.cdist(static, known).argmin(1)
+
+
+def thinned(groups: tuple[Group, ...], columns: int, rows: int) -> tuple[Group, ...]:
+    """At most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
+
+    Groups of as many rows keep the same ones.
+    """
+    chosen = np.unique(np.linspace(0, len(groups) - 1, min(columns, len(groups))).round().astype(int))
+    found = []
+    for number in chosen:
+        group = groups[number]
+        if len(group) > rows:
+            kept = np.sort(np.random.default_rng(0).permutation(len(group))[:rows])
+            group = group.take(torch.from_numpy(kept))
+        found.append(group)
+    return tuple(found)

@@ -1,0 +1,190 @@
+"""Covariance of channels at two sets of places: leakage, direct wave, sources and the diffuse field.
+
+    C = p_0 E sinc(k d) + E sum_b p_b V_b(d) + R (p_c + p_d a a^H + sum_n s_n b_n b_n^H)
+        + S (p_g a a^H + sum_n t_n b_n b_n^H)
+
+with E the Matern-3/2 envelope, V_b the correlation of waves from one direction, a and b_n the spherical waves
+of the static end and of sources, S a squared exponential of gains that vary over places, and R one that is so
+long that it only ends far outside. Noise, and what is correlated over the order of rows, is training's alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsparc.multipath.waves.columns import Group, Slot
+from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth, steering
+
+FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
+DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike
+BEYOND = 10.0  # extents of the places after which nothing is known any more
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Which terms there are.
+
+    Attributes:
+        angles: (M, 3) float64, where waves of unequal power come from; none: from everywhere alike.
+        concentration: of each.
+        constant, direct, correlated: whether there is leakage, a direct wave, noise correlated over rows.
+        sources: how many.
+        middle: (3,) float64 [m] of the places learned from, where waves have their nominal power.
+        reach: length of what is fixed [m].
+    """
+
+    angles: Tensor
+    concentration: float
+    constant: bool
+    direct: bool
+    correlated: bool
+    sources: int
+    middle: Tensor
+    reach: float
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Of all powers, in their order."""
+        return (
+            "isotropic",
+            *["direction"] * len(self.angles),
+            *["constant"] * self.constant,
+            *["direct", "direct_smooth"] * self.direct,
+            *["source"] * self.sources,
+            *["source_smooth"] * self.sources,
+            "noise",
+            *["fast", "drift"] * self.correlated,
+        )
+
+    def where(self, name: str) -> list[int]:
+        """Numbers of the powers of this name."""
+        return [i for i, each in enumerate(self.names) if each == name]
+
+    def of(self, name: str, power: Tensor) -> Tensor:
+        """Powers (m,) of this name; of one that there is not, none."""
+        return power[self.where(name)]
+
+
+@dataclass(frozen=True)
+class Values:
+    """What is learned by gradient.
+
+    Attributes:
+        power: (P,) float64, see `Shape.names`; relative to each group's scale.
+        envelope, gain: () float64 lengths [m] of the diffuse field's envelope and of gains.
+        offset: (3,) float64 [m] of static ends from where they are said to be.
+        sources: (N, 3) float64 [m], local.
+    """
+
+    power: Tensor
+    envelope: Tensor
+    gain: Tensor
+    offset: Tensor
+    sources: Tensor
+
+
+def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+    """(n,) complex128, of size 1 in the middle."""
+    end = slot.end + values.offset
+    return steering(places, end, slot.wavenumber, torch.linalg.vector_norm(end - shape.middle))
+
+
+def source_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+    """(N, n) complex128 of all sources, each of size 1 in the middle."""
+    reference = torch.linalg.vector_norm(values.sources - shape.middle, dim=-1)
+    waves = [
+        steering(places, source, slot.wavenumber, away)
+        for source, away in zip(values.sources, reference, strict=True)
+    ]
+    return torch.stack(waves) if waves else places.new_zeros(0, len(places), dtype=torch.complex128)
+
+
+def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
+    """The diffuse field's covariance (n, m) complex128 of places a (n, 3) and b (m, 3) [m]."""
+    distance = apart(a, b)
+    found = shape.of("isotropic", values.power)[0] * isotropic(distance, wavenumber)
+    if len(shape.angles):
+        found = found.to(torch.complex128)
+        correlations = directions(shape, wavenumber, a, b, distance)
+        for power, correlation in zip(shape.of("direction", values.power), correlations, strict=True):
+            found = found + power * correlation
+    return (found * envelope(distance, values.envelope)).to(torch.complex128)
+
+
+def directions(shape: Shape, wavenumber: float, a: Tensor, b: Tensor, distance: Tensor) -> Iterator[Tensor]:
+    """Correlations (n, m) complex128 of waves from each direction, over distances (n, m) [m]."""
+    squared = (wavenumber * distance).square()
+    middle = b[:1]  # differences of small numbers, wherever the origin is
+    before, after = (wavenumber * (places - middle) @ shape.angles.T for places in (a, b))
+    for first, second in zip(before.T, after.T, strict=True):
+        yield directed(squared, first[:, None] - second[None], shape.concentration)
+
+
+def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
+    """The sources' share (n, m) of the covariance."""
+    distance = apart(a, b)
+    before, after = source_waves(shape, values, slot, a), source_waves(shape, values, slot, b)
+    fixed, varying = shape.of("source", values.power), shape.of("source_smooth", values.power)
+    return _mixed(before, after, fixed) * smooth(distance, shape.reach) + _mixed(
+        before, after, varying
+    ) * smooth(distance, values.gain)
+
+
+def told(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
+    """Covariance (n, m) of all but the diffuse field."""
+    distance = apart(a, b)
+    found = torch.zeros(len(a), len(b), dtype=torch.complex128)
+    if shape.constant:
+        found = found + shape.of("constant", values.power)[0] * smooth(distance, shape.reach)
+    if shape.direct:
+        before, after = (direct_wave(shape, values, slot, places) for places in (a, b))
+        gains = shape.of("direct", values.power)[0] * smooth(distance, shape.reach)
+        gains = gains + shape.of("direct_smooth", values.power)[0] * smooth(distance, values.gain)
+        found = found + before[:, None] * after.conj()[None] * gains
+    return found + explained(shape, values, slot, a, b) if shape.sources else found
+
+
+def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
+    """Variance (n,) of the signal."""
+    power = values.power
+    found = shape.of("isotropic", power)[0] + shape.of("direction", power).sum()
+    found = found + shape.of("constant", power).sum()
+    if shape.direct:
+        level = direct_wave(shape, values, slot, places).abs().square()
+        found = found + level * (shape.of("direct", power) + shape.of("direct_smooth", power))
+    if shape.sources:
+        level = source_waves(shape, values, slot, places).abs().square()
+        found = found + (shape.of("source", power) + shape.of("source_smooth", power)) @ level
+    return found.expand(len(places))
+
+
+def disturbance(shape: Shape, values: Values, group: Group) -> Tensor:
+    """Covariance (n, n) float64 of what is no signal of the place: noise and drift of training rows."""
+    found = torch.eye(len(group), dtype=torch.float64) * shape.of("noise", values.power)
+    if shape.correlated:
+        fast, drift = temporal(values.envelope, group)
+        found = found + shape.of("fast", values.power) * fast + shape.of("drift", values.power) * drift
+    return found
+
+
+def temporal(length: Tensor | float, group: Group) -> tuple[Tensor, Tensor]:
+    """Correlations (n, n) of errors over few rows and over many, between rows of the same run."""
+    between = (group.order[:, None] - group.order[None]).abs()
+    same = group.run[:, None] == group.run[None]
+    distance = apart(group.places, group.places)
+    field = isotropic(distance, group.slot.wavenumber) * envelope(distance, length)
+    fast, slow = (torch.exp(-between / rows) * same for rows in (FAST_ROWS, DRIFT_ROWS))
+    return fast, slow * (DRIFT_FIELD * field + 1 - DRIFT_FIELD)
+
+
+def apart(a: Tensor, b: Tensor) -> Tensor:
+    """Distances (n, m) [m]; exact at none, and differentiable there."""
+    return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
+
+
+def _mixed(before: Tensor, after: Tensor, power: Tensor) -> Tensor:
+    return (before.T * power) @ after.conj()

@@ -1,0 +1,130 @@
+"""Noise that is correlated over the order of rows: clocks, temperature and bodies drift while rows are taken.
+
+Its powers are found with those of all other terms held, on a stretch of rows, since correlation over the
+order needs neighbours in it. At queries nothing of it is known.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from gsparc.multipath.ridge import cholesky
+from gsparc.multipath.waves.columns import Group
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse, temporal, told
+from gsparc.multipath.waves.evidence import Kept
+
+STRETCH = 400  # rows looked at
+COLUMNS = 3  # groups looked at
+STEPS = 15
+SHARES = (0.3, 0.3, 1.0)  # of the white noise, where noise, fast and drift start
+LOWEST = 1e-5  # of the white noise
+
+
+def stretches(groups: tuple[Group, ...]) -> tuple[Group, ...]:
+    """At most `COLUMNS` groups, of `STRETCH` rows that follow each other."""
+    found = []
+    for number in np.unique(np.linspace(0, len(groups) - 1, min(COLUMNS, len(groups))).round().astype(int)):
+        group = groups[number]
+        order = torch.argsort(group.order, stable=True)
+        start = max(len(order) - STRETCH, 0) // 2
+        found.append(group.take(order[start : start + STRETCH]))
+    return tuple(found)
+
+
+def with_drift(
+    groups: tuple[Group, ...], signals: list[Tensor], shape: Shape, values: Values
+) -> tuple[Shape, Values, float]:
+    """The shape and values with correlated noise, and what evidence gains on `groups` [nats].
+
+    Args:
+        groups: see `stretches`.
+        signals: covariances (n, n) of theirs, see `signals_of`.
+        shape, values: without correlated noise.
+    """
+    noise = float(shape.of("noise", values.power)[0])
+    eye = [torch.eye(len(group), dtype=torch.float64) for group in groups]
+    terms = [[one, *temporal(values.envelope, group)] for one, group in zip(eye, groups, strict=True)]
+    before = sum(
+        _likelihood(signal, [one], np.array([noise]), group)[0]
+        for signal, one, group in zip(signals, eye, groups, strict=True)
+    )
+
+    def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        power = np.exp(logs)
+        both = [
+            _likelihood(signal, three, power, group)
+            for signal, three, group in zip(signals, terms, groups, strict=True)
+        ]
+        return sum(nll for nll, _ in both), np.sum([slope for _, slope in both], axis=0) * power
+
+    start = np.log(noise * np.array(SHARES))
+    bounds = [(math.log(noise * LOWEST), math.log(noise) + 5)] * 3
+    found = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": STEPS})
+    fresh = replace(shape, correlated=True)
+    power = torch.cat([values.power.clone(), torch.zeros(2, dtype=torch.float64)])
+    for name, level in zip(("noise", "fast", "drift"), np.exp(found.x), strict=True):
+        power[fresh.where(name)] = float(level)
+    return fresh, replace(values, power=power), before - float(found.fun)
+
+
+def left_out_cells(group: Group, signal: Tensor, other: Tensor, cells: list[np.ndarray]) -> list[Tensor]:
+    """Errors (n, D) of rows whose signal is predicted without any of their cell, for each of some cells (n,).
+
+    Args:
+        group: rows.
+        signal: (n, n) covariance of the signal.
+        other: (n, n) covariance of what disturbs it.
+        cells: numbers (n,) of cells.
+    """
+    other = other.to(torch.complex128)
+    inverse = torch.cholesky_inverse(cholesky(signal + other))
+    return [_left_out(group, other, inverse, cell) for cell in cells]
+
+
+def _left_out(group: Group, other: Tensor, inverse: Tensor, cell: np.ndarray) -> Tensor:
+    alpha = inverse @ group.target
+    known = group.target - other @ alpha
+    mixed = other @ inverse
+    if len(np.unique(cell)) == len(cell):
+        own = (1 - mixed.diagonal()) / inverse.diagonal()
+        return group.target - known + own[:, None] * alpha
+    error = torch.empty_like(alpha)
+    for number in np.unique(cell):
+        mine = torch.from_numpy(np.flatnonzero(cell == number))
+        share = torch.eye(len(mine), dtype=torch.complex128) - mixed[mine[:, None], mine]
+        own = torch.linalg.solve(inverse[mine[:, None], mine], alpha[mine])
+        error[mine] = group.target[mine] - (known[mine] - share @ own)
+    return error
+
+
+def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """Covariances (n, n) of the groups' signals."""
+    fields, found = Kept(), []
+    for group in groups:
+        places, slot = group.places, group.slot
+        make = partial(diffuse, shape, values, slot.wavenumber, places, places)
+        field = fields.of((group.displacements, slot.wavenumber), make)
+        found.append(field + told(shape, values, slot, places, places))
+    return found
+
+
+def _likelihood(
+    signal: Tensor, terms: list[Tensor], power: np.ndarray, group: Group
+) -> tuple[float, np.ndarray]:
+    """Negative log likelihood with the scale profiled, and its slope by the terms' powers."""
+    covariance = signal + sum(float(level) * term for level, term in zip(power, terms, strict=True))
+    lower = cholesky(covariance)
+    inverse = torch.cholesky_inverse(lower)
+    alpha = inverse @ group.target
+    count, outputs = group.target.shape
+    scale = float((group.target.conj() * alpha).real.mean())
+    nll = outputs * (count * math.log(scale) + 2 * float(lower.diagonal().real.log().sum()))
+    weight = outputs * inverse - alpha @ alpha.mH / scale
+    return nll, np.array([float((term * weight.mT).sum().real) for term in terms])

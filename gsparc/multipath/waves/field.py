@@ -1,0 +1,333 @@
+"""A channel's Gaussian field in closed form, conditioned on measured rows."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.multipath.ridge import cholesky
+from gsparc.multipath.run_factors import aligning, run_quadratic
+from gsparc.multipath.waves.columns import Group, Slot, asked, gather
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse, disturbance, explained, prior, told
+from gsparc.multipath.waves.evidence import Kept
+from gsparc.ops import Pose
+
+CHUNK = 2_000_000  # entries of a covariance that are held at a time
+
+
+@dataclass(frozen=True)
+class Weights:
+    """A group's rows, and what its predictions are made of.
+
+    Attributes:
+        group: with targets in the phase and level of the largest run.
+        lower: (n, n) complex128, Cholesky factor of the covariance.
+        alpha: (n, D) complex128, its inverse times the targets.
+        scale: power that the covariance is in units of.
+    """
+
+    group: Group
+    lower: Tensor
+    alpha: Tensor
+    scale: float
+
+
+class ChannelField(ConditionalField):
+    """Leakage, direct wave, sources and a diffuse field of a static end and one that moves.
+
+    Args:
+        site: kind csi, of a known carrier; one end static, or several stations.
+        shape: which terms there are.
+        values: where learning starts.
+        channel: (A, K) of the targets.
+
+    Attributes:
+        log_power: (P,) of `Shape.names`, relative to each group's scale.
+        log_envelope, log_gain: lengths [log m].
+        offset: (3,) of static ends [m].
+        sources: (N, 3) [m], local.
+    """
+
+    def __init__(self, site: Site, shape: Shape, values: Values, channel: tuple[int, int]) -> None:
+        super().__init__()
+        self.site, self.shape, self.channel = site, shape, channel
+        self.log_power = nn.Parameter(values.power.log())
+        self.log_envelope = nn.Parameter(values.envelope.log())
+        self.log_gain = nn.Parameter(values.gain.log())
+        self.offset = nn.Parameter(values.offset.clone())
+        self.sources = nn.Parameter(values.sources.clone())
+        self.weights: tuple[Weights, ...] = ()
+        self.rows = np.zeros(0, np.int64)
+        self.runs = np.zeros(1, np.int64)
+        self.run_factors = torch.ones(1, dtype=torch.complex128)
+
+    @property
+    def values(self) -> Values:
+        """The parameters as they are, differentiable."""
+        lengths = self.log_envelope.exp(), self.log_gain.exp()
+        return Values(self.log_power.exp(), *lengths, self.offset, self.sources)
+
+    @property
+    def _held(self) -> Values:
+        """The parameters as they are, as constants."""
+        return Values(**{name: value.detach() for name, value in vars(self.values).items()})
+
+    @property
+    def apart(self) -> bool:
+        """Whether antennas and tones have covariances of their own."""
+        return self.shape.direct or self.count > 0
+
+    @property
+    def count(self) -> int:
+        """Sources."""
+        return self.shape.sources
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """Of `residual` (the diffuse field), `directions`, `leakage`, `direct`, `sources` and `drift`."""
+        shape = self.shape
+        on = {
+            "residual": True,
+            "directions": len(shape.angles) > 0,
+            "leakage": shape.constant,
+            "direct": shape.direct,
+            "sources": shape.sources > 0,
+            "drift": shape.correlated,
+        }
+        return tuple(name for name, is_on in on.items() if is_on)
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `ConditionalField`; needs `condition` first, for the scales.
+
+        Raises:
+            ValueError: not conditioned yet.
+        """
+        moving, turned, nearest = asked(self.site, batch.tx, batch.rx)
+        station = nearest if batch.station is None else batch.station.cpu()
+        target = batch.target.cpu().to(torch.complex128) / self.run_factor(batch.run)[:, None, None]
+        shape, values = self.shape, self.values
+        total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
+        for known in self._conditioned():
+            slot = known.group.slot
+            here = torch.nonzero(station == slot.station).flatten()
+            if batch.mask is not None and len(here):
+                here = here[_entries(batch.mask.cpu(), here, slot).all(1)]
+            if not len(here):
+                continue
+            order = batch.index[here].double().cpu()
+            run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
+            places = slot.places(moving[here], turned[here])
+            group = Group(slot, here, places, _entries(target, here, slot), run, order)
+            inverse = torch.linalg.inv(self._covariance(group, shape, values, Kept()))
+            variance = known.scale / inverse.diagonal().real
+            error = (inverse @ group.target) / inverse.diagonal()[:, None]
+            density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
+            outputs = group.target.shape[1]
+            total = total.index_add(0, here, density * outputs / 2)
+            entries = entries.index_add(0, here, torch.full((len(here),), float(outputs)))
+        return total / entries.clamp_min(1)
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`; factors of runs are estimated by likelihood where there are several.
+
+        Raises:
+            ValueError: channels of another shape than the field's.
+        """
+        if tuple(data.target.shape[1:]) != self.channel:
+            raise ValueError(
+                f"channels of shape {tuple(data.target.shape[1:])}, the field has {self.channel}"
+            )
+        self.rows = np.asarray(rows)
+        self.runs = np.zeros(1, np.int64) if data.run is None else np.unique(data.run[self.rows])
+        groups = gather(data, self.rows, self.apart)
+        with torch.no_grad():
+            self._solve(groups, None)
+
+    def _solve(self, groups: tuple[Group, ...], factors: Tensor | None) -> None:
+        """Set the weights; factors of runs (runs,), as measured, are estimated unless given."""
+        shape, values = self.shape, self.values
+        fields = Kept()
+        lowers = [cholesky(self._covariance(group, shape, values, fields)) for group in groups]
+        if factors is None:
+            factors = torch.ones(len(self.runs), dtype=torch.complex128)
+            if len(self.runs) > 1:
+                factors = _factors(groups, lowers, len(self.runs))
+        self.run_factors, found = factors, []
+        for group, lower in zip(groups, lowers, strict=True):
+            aligned = replace(group, target=group.target / factors[group.run][:, None])
+            alpha = torch.cholesky_solve(aligned.target, lower)
+            scale = float((aligned.target.conj() * alpha).real.mean())
+            found.append(Weights(aligned, lower, alpha, max(scale, 1e-300)))
+        self.weights = tuple(found)
+
+    @staticmethod
+    def _covariance(group: Group, shape: Shape, values: Values, fields: Kept) -> Tensor:
+        """(n, n) complex128 of a group's rows with what disturbs them, relative to its scale."""
+        slot, places = group.slot, group.places
+        field = fields.of(
+            (group.displacements, slot.wavenumber),
+            partial(diffuse, shape, values, slot.wavenumber, places, places),
+        )
+        return field + told(shape, values, slot, places, places) + disturbance(shape, values, group)
+
+    def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
+        """See `ConditionalField`; in the phase and level of the largest run, see `run_factor`.
+
+        Differentiable in the places, not in the parameters, which the weights depend on as well.
+
+        Args:
+            tx, rx: see `ConditionalField`.
+            station: (B,) int64 static ends; None takes the nearest, the first of those at one place.
+        """
+        moving, turned, nearest = asked(self.site, tx, rx)
+        station = nearest if station is None else station.cpu()
+        count, longest = len(moving), max(len(each.group) for each in self._conditioned())
+        parts = [
+            self._answer(moving[part], turned[part], station[part])
+            for part in torch.arange(count).split(max(CHUNK // longest, 1))
+        ]
+        mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
+        device = tx.device
+        return Posterior(
+            mean.to(device),
+            after.float().to(device),
+            share.to(device) if self.count else None,
+            (after / before.clamp_min(1e-300)).clamp(0, 1).float().to(device),
+        )
+
+    def _answer(
+        self, moving: Tensor, turned: Tensor, station: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Mean and sources' share of it (B, A, K), variance after and before learning (B,)."""
+        shape, values, size = self.shape, self._held, math.prod(self.channel)
+        mean = torch.zeros(len(moving), *self.channel, dtype=torch.complex64)
+        share = torch.zeros_like(mean) if self.count else mean
+        after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
+        disturbed = sum(shape.of(name, values.power).sum() for name in ("noise", "fast", "drift"))
+        last: tuple[Any, ...] = ()
+        for known in self._conditioned():
+            group, slot = known.group, known.group.slot
+            here = torch.nonzero(station == slot.station).flatten()
+            if not len(here):
+                continue
+            places = slot.places(moving[here], turned[here])
+            key = (slot.wavenumber, group.places, places)
+            if not last or last[0] != slot.wavenumber or not all(map(torch.equal, last[1:3], key[1:])):
+                last = (*key, diffuse(shape, values, slot.wavenumber, places, group.places))
+            cross = last[3] + told(shape, values, slot, places, group.places)
+            slot.put(mean, here, cross @ known.alpha)
+            if self.count:
+                slot.put(share, here, explained(shape, values, slot, places, group.places) @ known.alpha)
+            learned = torch.linalg.solve_triangular(known.lower, cross.mH, upper=False).abs().square().sum(0)
+            weight = known.scale * known.alpha.shape[1] / size
+            whole = prior(shape, values, slot, places) + disturbed
+            after.index_add_(0, here, weight * (whole - learned).clamp_min(0))
+            before.index_add_(0, here, weight * whole)
+        return mean, share, after, before
+
+    def run_factor(self, run: Tensor | None) -> Tensor:
+        """What predictions of rows of runs (B,) must be multiplied by, (B,) complex128; 1 where unknown."""
+        if run is None:
+            return torch.ones(1, dtype=torch.complex128)
+        same = run.cpu()[:, None] == torch.from_numpy(self.runs)
+        return torch.where(same.any(1), (same * self.run_factors).sum(1), 1.0)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`; in the phase and level of each row's own run.
+
+        What rows have in common by their order alone is not predicted: no query has it.
+        """
+        shape, values = self.shape, self.values
+        mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
+        variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
+        with torch.no_grad():
+            for known in self._conditioned():
+                group, outputs = known.group, known.alpha.shape[1]
+                inverse = torch.cholesky_inverse(known.lower)
+                # With C = S + N: S_i,-i C_-i^-1 y_-i = y - (N + D) C^-1 y; D takes away its own weight.
+                other = disturbance(shape, values, group).to(torch.complex128)
+                own = (1 - (other * inverse.mT).sum(1)) / inverse.diagonal()
+                rest = other + torch.diag(own)
+                predicted = group.target - rest @ known.alpha
+                error = (rest * (rest @ inverse).conj()).sum(1).real
+                group.slot.put(mean, group.rows, predicted * self.run_factors[group.run][:, None])
+                level = known.scale * outputs * self.run_factors[group.run].abs().square()
+                variance.index_add_(0, group.rows, error * level)
+                entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
+        return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())
+
+    def _conditioned(self) -> tuple[Weights, ...]:
+        if not self.weights:
+            raise ValueError(
+                "the field of channels is not conditioned yet; call condition or initialise first"
+            )
+        return self.weights
+
+    def state(self) -> dict[str, Any]:
+        """See `ConditionalField`; factors are computed again by `restored`."""
+        groups = [each.group for each in self._conditioned()]
+        values = {name: value.detach() for name, value in self.named_parameters()}
+        return {
+            "shape": dict(vars(self.shape)),
+            "values": values,
+            "channel": list(self.channel),
+            "rows": torch.from_numpy(self.rows),
+            "runs": torch.from_numpy(self.runs),
+            "run_factors": self.run_factors,
+            "groups": [
+                {**vars(group), "slot": {**vars(group.slot)}, "target": group.target * self._turn(group)}
+                for group in groups
+            ],
+        }
+
+    def _turn(self, group: Group) -> Tensor:
+        return self.run_factors[group.run][:, None]
+
+
+def restored(site: Site, state: dict[str, Any]) -> ChannelField:
+    """The field whose `state()` this was."""
+    shape, kept = Shape(**state["shape"]), state["values"]
+    lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
+    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"])
+    antennas, tones = (int(n) for n in state["channel"])
+    field = ChannelField(site, shape, values, (antennas, tones))
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            parameter.copy_(kept[name])
+    field.rows, field.runs = state["rows"].numpy(), state["runs"].numpy()
+    groups = []
+    for each in state["groups"]:
+        slot = {**each["slot"]}
+        slot = {**slot, "antennas": tuple(slot["antennas"]), "tones": tuple(slot["tones"])}
+        groups.append(Group(**{**each, "slot": Slot(**slot)}))
+    with torch.no_grad():
+        field._solve(tuple(groups), state["run_factors"])
+    return field
+
+
+def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:
+    """Entries (n, D) of a slot, of `rows` of (B, A, K)."""
+    return whole[rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(rows), -1)
+
+
+def _factors(groups: tuple[Group, ...], lowers: list[Tensor], runs: int) -> Tensor:
+    """Factors of runs (runs,), as measured over the largest one's."""
+    quadratic, size = np.zeros((runs, runs), np.complex128), np.zeros(runs)
+    for group, lower in zip(groups, lowers, strict=True):
+        inverse, run = torch.cholesky_inverse(lower).numpy(), group.run.numpy()
+        level = float(group.target.abs().square().mean())
+        own = run_quadratic(inverse, group.target.numpy(), run) / max(level, 1e-300)
+        quadratic[: len(own), : len(own)] += own
+        size += np.bincount(run, minlength=runs) * group.target.shape[1]
+    heard = size > 0
+    factors = np.ones(runs, np.complex128)
+    factors[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
+    return torch.from_numpy(factors)

@@ -1,0 +1,377 @@
+"""Which terms a field of channels has, and their powers, from training rows.
+
+The isotropic process comes first, chosen as `model=complex_gp` chooses. Every further term is kept where the
+marginal likelihood gains more than its parameters are worth (G. Schwarz, "Estimating the dimension of a
+model", Ann. Statist. 6 (1978)) and rows are predicted better without their neighbours: each alone, in 32
+cells of nearby places and in 8. Powers of many directions fit any field: theirs are those of other cells.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.methods.time_budget import TimeBudget
+from gsparc.multipath.complex_gp import CHOSEN_ON, LENGTHS, NOISES
+from gsparc.multipath.ridge import cholesky
+from gsparc.multipath.run_factors import aligning, run_quadratic
+from gsparc.multipath.waves import drift
+from gsparc.multipath.waves.columns import Group, gather, thinned
+from gsparc.multipath.waves.covariance import BEYOND, Shape, Values, disturbance
+from gsparc.multipath.waves.evidence import (
+    Compressed,
+    Kept,
+    compressed,
+    compressible,
+    evidence,
+    fit_powers,
+    left_out_cells,
+    normalised,
+    without,
+)
+from gsparc.multipath.waves.field import ChannelField
+from gsparc.multipath.waves.kernels import cells, directions, envelope, isotropic
+from gsparc.multipath.waves.offset import best_offset
+from gsparc.multipath.waves.settings import ChannelSettings
+
+FOLDS = 4  # of cells, whose directions' powers are found from the others
+DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
+GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
+LEAST = 1e-3  # of all powers: sources below are dropped
+NEW = 0.2  # of the isotropic field's power, where that of a new term starts
+SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
+DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
+WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
+BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
+NO_WORSE = 1.1  # largest of any one of them
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """Terms with their powers, and how well they do.
+
+    Attributes:
+        nll: negative log marginal likelihood [nats], the same rows for all candidates, plus what the
+            parameters must gain.
+        errors: squared errors, left out one by one and in the cells of `DEPTHS`, relative to the power.
+    """
+
+    shape: Shape
+    values: Values
+    nll: float
+    errors: np.ndarray
+
+    def beats(self, other: Candidate) -> bool:
+        """Whether likelihood and left-out places prefer this one."""
+        ratio = self.errors / other.errors
+        return self.nll < other.nll and bool(np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE)
+
+
+def initialise(
+    data: Measurements,
+    rows: np.ndarray,
+    settings: ChannelSettings,
+    seed: int = 0,
+    budget: TimeBudget | None = None,
+    sources: np.ndarray | None = None,
+    target: np.ndarray | None = None,
+) -> tuple[ChannelField, tuple[str, ...]]:
+    """A field conditioned on the rows, and notes about it.
+
+    Args:
+        data: kind csi.
+        rows: (n,) measurements to learn from.
+        settings: terms.
+        seed: nothing is random.
+        budget: when it is over, no further term is tried.
+        sources: (N, 3) [m], local: Gaussians as virtual sources; None for none.
+        target: (n, A, K) in place of the rows' targets, such as another model's left-out residual.
+
+    Raises:
+        ValueError: the data are no channels of a known carrier with one static end.
+    """
+    del seed
+    rows, budget = np.asarray(rows), budget or TimeBudget()
+    if target is not None:
+        whole = np.zeros_like(data.target)
+        whole[rows] = target.reshape(len(rows), *data.target.shape[1:])
+        data = replace(data, target=whole)
+    places = np.zeros((0, 3)) if sources is None else np.asarray(sources, np.float64)
+    plain, factors, notes = _isotropic(data, rows)
+    search = _Search.of(data, rows, settings, torch.from_numpy(places), plain, factors)
+    best, more = search.run(budget)
+    channel = (int(data.target.shape[1]), int(data.target.shape[2]))
+    field = ChannelField(data.site, best.shape, best.values, channel)
+    field.condition(data, rows)
+    return field, (*notes, *more)
+
+
+def isotropic_shape(middle: Tensor, reach: float) -> Shape:
+    """The diffuse field from everywhere alike, and no other term."""
+    return Shape(torch.zeros(0, 3, dtype=torch.float64), 8.0, False, False, False, 0, middle, reach)
+
+
+def _isotropic(data: Measurements, rows: np.ndarray) -> tuple[tuple[Shape, Values], Tensor, list[str]]:
+    """Envelope and noise on the grid of `complex_gp`, and the factors of runs, as measured."""
+    groups = gather(data, rows, False)
+    looked = thinned(groups, 8, CHOSEN_ON)
+    runs = 1 if data.run is None else len(np.unique(data.run[rows]))
+    wavelength = 2 * math.pi / groups[0].slot.wavenumber
+    tried = []
+    for length in LENGTHS:
+        bounded = [_plain_kernel(group, length * wavelength) for group in looked]
+        for noise in NOISES:
+            tried.append((*_grid_point(looked, bounded, noise, runs), length * wavelength, noise))
+    _, factors, length, noise = min(tried, key=lambda t: t[0])
+    everywhere = torch.cat([group.places for group in groups])
+    extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
+    shape = isotropic_shape(everywhere.mean(0), BEYOND * max(extent, wavelength))
+    zero = torch.zeros(3, dtype=torch.float64)
+    one = torch.tensor([1.0, noise], dtype=torch.float64)
+    lengths = torch.tensor(length).double(), torch.tensor(GAINS[0] * wavelength).double()
+    values = Values(one, *lengths, zero, torch.zeros(0, 3, dtype=torch.float64))
+    note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.0e} of its power"
+    return (shape, values), factors, [note]
+
+
+def _plain_kernel(group: Group, length: float) -> Tensor:
+    distance = torch.cdist(group.places, group.places)
+    return isotropic(distance, group.slot.wavenumber) * envelope(distance, length)
+
+
+def _grid_point(
+    groups: tuple[Group, ...], kernels: list[Tensor], noise: float, runs: int
+) -> tuple[float, Tensor]:
+    """Negative log likelihood with profiled scales, and factors of runs as measured."""
+    solved, total, size = [], np.zeros((runs, runs), np.complex128), np.zeros(runs)
+    for group, kernel in zip(groups, kernels, strict=True):
+        covariance = kernel.clone()
+        covariance.diagonal().add_(noise)
+        solved.append(cholesky(covariance))
+        if runs > 1:
+            level = float(group.target.abs().square().mean())
+            run = group.run.numpy()
+            own = run_quadratic(torch.cholesky_inverse(solved[-1]).numpy(), group.target.numpy(), run)
+            total[: len(own), : len(own)] += own / max(level, 1e-300)
+            size += np.bincount(run, minlength=runs) * group.target.shape[1]
+    factors = np.ones(runs, np.complex128)
+    heard = size > 0
+    if runs > 1:
+        factors[heard] = aligning(total[np.ix_(heard, heard)], size[heard])
+    turn, nll = torch.from_numpy(factors), 0.0
+    for group, lower in zip(groups, solved, strict=True):
+        target = group.target * turn[group.run][:, None]
+        white = torch.cat([target.real, target.imag], 1)
+        count, outputs = target.shape
+        fit = float((white * torch.cholesky_solve(white, lower)).sum()) / (count * outputs)
+        nll += outputs * (count * math.log(max(fit, 1e-300)) + 2 * float(lower.diagonal().log().sum()))
+        nll -= 2 * outputs * float(turn.abs().log()[group.run].sum())
+    return nll, 1 / turn
+
+
+def _strongest(shape: Shape, values: Values) -> tuple[Shape, Values]:
+    """What all directions have in common, and weak ones, made part of the isotropic field."""
+    power, numbers = values.power, shape.where("direction")
+    beyond = power[numbers] - power[numbers].min()
+    everywhere = power[shape.where("isotropic") + numbers].sum()
+    strong = beyond > WEAKEST * everywhere
+    isotropic_power = everywhere - beyond[strong].sum()
+    rest = power[len(numbers) + 1 :]
+    kept = torch.cat([isotropic_power[None], beyond[strong], rest])
+    return replace(shape, angles=shape.angles[strong]), replace(values, power=kept)
+
+
+def _left_out(part: Compressed, power: Tensor) -> np.ndarray:
+    """Squared errors (1 + depths, n) of rows left out one by one and in cells."""
+    places = part.group.places.numpy()
+    grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
+    return np.stack([left_out_cells(part, power, cell).abs().square().mean(1).numpy() for cell in grouping])
+
+
+@dataclass(frozen=True)
+class _Search:
+    """What every candidate of a fit has in common."""
+
+    settings: ChannelSettings
+    groups: tuple[Group, ...]
+    every: tuple[Group, ...]
+    plain: tuple[Shape, Values]
+    sources: Tensor
+    wavelength: float
+    kept: Kept
+
+    @staticmethod
+    def of(
+        data: Measurements,
+        rows: np.ndarray,
+        settings: ChannelSettings,
+        sources: Tensor,
+        plain: tuple[Shape, Values],
+        factors: Tensor,
+    ) -> _Search:
+        every = gather(data, rows, True)
+        every = tuple(normalised(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
+        groups = thinned(every, settings.columns, settings.rows)
+        if not compressible(groups[0], *plain):
+            groups = thinned(every, DENSE_COLUMNS, min(settings.rows, DENSE_ROWS))
+        wavelength = 2 * math.pi / every[0].slot.wavenumber
+        return _Search(settings, groups, every, plain, sources, wavelength, Kept())
+
+    def run(self, budget: TimeBudget) -> tuple[Candidate, list[str]]:
+        """The terms that are kept, and notes."""
+        wanted = self.settings
+        notes: list[str] = []
+        best = self._measured(*self.plain, self._compressed(*self.plain))
+        best = self._step(best, self._fitted(*self.plain), "auto", "powers by likelihood", notes)
+        known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
+        direct = known and wanted.direct is not False
+        if (direct or wanted.constant is not False) and not budget.over():
+            forced = wanted.constant is True or wanted.direct is True or "auto"
+            best = self._step(best, self._with_told(best, direct), forced, "leakage and direct wave", notes)
+        if len(self.sources) and not budget.over():
+            best = self._step(best, self._with_sources(best), "auto", "sources", notes)
+        if wanted.directions is not False and not budget.over():
+            best = self._step(best, self._with_directions(best), wanted.directions, "directions", notes)
+        if wanted.correlated is not False and not budget.over():
+            best = self._with_drift(best, notes)
+        return best, notes
+
+    def _step(
+        self, before: Candidate, after: Candidate, wanted: bool | str, name: str, notes: list[str]
+    ) -> Candidate:
+        keep = wanted is True or after.beats(before)
+        ratio = after.errors / before.errors
+        gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
+        notes.append(
+            f"waves: {name} {'kept' if keep else 'dropped'}: {gain:+.3f} nats per channel, left-out error of "
+            f"rows, small and large cells times {ratio[0]:.3f}, {ratio[1]:.3f}, {ratio[2]:.3f}"
+        )
+        return after if keep else before
+
+    def _compressed(self, shape: Shape, values: Values) -> tuple[Compressed, ...]:
+        return compressed(self.groups, shape, values, self.kept)
+
+    def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
+        """With what left-out rows say."""
+        errors = np.mean([_left_out(part, values.power).mean(1) for part in parts], axis=0)
+        return Candidate(
+            shape, values, evidence(parts, values.power) + self._worth(shape, values.offset), errors
+        )
+
+    def _fitted(self, shape: Shape, values: Values) -> Candidate:
+        """With powers of largest evidence; measured."""
+        parts = self._compressed(shape, values)
+        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage)
+        return self._measured(shape, replace(values, power=power), parts)
+
+    def _worth(self, shape: Shape, offset: Tensor) -> float:
+        """What the terms beside the isotropic field must gain [nats]."""
+        parameters = len(shape.names) - 2 + shape.direct + 3 * bool(offset.any())
+        numbers = sum(2 * group.target.numel() for group in self.groups)
+        return 0.5 * parameters * math.log(numbers)
+
+    def _with_told(self, before: Candidate, direct: bool) -> Candidate:
+        """With leakage and the direct wave; the best of a few lengths."""
+        shape = replace(before.shape, constant=self.settings.constant is not False, direct=direct)
+        return self._moved(self._of_lengths(shape, before.values, before.shape, direct))
+
+    def _of_lengths(self, shape: Shape, values: Values, old: Shape, gains: bool) -> Candidate:
+        """Lengths of the envelope and of gains from a short fit each, then powers."""
+        powers = {name: float(old.of(name, values.power).sum()) for name in old.names}
+        start = [powers.get(name, NEW * powers["isotropic"]) for name in shape.names]
+        values = replace(values, power=torch.tensor(start, dtype=torch.float64))
+        tried = []
+        for bound in sorted({float(values.envelope), LENGTHS[-1] * self.wavelength}):
+            for gain in GAINS if gains else GAINS[:1]:
+                lengths = (torch.tensor(each).double() for each in (bound, gain * self.wavelength))
+                trial = replace(values, **dict(zip(("envelope", "gain"), lengths, strict=True)))
+                power, nll = fit_powers(self._compressed(shape, trial), shape, trial.power, 0.0, SHORT)
+                tried.append((nll, replace(trial, power=power)))
+        return self._fitted(shape, min(tried, key=lambda each: each[0])[1])
+
+    def _moved(self, found: Candidate) -> Candidate:
+        """With static ends where they really are."""
+        shape, values = found.shape, found.values
+        if not shape.direct or not self.settings.offset:
+            return found
+        offset = best_offset(self._compressed(shape, values), shape, values, self.wavelength)
+        if offset is None:
+            return found
+        moved = self._fitted(shape, replace(values, offset=offset))
+        return moved if moved.nll < found.nll else found
+
+    def _with_sources(self, before: Candidate) -> Candidate:
+        """With those sources that have power."""
+        found = self._with_all_sources(before)
+        shape, power = found.shape, found.values.power
+        fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
+        heard = power[fixed] + power[varying] > LEAST * power.sum()
+        if bool(heard.all()) or not bool(heard.any()):
+            return found
+        silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
+        rest = power[[i for i in range(len(power)) if i not in silent]]
+        values = replace(found.values, power=rest, sources=found.values.sources[heard])
+        return self._fitted(replace(shape, sources=int(heard.sum())), values)
+
+    def _with_all_sources(self, before: Candidate) -> Candidate:
+        shape = replace(before.shape, sources=len(self.sources))
+        values = replace(before.values, sources=self.sources)
+        if before.shape.direct:
+            power = before.values.power
+            level = NEW * float(before.shape.of("isotropic", power)[0])
+            fresh = torch.full((2 * len(self.sources),), level, dtype=torch.float64)
+            end = before.shape.where("noise")[0]
+            return self._fitted(shape, replace(values, power=torch.cat([power[:end], fresh, power[end:]])))
+        return self._of_lengths(shape, values, before.shape, True)
+
+    def _with_directions(self, before: Candidate) -> Candidate:
+        """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
+        group = max(self.groups, key=len)
+        angles = directions(group.places, group.slot.wavenumber, self.settings.angles)
+        shape = replace(before.shape, angles=angles, concentration=self.settings.concentration)
+        old = before.values.power
+        level = float(before.shape.of("isotropic", old)[0])
+        power = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
+        values = replace(before.values, power=torch.cat([power, old[1:]]))
+        parts = self._compressed(shape, values)
+        errors = self._crossed(parts, shape, values)
+        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage, 2 * SHORT)
+        found = self._fitted(*_strongest(shape, replace(values, power=power)))
+        return replace(found, errors=np.maximum(found.errors, errors))
+
+    def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
+        """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""
+        number = [cells(part.group.places.numpy(), DEPTHS[0]) % FOLDS for part in parts]
+        errors = np.zeros(1 + len(DEPTHS))
+        for fold in range(FOLDS):
+            held = [np.equal(each, fold) for each in number]
+            rest = tuple(
+                without(part, torch.from_numpy(left)) for part, left in zip(parts, held, strict=True)
+            )
+            power, _ = fit_powers(rest, shape, values.power, self.settings.shrinkage, 2 * SHORT)
+            for part, left in zip(parts, held, strict=True):
+                errors += _left_out(part, power)[:, left].sum(1) / len(left) / len(parts)
+        return errors
+
+    def _with_drift(self, before: Candidate, notes: list[str]) -> Candidate:
+        groups = drift.stretches(self.every)
+        signals = drift.signals_of(groups, before.shape, before.values)
+        shape, values, gain = drift.with_drift(groups, signals, before.shape, before.values)
+        errors = [np.zeros(1 + len(DEPTHS)), np.zeros(1 + len(DEPTHS))]
+        for group, signal in zip(groups, signals, strict=True):
+            places = group.places.numpy()
+            grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
+            for found, of, at in zip(errors, (before.shape, shape), (before.values, values), strict=True):
+                other = disturbance(of, at, group)
+                left = drift.left_out_cells(group, signal, other, grouping)
+                found += [float(error.abs().square().mean()) / len(groups) for error in left]
+        worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
+        known = replace(before, nll=0.0, errors=errors[0])
+        after = Candidate(shape, values, worth - gain, errors[1])
+        kept = self._step(known, after, self.settings.correlated, "noise correlated over rows", notes)
+        return after if kept is after else before

@@ -1,0 +1,104 @@
+"""Correlations of wave fields over displacements, with complex values where waves prefer directions.
+
+The diffuse field of a von Mises-Fisher density of directions with mean u and concentration c is
+`c / sinh(c) sinh(z) / z`, `z^2 = c^2 - (k d)^2 + 2 j c k u.d` (N. Ueno, S. Koyama and H. Saruwatari,
+"Directionally weighted wave field estimation exploiting prior information on source direction", IEEE Trans.
+Signal Process. 69 (2021)); without concentration it is sin(kd) / (kd).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.multipath.visibility_kernel import matern32
+from gsparc.physics.waves import NEAR_M
+
+FLAT_RAD = 0.5  # phase over the height of places, below which waves from above and below look alike
+
+
+def envelope(distance: Tensor, length: Tensor | float) -> Tensor:
+    """Matern-3/2 of distances [m]."""
+    return matern32((distance / length).square())
+
+
+def smooth(distance: Tensor, length: Tensor | float) -> Tensor:
+    """Squared exponential of distances [m]."""
+    return torch.exp(-0.5 * (distance / length).square())
+
+
+def isotropic(distance: Tensor, wavenumber: float) -> Tensor:
+    """sin(kd) / (kd), float64."""
+    return torch.sinc(distance * (wavenumber / math.pi))
+
+
+def directed(squared: Tensor, along: Tensor, concentration: float) -> Tensor:
+    """Correlation (...) complex128 of waves that come from about one direction.
+
+    Args:
+        squared: (...) float64, (k d)^2 of displacements d.
+        along: (...) k d's component towards the direction.
+        concentration: about it.
+    """
+    if squared.requires_grad or along.requires_grad:
+        root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
+        root = torch.where(root.abs() < 1e-9, root + 1e-9, root)
+        return root.sinh() / root * (concentration / math.sinh(concentration))
+    # In real numbers and in place: complex sqrt and sinh take four times as long.
+    with torch.no_grad():
+        real, imag = concentration**2 - squared, 2 * concentration * along
+        size = (real.square() + imag.square()).sqrt_()
+        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(1e-12)
+        smaller = imag.div_(2 * larger)
+        a, b = torch.where(real > 0, larger, smaller), torch.where(real > 0, smaller, larger)
+        rising, falling = a.exp(), (-a).exp()
+        x, y = (rising - falling).mul_(b.cos()), rising.add_(falling).mul_(b.sin())
+        share = size.clamp_min_(1e-24).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
+        return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
+
+
+def steering(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
+    """Spherical wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
+    away = ((places - source).square().sum(-1) + NEAR_M**2).sqrt()
+    # The amplitude stops growing a quarter of a wavelength away, where no antenna is a point.
+    level = reference / (away.square() + (math.pi / 2 / wavenumber) ** 2).sqrt()
+    return torch.polar(level, -wavenumber * away)
+
+
+def sphere(count: int) -> Tensor:
+    """Unit vectors (count, 3) float64, evenly spread (a Fibonacci lattice)."""
+    number = torch.arange(count, dtype=torch.float64) + 0.5
+    height, turn = 1 - 2 * number / count, math.pi * (1 + 5**0.5) * number
+    radius = (1 - height.square()).sqrt()
+    return torch.stack([radius * turn.cos(), radius * turn.sin(), height], 1)
+
+
+def directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
+    """`count` directions (count, 3): of the sphere, or of a half where places (n, 3) are in one plane."""
+    centred = places - places.mean(0)
+    axes = torch.linalg.svd(centred, full_matrices=False)[2] if len(places) > 2 else torch.eye(3).double()
+    height = (centred @ axes[-1]).abs().max()
+    if float(height) * wavenumber > FLAT_RAD:
+        return sphere(count)
+    half = sphere(2 * count)
+    half = half[half[:, 2] > 0]
+    # Columns of `basis` are two axes of the plane and its normal.
+    basis = torch.stack([axes[0], axes[1], torch.linalg.cross(axes[0], axes[1])], 1)
+    return half @ basis.T
+
+
+def cells(places: np.ndarray, depth: int) -> np.ndarray:
+    """Numbers (n,) of 2^depth cells of nearby places (n, 3): halved `depth` times across the widest axis."""
+    number = np.zeros(len(places), np.int64)
+    for _ in range(depth):
+        after = number * 2
+        for cell in np.unique(number):
+            mine = np.flatnonzero(number == cell)
+            axis = int(np.ptp(places[mine], axis=0).argmax())
+            upper = mine[np.argsort(places[mine, axis], kind="stable")[(len(mine) + 1) // 2 :]]
+            after[upper] += 1
+        number = after
+    return number
