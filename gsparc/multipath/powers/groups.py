@@ -1,0 +1,54 @@
+"""Groups of places apart, left out whole: whether a prior predicts where nobody measured nearby."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+SIDES = 10  # squares along the longer side of the places' box
+ERRORS = 1.0  # standard errors that a gain must exceed
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What one prior gains over another at rows left out.
+
+    Attributes:
+        squares: mean of the squared errors of the other less those of the one [dB^2].
+        error: standard error of that, groups taken as independent.
+        others: mean of the squared errors of the other [dB^2].
+    """
+
+    squares: float
+    error: float
+    others: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether it is more than chance."""
+        return self.squares > ERRORS * self.error
+
+
+def groups(places: np.ndarray) -> np.ndarray:
+    """Number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in."""
+    ends = places[:, :3] if places.shape[1] == 6 else places
+    low = ends[:, :2].min(0)
+    side = max(float(np.ptp(ends[:, :2], axis=0).max()), 1e-9) / SIDES * (1 + 1e-9)
+    cell = np.floor((ends[:, :2] - low) / side).astype(np.int64)
+    return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
+    """`count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
+    names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
+    parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
+    return [part for part in parts if len(part)]
+
+
+def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
+    """What `one` gains, by errors (n,) [dB] of both at the same rows left out, and their groups (n,)."""
+    gain = other**2 - one**2
+    total = np.bincount(group, gain - gain.mean())
+    return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float((other**2).mean()))
