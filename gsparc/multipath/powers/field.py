@@ -4,7 +4,7 @@ In decibels: a constant or a distance law, uncertain; Gaussians that the straigh
 power in, their strengths a Gaussian prior (the network shadowing of P. Agrawal and N. Patwari, "Correlated
 link shadow fading in multi-hop wireless networks", IEEE Trans. Wireless Commun. 8 (2009), whose pixels are
 here few, sought, and of any shape); one or two Matern-3/2 of place; noise. Without Gaussians it is
-`model=gp`.
+`model=gp`. Where a wavelength is sampled powers interfere: there coherent waves take the Gaussians' part.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, choice, setting, whole
+from gsparc.data.limits import Checked, choice, setting, switch, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
@@ -39,6 +40,7 @@ from gsparc.methods.power_process import restored as restored_process
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.powers.blockers import Blockers, Place, ShadowedTrend
+from gsparc.multipath.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
 from gsparc.multipath.powers.search import Seen, search
@@ -58,10 +60,12 @@ class PowerSettings(Checked):
     Attributes:
         most: Gaussians; 0 leaves the plain process.
         mean: of the plain process: `constant`, `distance`, or `auto`, the likelier.
+        fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
     """
 
     most: int = setting(12, whole(0))
     mean: MeanName = setting("auto", choice(*MEANS))
+    fringes: bool = setting(True, switch())
 
 
 class PowerField(ConditionalField):
@@ -74,6 +78,7 @@ class PowerField(ConditionalField):
         blockers: Gaussians, in units of the kernel's amplitude.
         still: of the end that stands [m]; None where both move or there are no Gaussians.
         seed: of rows drawn where there are too many.
+        fringes: of coherent waves, beside the process; they do not move with gradients.
 
     Attributes:
         means, log_scales, turns, log_strengths: of N Gaussians, see `Blockers`.
@@ -88,8 +93,10 @@ class PowerField(ConditionalField):
         blockers: Blockers,
         still: Place | None,
         seed: int = 0,
+        fringes: Fringes | None = None,
     ) -> None:
         super().__init__()
+        self.fringes = fringes
         self.site, self.trend, self.still, self.seed = site, trend, still, seed
         self.means, self.log_scales, self.turns, self.log_strengths = (
             nn.Parameter(part.clone()) for part in blockers.parts()
@@ -99,19 +106,21 @@ class PowerField(ConditionalField):
             nn.Parameter(part) for part in vars(covariance).values()
         )
         self.process: PowerProcess | None = None
+        self._tree: cKDTree | None = None  # of its places, made when it is asked
         self.known = np.zeros(0, np.int64)
         self.decibels = np.zeros(0)
         self.alone = np.zeros(0)  # weights of the terms where there is no process
 
     @property
     def count(self) -> int:
-        """See `ConditionalField`."""
-        return len(self.means)
+        """See `ConditionalField`; coherent waves count as Gaussians of no extent, far away."""
+        return len(self.means) + (0 if self.fringes is None else len(self.fringes.weights))
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """`power` where Gaussians are, `residual` always."""
-        return ("power", "residual") if self.count else ("residual",)
+        """`power` where Gaussians are, `phase` where coherent waves are, `residual` always."""
+        named = {"power": len(self.means) > 0, "phase": self.fringes is not None, "residual": True}
+        return tuple(name for name, there in named.items() if there)
 
     @property
     def blockers(self) -> Blockers:
@@ -123,13 +132,13 @@ class PowerField(ConditionalField):
         logit = [self.share_logit.item()] if len(self.log_lengths) == 2 else []
         settings = np.array([*self.log_lengths.tolist(), *logit, self.log_noise.item()])
         kernel = kernel_of(settings, math.exp(self.log_amplitude.item()))
-        if not self.count:
+        if not len(self.means):
             return self.trend, kernel
         still = Blockers(*(part.detach().clone() for part in self.blockers.parts()))
         return ShadowedTrend.over(self.trend, still, self.still), kernel
 
     def loss(self, batch: Batch) -> Tensor:
-        """See `ConditionalField`; 0 at rows that were not measured, which tell the others nothing."""
+        """See `ConditionalField`; of the process alone. Rows that were not measured cost 0."""
         losses = self.log_noise.new_zeros(len(batch))
         used = torch.ones(len(batch), dtype=torch.bool)
         if batch.mask is not None:
@@ -139,7 +148,7 @@ class PowerField(ConditionalField):
             return losses + 0 * self.log_noise
         decibels = 10 * batch.target.flatten(1)[used, 0].double().clamp_min(TINY_POWER).log10()
         columns = self.trend.terms(places)
-        if self.count:
+        if len(self.means):
             columns = torch.cat([columns, self.blockers.terms(places, self.still)], 1)
         distance = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
         covariance = Covariance(self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude)
@@ -157,9 +166,10 @@ class PowerField(ConditionalField):
         rows = rows[draw(silent(data, rows), MOST_ROWS, self.seed)]
         seen = rows_of(data, rows)
         self.process, _ = conditioned(seen, *self.prior(), self.seed)
+        self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
-        if self.count:
+        if len(self.means):
             trend, places = self.process.trend, torch.from_numpy(loud.places)
             values = loud.decibels - trend.mean(places).numpy()
             self.alone = ridge(trend.terms(places).numpy(), values, self.process.kernel.amplitude)
@@ -185,7 +195,11 @@ class PowerField(ConditionalField):
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean (B, 1) alone, with autograd for places."""
-        return self._power(self._conditioned().mean_at(self._places(tx, rx)))
+        process, places = self._conditioned(), self._places(tx, rx)
+        decibels = process.mean_at(places)
+        if self.fringes is not None:
+            decibels, _ = self.fringes.blended(decibels, places, self._distance(places.detach()))
+        return self._power(decibels)
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
@@ -198,8 +212,15 @@ class PowerField(ConditionalField):
         inverse, _ = inverse_of(np.tril(lower) @ np.tril(lower).T)
         loud = process.extra == 0
         share = inverse.diagonal()[loud]
-        mean = self._power(torch.from_numpy(self.decibels - process.weights[loud] / share))
+        decibels = torch.from_numpy(self.decibels - process.weights[loud] / share)
         spread = torch.from_numpy(process.kernel.amplitude / share)
+        if self.fringes is not None:
+            places = process.places[loud]
+            decibels, factor = self.fringes.blended_unseen(
+                decibels, torch.from_numpy(places), nearest(places), self.known
+            )
+            spread = spread * factor
+        mean = self._power(decibels)
         return LeftOutRows(self.known, mean, entry_variance(spread.float(), mean, "rssi"))
 
     def state(self) -> dict[str, Any]:
@@ -216,16 +237,27 @@ class PowerField(ConditionalField):
             "known": torch.from_numpy(self.known),
             "decibels": torch.from_numpy(self.decibels),
             "alone": torch.from_numpy(self.alone),
+            **({} if self.fringes is None else {"fringes": self.fringes.state()}),
             **({} if self.process is None else {"process": self.process.state()}),
         }
 
     def _answer(self, process: PowerProcess, places: Tensor) -> tuple[np.ndarray, ...]:
         """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
         mean, spread, share = process.mean_and_variance(places.numpy())
+        if self.fringes is not None:
+            both, factor = self.fringes.blended(torch.from_numpy(mean), places, self._distance(places))
+            explained = self.fringes.solutions(places).mean(1).numpy()
+            return both.numpy(), spread * factor.numpy(), share, explained
         if not self.count:
             return mean, spread, share, mean
         explained = process.trend.mean(places).numpy() + process.trend.terms(places).numpy() @ self.alone
         return mean, spread, share, explained
+
+    def _distance(self, places: Tensor) -> np.ndarray:
+        """From the nearest known row (B,) [m]."""
+        if self._tree is None:
+            self._tree = cKDTree(self._conditioned().places)
+        return self._tree.query(places.numpy())[0]
 
     def _conditioned(self) -> PowerProcess:
         if self.process is None:
@@ -287,6 +319,13 @@ def initialise(
     seen = rows_of(data, rows)
     plain, notes = fit_powers(seen, data.site, settings.mean, seed)
     bare = PowerField(data.site, plain.trend, plain.kernel, Blockers.none(), None, seed)
+    if settings.fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength):
+        order = np.argsort(rows)
+        assert data.site.wavelength is not None
+        bare.fringes, said = find_fringes(
+            seen.at(order), rows[order], plain, data.site.wavelength, seed, budget
+        )
+        return bare, (*notes, said)
     if not settings.most:
         return bare, notes
     if int((~seen.silent).sum()) < LEAST:
@@ -355,7 +394,8 @@ def gain_of_groups(
         with_them, plain, told = [*with_them, error], [*plain, without], [*told, group[asked]]
     if not told:
         return None
-    return compared(*(np.concatenate(part) for part in (with_them, plain, told)))
+    squares = (np.concatenate(part) ** 2 for part in (with_them, plain))
+    return compared(*squares, np.concatenate(told))
 
 
 def restored(site: Site, state: dict[str, Any]) -> PowerField:
@@ -368,7 +408,7 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     kernel = PowerKernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
     field = PowerField(
         site, Trend(level, law, middle, spread), kernel, Blockers(*(state[name] for name in names)),
-        _place(still), int(state["seed"]),
+        _place(still), int(state["seed"]), fringes_of(state["fringes"]) if "fringes" in state else None,
     )  # fmt: skip
     with torch.no_grad():
         for name, parameter in field.named_parameters():

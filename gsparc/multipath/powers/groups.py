@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 SIDES = 10  # squares along the longer side of the places' box
-ERRORS = 1.0  # standard errors that a gain must exceed
+ERRORS = 1.0  # standard errors that a sure gain exceeds
 
 
 @dataclass(frozen=True)
@@ -27,15 +27,23 @@ class Gain:
 
     @property
     def pays(self) -> bool:
+        """Whether there is one; what was found by evidence has ruled out chance before."""
+        return self.squares > 0
+
+    @property
+    def surely(self) -> bool:
         """Whether it is more than chance."""
         return self.squares > ERRORS * self.error
 
 
-def groups(places: np.ndarray) -> np.ndarray:
-    """Number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in."""
+def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
+    """Number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
+
+    Along the longer side of the places' box there are `sides` squares.
+    """
     ends = places[:, :3] if places.shape[1] == 6 else places
     low = ends[:, :2].min(0)
-    side = max(float(np.ptp(ends[:, :2], axis=0).max()), 1e-9) / SIDES * (1 + 1e-9)
+    side = max(float(np.ptp(ends[:, :2], axis=0).max()), 1e-9) / sides * (1 + 1e-9)
     cell = np.floor((ends[:, :2] - low) / side).astype(np.int64)
     return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
 
@@ -48,7 +56,7 @@ def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
 
 
 def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
-    """What `one` gains, by errors (n,) [dB] of both at the same rows left out, and their groups (n,)."""
-    gain = other**2 - one**2
+    """What `one` gains, by squared errors (n,) [dB^2] of both at rows left out, and the rows' groups (n,)."""
+    gain = other - one
     total = np.bincount(group, gain - gain.mean())
-    return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float((other**2).mean()))
+    return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))
