@@ -340,7 +340,7 @@ def initialise(
     said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
     said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
     if not gain.pays:
-        return bare, (*notes, f"no Gaussians; {said}, no more than chance")
+        return bare, (*notes, f"no Gaussians; {said}")
     trend, kernel, more = found
     assert trend.blockers is not None
     law = Trend(trend.level, trend.law, trend.middle, trend.spread)

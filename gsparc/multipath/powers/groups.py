@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 SIDES = 10  # squares along the longer side of the places' box
-ERRORS = 1.0  # standard errors that a sure gain exceeds
 
 
 @dataclass(frozen=True)
@@ -27,13 +26,8 @@ class Gain:
 
     @property
     def pays(self) -> bool:
-        """Whether there is one; what was found by evidence has ruled out chance before."""
+        """Whether there is one."""
         return self.squares > 0
-
-    @property
-    def surely(self) -> bool:
-        """Whether it is more than chance."""
-        return self.squares > ERRORS * self.error
 
 
 def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:

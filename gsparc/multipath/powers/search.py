@@ -26,7 +26,7 @@ from gsparc.multipath.powers.blockers import Blockers, Place
 
 CANDIDATES = 3_000  # drawn for each Gaussian
 ODDS = 20.0  # that the best of them must be worth against nothing
-POLISHED = 8  # of the best candidates
+POLISHED = 4  # of the best candidates
 LOOKS = 25  # at a candidate's slopes
 REACH = 1.5  # a search moves logarithms of scales by no more, and angles [rad]
 TINY = 1e-9

@@ -83,8 +83,8 @@ def test_without_gaussians_it_is_the_plain_process(share):
 
 @pytest.fixture(scope="module")
 def blocked():
-    """A town of 300 rows with walls, and the field of 200 of them."""
-    data, rows = town(300), np.arange(200)
+    """A town of 260 rows with walls, and the field of 160 of them."""
+    data, rows = town(260), np.arange(160)
     field, notes = initialise(data, rows, PowerSettings(), seed=0)
     field.condition(data, rows)
     return data, field, notes
@@ -92,9 +92,9 @@ def blocked():
 
 def test_walls_are_found_where_they_pay(blocked):
     data, field, notes = blocked
-    batch = data.batch(np.arange(200, 300))
-    plain, _ = initialise(data, np.arange(200), PLAIN)
-    plain.condition(data, np.arange(200))
+    batch = data.batch(np.arange(160, 260))
+    plain, _ = initialise(data, np.arange(160), PLAIN)
+    plain.condition(data, np.arange(160))
     truth = db(batch.target)
     errors = [np.mean((db(f(batch.tx, batch.rx).mean) - truth) ** 2) for f in (field, plain)]
     assert field.count and errors[0] < 0.8 * errors[1], (errors, notes)
