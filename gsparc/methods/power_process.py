@@ -163,9 +163,23 @@ def fit_powers(
     if len(rows.places) > MOST_ROWS:
         notes.append(f"learned from {MOST_ROWS} of {len(rows.places)} rows, drawn evenly")
         rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
-    trend, kernel, said = _settings(rows, site, mean, seed)
-    process, more = _conditioned(rows, trend, kernel, seed)
-    return process, (_description(trend, process.kernel), *notes, *said, *more)
+    process, more = _fitted(rows, _trends(rows, site, mean), seed)
+    return process, (_description(process.trend, process.kernel), *notes, *more)
+
+
+def fit_about(rows: Rows, trend: Trend, seed: int = 0) -> tuple[PowerProcess, tuple[str, ...]]:
+    """The same about a mean law that is given."""
+    rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
+    return _fitted(rows, [(trend, 0, ())], seed)
+
+
+def _fitted(
+    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int
+) -> tuple[PowerProcess, tuple[str, ...]]:
+    """The process about the best of `trends`, and what must be said of it."""
+    trend, kernel, said = _settings(rows, trends, seed)
+    process, more = conditioned(rows, trend, kernel, seed)
+    return process, (*said, *more)
 
 
 def draw(silent: np.ndarray, most: int, seed: int) -> np.ndarray:
@@ -191,7 +205,7 @@ class _Candidate:
 
 
 def _settings(
-    rows: Rows, site: Site, mean: MeanName, seed: int
+    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int
 ) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
     """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
     loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
@@ -199,7 +213,7 @@ def _settings(
     few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
     weighed = rows.at(draw(rows.silent, WEIGHED_ON, seed))
     both = weighed.silent.any() and not weighed.silent.all()
-    found = [_one_length(few, trend, cost, notes) for trend, cost, notes in _trends(rows, site, mean)]
+    found = [_one_length(few, trend, cost, notes) for trend, cost, notes in trends]
     if both:
         found = [_weighed(weighed, one) for one in found]
     best = max(found, key=lambda one: one.score)
@@ -281,10 +295,10 @@ def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
     return replace(one, score=-float(best.fun) * len(values) - one.cost, kernel=kernel)
 
 
-def _conditioned(
+def conditioned(
     rows: Rows, trend: Trend, kernel: PowerKernel, seed: int
 ) -> tuple[PowerProcess, tuple[str, ...]]:
-    """The process given all rows, and what must be said of the silent ones."""
+    """The process given all rows with settings as they are, and what must be said of the silent ones."""
     notes: list[str] = []
     extra = np.zeros(len(rows.places))
     places = torch.from_numpy(rows.places)

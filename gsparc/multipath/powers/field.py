@@ -1,0 +1,426 @@
+"""The Gaussian field of received powers: what the path loses in Gaussians, and a process of the rest.
+
+In decibels: a constant or a distance law, uncertain; Gaussians that the straight path between the ends loses
+power in, their strengths a Gaussian prior (the network shadowing of P. Agrawal and N. Patwari, "Correlated
+link shadow fading in multi-hop wireless networks", IEEE Trans. Wireless Commun. 8 (2009), whose pixels are
+here few, sought, and of any shape); one or two Matern-3/2 of place; noise. Without Gaussians it is
+`model=gp`. Where a wavelength is sampled powers interfere: there coherent waves take the Gaussians' part.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import astuple, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from gsparc.data.limits import Checked, choice, setting, switch, whole
+from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.methods.censored import silent
+from gsparc.methods.distance_law import Law, Rows
+from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
+from gsparc.methods.power_process import (
+    LAW_NEEDS,
+    MEANS,
+    MOST_ROWS,
+    MeanName,
+    PowerProcess,
+    Trend,
+    conditioned,
+    draw,
+    fit_about,
+    fit_powers,
+)
+from gsparc.methods.power_process import restored as restored_process
+from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
+from gsparc.methods.time_budget import TimeBudget
+from gsparc.multipath.powers.blockers import Blockers, Place, ShadowedTrend
+from gsparc.multipath.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
+from gsparc.multipath.powers.groups import Gain, compared, folds, groups
+from gsparc.multipath.powers.likelihood import Covariance, left_out_losses
+from gsparc.multipath.powers.search import Seen, search
+from gsparc.ops import Pose
+
+QUERIES = 512  # at a time: memory
+SOUGHT_ON = 600  # rows: each look factors a matrix
+FOLDS = 3
+RIDGE_STEPS = 5  # of the variance of what is left
+LEAST = 40  # rows that were heard, for seeking Gaussians
+
+
+@dataclass(frozen=True)
+class PowerSettings(Checked):
+    """How a field of powers is found.
+
+    Attributes:
+        most: Gaussians; 0 leaves the plain process.
+        mean: of the plain process: `constant`, `distance`, or `auto`, the likelier.
+        fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
+    """
+
+    most: int = setting(12, whole(0))
+    mean: MeanName = setting("auto", choice(*MEANS))
+    fringes: bool = setting(True, switch())
+
+
+class PowerField(ConditionalField):
+    """See `ConditionalField`; parameters are float64, targets linear powers (1,).
+
+    Args:
+        site: of powers, with at most one end that stands.
+        trend: the mean law.
+        kernel: of the process.
+        blockers: Gaussians, in units of the kernel's amplitude.
+        still: of the end that stands [m]; None where both move or there are no Gaussians.
+        seed: of rows drawn where there are too many.
+        fringes: of coherent waves, beside the process; they do not move with gradients.
+
+    Attributes:
+        means, log_scales, turns, log_strengths: of N Gaussians, see `Blockers`.
+        log_lengths, share_logit, log_noise, log_amplitude: of the process, see `Covariance`.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        trend: Trend,
+        kernel: PowerKernel,
+        blockers: Blockers,
+        still: Place | None,
+        seed: int = 0,
+        fringes: Fringes | None = None,
+    ) -> None:
+        super().__init__()
+        self.fringes = fringes
+        self.site, self.trend, self.still, self.seed = site, trend, still, seed
+        self.means, self.log_scales, self.turns, self.log_strengths = (
+            nn.Parameter(part.clone()) for part in blockers.parts()
+        )
+        covariance = Covariance.of(kernel)
+        self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude = (
+            nn.Parameter(part) for part in vars(covariance).values()
+        )
+        self.process: PowerProcess | None = None
+        self._tree: cKDTree | None = None  # of its places, made when it is asked
+        self.known = np.zeros(0, np.int64)
+        self.decibels = np.zeros(0)
+        self.alone = np.zeros(0)  # weights of the terms where there is no process
+
+    @property
+    def count(self) -> int:
+        """See `ConditionalField`; coherent waves count as Gaussians of no extent, far away."""
+        return len(self.means) + (0 if self.fringes is None else len(self.fringes.weights))
+
+    @property
+    def terms(self) -> tuple[str, ...]:
+        """`power` where Gaussians are, `phase` where coherent waves are, `residual` always."""
+        named = {"power": len(self.means) > 0, "phase": self.fringes is not None, "residual": True}
+        return tuple(name for name, there in named.items() if there)
+
+    @property
+    def blockers(self) -> Blockers:
+        """The Gaussians as they are, with their gradients."""
+        return Blockers(self.means, self.log_scales, self.turns, self.log_strengths)
+
+    def prior(self) -> tuple[Trend, PowerKernel]:
+        """What the parameters say, without gradients."""
+        logit = [self.share_logit.item()] if len(self.log_lengths) == 2 else []
+        settings = np.array([*self.log_lengths.tolist(), *logit, self.log_noise.item()])
+        kernel = kernel_of(settings, math.exp(self.log_amplitude.item()))
+        if not len(self.means):
+            return self.trend, kernel
+        still = Blockers(*(part.detach().clone() for part in self.blockers.parts()))
+        return ShadowedTrend.over(self.trend, still, self.still), kernel
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `ConditionalField`; of the process alone. Rows that were not measured cost 0."""
+        losses = self.log_noise.new_zeros(len(batch))
+        used = torch.ones(len(batch), dtype=torch.bool)
+        if batch.mask is not None:
+            used = batch.mask.flatten(1).all(1)
+        places = self._places(batch.tx, batch.rx)[used]
+        if not len(places):
+            return losses + 0 * self.log_noise
+        decibels = 10 * batch.target.flatten(1)[used, 0].double().clamp_min(TINY_POWER).log10()
+        columns = self.trend.terms(places)
+        if len(self.means):
+            columns = torch.cat([columns, self.blockers.terms(places, self.still)], 1)
+        distance = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+        covariance = Covariance(self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude)
+        gram, values = covariance.gram(distance, columns), decibels - self.trend.mean(places)
+        return losses.index_put((used.nonzero()[:, 0],), left_out_losses(gram, values, self.log_amplitude))
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """See `ConditionalField`; what rows say where nothing was heard is that powers are below a level.
+
+        Raises:
+            ValueError: no rows.
+        """
+        if not len(rows):
+            raise ValueError("a field of powers needs at least one row")
+        rows = rows[draw(silent(data, rows), MOST_ROWS, self.seed)]
+        seen = rows_of(data, rows)
+        self.process, _ = conditioned(seen, *self.prior(), self.seed)
+        self._tree = None
+        loud = seen.at(np.flatnonzero(~seen.silent))
+        self.known, self.decibels = rows[~seen.silent], loud.decibels
+        if len(self.means):
+            trend, places = self.process.trend, torch.from_numpy(loud.places)
+            values = loud.decibels - trend.mean(places).numpy()
+            self.alone = ridge(trend.terms(places).numpy(), values, self.process.kernel.amplitude)
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`; (B, 1) linear powers.
+
+        What is explained is the mean law and the Gaussians fitted without the process: with it, a process of
+        a long length may hold what they could say as well.
+
+        Raises:
+            ValueError: before `condition`.
+        """
+        process, places = self._conditioned(), self._places(tx, rx)
+        parts = [self._answer(process, part) for part in places.split(QUERIES)]
+        mean, spread, share, explained = (
+            torch.from_numpy(np.concatenate(v)) for v in zip(*parts, strict=True)
+        )
+        power = self._power(mean)
+        said = self._power(explained) if self.count else None
+        return Posterior(power, entry_variance(spread.float(), power, "rssi"), said, share.float())
+
+    def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
+        """The mean (B, 1) alone, with autograd for places."""
+        process, places = self._conditioned(), self._places(tx, rx)
+        decibels = process.mean_at(places)
+        if self.fringes is not None:
+            decibels, _ = self.fringes.blended(decibels, places, self._distance(places.detach()))
+        return self._power(decibels)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`; of rows where something was heard.
+
+        Raises:
+            ValueError: before `condition`.
+        """
+        process = self._conditioned()
+        lower = process.factor
+        inverse, _ = inverse_of(np.tril(lower) @ np.tril(lower).T)
+        loud = process.extra == 0
+        share = inverse.diagonal()[loud]
+        decibels = torch.from_numpy(self.decibels - process.weights[loud] / share)
+        spread = torch.from_numpy(process.kernel.amplitude / share)
+        if self.fringes is not None:
+            places = process.places[loud]
+            decibels, factor = self.fringes.blended_unseen(
+                decibels, torch.from_numpy(places), nearest(places), self.known
+            )
+            spread = spread * factor
+        mean = self._power(decibels)
+        return LeftOutRows(self.known, mean, entry_variance(spread.float(), mean, "rssi"))
+
+    def state(self) -> dict[str, Any]:
+        """See `ConditionalField`."""
+        law = self.trend.law
+        values = {name: value.detach().clone() for name, value in self.named_parameters()}
+        return {
+            **values,
+            "trend": [self.trend.level, self.trend.middle, self.trend.spread],
+            "law": [] if law is None else [*astuple(law)[:4]],
+            "law_place": [] if law is None or law.place is None else [*law.place],
+            "still": [] if self.still is None else [*self.still],
+            "seed": self.seed,
+            "known": torch.from_numpy(self.known),
+            "decibels": torch.from_numpy(self.decibels),
+            "alone": torch.from_numpy(self.alone),
+            **({} if self.fringes is None else {"fringes": self.fringes.state()}),
+            **({} if self.process is None else {"process": self.process.state()}),
+        }
+
+    def _answer(self, process: PowerProcess, places: Tensor) -> tuple[np.ndarray, ...]:
+        """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
+        mean, spread, share = process.mean_and_variance(places.numpy())
+        if self.fringes is not None:
+            both, factor = self.fringes.blended(torch.from_numpy(mean), places, self._distance(places))
+            explained = self.fringes.solutions(places).mean(1).numpy()
+            return both.numpy(), spread * factor.numpy(), share, explained
+        if not self.count:
+            return mean, spread, share, mean
+        explained = process.trend.mean(places).numpy() + process.trend.terms(places).numpy() @ self.alone
+        return mean, spread, share, explained
+
+    def _distance(self, places: Tensor) -> np.ndarray:
+        """From the nearest known row (B,) [m]."""
+        if self._tree is None:
+            self._tree = cKDTree(self._conditioned().places)
+        return self._tree.query(places.numpy())[0]
+
+    def _conditioned(self) -> PowerProcess:
+        if self.process is None:
+            raise ValueError("a field of powers: condition it first")
+        return self.process
+
+    def _places(self, tx: Tensor, rx: Pose) -> Tensor:
+        """(B, 3) of the moving end, or (B, 6) of both, float64 [m]."""
+        return self.site.moving(tx, rx).expand(len(tx), -1).cpu().double()
+
+    def _power(self, decibels: Tensor) -> Tensor:
+        return from_real(decibels[:, None].float(), "rssi", (1,))
+
+
+def ridge(columns: np.ndarray, values: np.ndarray, prior: float) -> np.ndarray:
+    """Weights (P,) of columns (n, P) with a prior variance, when what is left of values (n,) is white."""
+    weights, left = np.zeros(columns.shape[1]), float((values**2).mean())
+    for _ in range(RIDGE_STEPS):
+        gram = columns.T @ columns + left / prior * np.eye(columns.shape[1])
+        weights = np.linalg.solve(gram, columns.T @ values)
+        left = max(float(((values - columns @ weights) ** 2).mean()), 1e-12)
+    return weights
+
+
+def rows_of(data: Measurements, rows: np.ndarray) -> Rows:
+    """Powers of rows (n,) in decibels, levels where nothing was heard."""
+    decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+    return Rows(data.moving[rows], decibels, silent(data, rows))
+
+
+def initialise(
+    data: Measurements,
+    rows: np.ndarray,
+    settings: PowerSettings,
+    seed: int = 0,
+    budget: TimeBudget | None = None,
+) -> tuple[PowerField, tuple[str, ...]]:
+    """A field of powers and what must be said of it; `condition` is to follow.
+
+    Gaussians are sought by evidence, and kept where they predict groups of places that were left out better
+    than the plain process does, by more than one standard error.
+
+    Args:
+        data: powers, of one station where there are several.
+        rows: (n,) to learn from, at least one.
+        settings: see there.
+        seed: of rows, candidates and groups that are drawn.
+        budget: no Gaussians are sought beyond it.
+
+    Raises:
+        ValueError: not powers, several stations, or no rows.
+    """
+    if data.site.kind != "rssi":
+        raise ValueError(f"a field of powers needs received powers (rssi), not {data.site.kind}")
+    if data.site.stations is not None and len(data.site.stations) > 1:
+        raise ValueError(f"a field of powers is of one station, not of {len(data.site.stations)}")
+    if not len(rows):
+        raise ValueError("a field of powers needs at least one row")
+    seen = rows_of(data, rows)
+    plain, notes = fit_powers(seen, data.site, settings.mean, seed)
+    bare = PowerField(data.site, plain.trend, plain.kernel, Blockers.none(), None, seed)
+    if settings.fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength):
+        order = np.argsort(rows)
+        assert data.site.wavelength is not None
+        bare.fringes, said = find_fringes(
+            seen.at(order), rows[order], plain, data.site.wavelength, seed, budget
+        )
+        return bare, (*notes, said)
+    if not settings.most:
+        return bare, notes
+    if int((~seen.silent).sum()) < LEAST:
+        return bare, (*notes, f"no Gaussians: fewer than {LEAST} rows were heard")
+    found = shadowed(seen, data.site, settings, seed, budget)
+    if found is None:
+        return bare, (*notes, "no Gaussians: no candidate in the paths' way explains enough of the powers")
+    gain = gain_of_groups(seen, data.site, settings, seed, budget)
+    if gain is None:
+        return bare, (*notes, "no Gaussians: no time to try them on groups of places that are left out")
+    before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
+    said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
+    said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
+    if not gain.pays:
+        return bare, (*notes, f"no Gaussians; {said}")
+    trend, kernel, more = found
+    assert trend.blockers is not None
+    law = Trend(trend.level, trend.law, trend.middle, trend.spread)
+    field = PowerField(data.site, law, kernel, trend.blockers, trend.still, seed)
+    return field, (f"{field.count} Gaussians in the way of paths; {said}", *more)
+
+
+def shadowed(
+    rows: Rows, site: Site, settings: PowerSettings, seed: int, budget: TimeBudget | None
+) -> tuple[ShadowedTrend, PowerKernel, tuple[str, ...]] | None:
+    """A prior with Gaussians beside a distance law, and notes; None where no candidate is worth its place."""
+    loud = rows.at(np.flatnonzero(~rows.silent))
+    few = loud.at(draw(loud.silent, SOUGHT_ON, seed))
+    if len(few.places) < max(LAW_NEEDS, 2) or len(np.unique(few.places[:, :3], axis=0)) < 2:
+        return None
+    plain, _ = fit_powers(few, site, "distance", seed)
+    assert plain.trend.law is not None
+    still = plain.trend.law.place
+    blockers, _, _ = search(Seen.of(few, plain.trend, still), plain.kernel, settings.most, seed, budget)
+    if not len(blockers):
+        return None
+    trend = ShadowedTrend.over(plain.trend, blockers, still)
+    process, notes = fit_about(rows, trend, seed)
+    return trend, process.kernel, notes
+
+
+def gain_of_groups(
+    rows: Rows, site: Site, settings: PowerSettings, seed: int, budget: TimeBudget | None
+) -> Gain | None:
+    """What Gaussians gain over the plain process at groups of places left out; None where time is over.
+
+    Both are found without the groups, on a part of many rows.
+    """
+    group = groups(rows.places)
+    with_them, plain, told = [], [], []
+    for part in folds(group, FOLDS, seed):
+        if budget and budget.over():
+            return None
+        rest = np.setdiff1d(np.arange(len(group)), part)
+        asked = part[~rows.silent[part]]
+        known = rows.at(rest).at(draw(rows.silent[rest], SOUGHT_ON, seed))
+        if len(asked) == 0 or int((~known.silent).sum()) < LEAST:
+            continue
+        queries, measured = rows.places[asked], rows.decibels[asked]
+        process, _ = fit_powers(known, site, settings.mean, seed)
+        without = process.mean_and_variance(queries)[0] - measured
+        found = shadowed(known, site, settings, seed, budget)
+        if found is not None:
+            process, _ = conditioned(known, found[0], found[1], seed)
+        error = process.mean_and_variance(queries)[0] - measured
+        with_them, plain, told = [*with_them, error], [*plain, without], [*told, group[asked]]
+    if not told:
+        return None
+    squares = (np.concatenate(part) ** 2 for part in (with_them, plain))
+    return compared(*squares, np.concatenate(told))
+
+
+def restored(site: Site, state: dict[str, Any]) -> PowerField:
+    """The field whose `state()` this was."""
+    values, place, still = ([float(v) for v in state[name]] for name in ("law", "law_place", "still"))
+    law = Law(values[0], values[1], values[2], values[3], _place(place)) if values else None
+    level, middle, spread = (float(v) for v in state["trend"])
+    names = ("means", "log_scales", "turns", "log_strengths")
+    two = len(state["log_lengths"]) == 2
+    kernel = PowerKernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
+    field = PowerField(
+        site, Trend(level, law, middle, spread), kernel, Blockers(*(state[name] for name in names)),
+        _place(still), int(state["seed"]), fringes_of(state["fringes"]) if "fringes" in state else None,
+    )  # fmt: skip
+    with torch.no_grad():
+        for name, parameter in field.named_parameters():
+            parameter.copy_(state[name])
+    field.known, field.decibels = state["known"].numpy(), state["decibels"].numpy()
+    field.alone = state["alone"].numpy()
+    if "process" in state:
+        process = restored_process(state["process"])
+        trend, _ = field.prior()
+        field.process = PowerProcess(trend, process.kernel, process.places, process.weights, process.extra)
+    return field
+
+
+def _place(values: list[float]) -> Place | None:
+    return (values[0], values[1], values[2]) if values else None

@@ -1,0 +1,56 @@
+"""Groups of places apart, left out whole: whether a prior predicts where nobody measured nearby."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+SIDES = 10  # squares along the longer side of the places' box
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What one prior gains over another at rows left out.
+
+    Attributes:
+        squares: mean of the squared errors of the other less those of the one [dB^2].
+        error: standard error of that, groups taken as independent.
+        others: mean of the squared errors of the other [dB^2].
+    """
+
+    squares: float
+    error: float
+    others: float
+
+    @property
+    def pays(self) -> bool:
+        """Whether there is one."""
+        return self.squares > 0
+
+
+def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
+    """Number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
+
+    Along the longer side of the places' box there are `sides` squares.
+    """
+    ends = places[:, :3] if places.shape[1] == 6 else places
+    low = ends[:, :2].min(0)
+    side = max(float(np.ptp(ends[:, :2], axis=0).max()), 1e-9) / sides * (1 + 1e-9)
+    cell = np.floor((ends[:, :2] - low) / side).astype(np.int64)
+    return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def folds(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
+    """`count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
+    names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
+    parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
+    return [part for part in parts if len(part)]
+
+
+def compared(one: np.ndarray, other: np.ndarray, group: np.ndarray) -> Gain:
+    """What `one` gains, by squared errors (n,) [dB^2] of both at rows left out, and the rows' groups (n,)."""
+    gain = other - one
+    total = np.bincount(group, gain - gain.mean())
+    return Gain(float(gain.mean()), math.sqrt(float((total**2).sum())) / len(gain), float(other.mean()))

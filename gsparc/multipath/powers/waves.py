@@ -1,0 +1,149 @@
+"""Plane waves from everywhere as a basis of coherent fields at measured places, and powers fitted by them.
+
+Powers alone leave phases unknown: a fit is one of many, found by damped least squares from a random start
+(Levenberg 1944, Marquardt 1963) on decibels, whose errors are Student's t (K. L. Lange et al., "Robust
+statistical modeling using the t distribution", JASA 84 (1989)).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, eigh
+
+WAVES = 800  # on the sphere: twelve wavelengths of places are resolved
+KEPT = 1e-3  # eigenvalues kept, of the largest
+DEGREES = 4.0  # of freedom of the errors
+SCALE_DB = 2.0  # of the errors at first
+LEAST_DB = 0.5
+ALIKE = 3.0  # rows that err together, as neighbours do: each counts a third
+FLOOR = 3e-4  # power that no interference takes away, of the mean power
+STAGES = ((0.1, 8), (0.03, 8), (0.01, 8), (0.003, 8), (0.0, 16))  # power added to hide nulls at first, steps
+TRIES, SETTLED = 4, 1e-4
+DECIBEL = 20 / math.log(10)
+
+
+@dataclass(frozen=True)
+class Basis:
+    """Coherent fields of unit mean power at the places that they were made for.
+
+    Attributes:
+        waves: (M, 3) wave vectors [rad/m].
+        mixture: (M, r) complex128, of the plane waves in each column.
+    """
+
+    waves: np.ndarray
+    mixture: np.ndarray
+
+    def plane(self, places: np.ndarray) -> np.ndarray:
+        """The plane waves (n, M) at places (n, 3) [m]."""
+        return np.exp(1j * (places @ self.waves.T))
+
+    def columns(self, places: np.ndarray) -> np.ndarray:
+        """(n, r) complex128 at places (n, 3) [m]."""
+        return self.plane(places) @ self.mixture
+
+
+def basis_of(places: np.ndarray, wavelength: float) -> Basis:
+    """Combinations of plane waves, from everywhere alike, that places (n, 3) tell apart.
+
+    A prior of equal powers from all sides is a field of correlation sin(kd) / (kd).
+    """
+    step = np.arange(WAVES) + 0.5
+    height, azimuth = 1 - 2 * step / WAVES, math.pi * (1 + 5**0.5) * step  # a Fibonacci lattice
+    across = np.sqrt(1 - height**2)
+    waves = 2 * math.pi / wavelength * np.c_[across * np.cos(azimuth), across * np.sin(azimuth), height]
+    plane = Basis(waves, np.eye(WAVES)).plane(places)
+    values, vectors = eigh(plane.conj().T @ plane / len(places))
+    kept = values > KEPT * values[-1]
+    return Basis(waves, vectors[:, kept] / math.sqrt(values[kept].sum()))
+
+
+def decibels_of(field: np.ndarray) -> np.ndarray:
+    """Powers [dB] of complex fields of any shape, with the floor."""
+    return 10 * np.log10(np.abs(field) ** 2 + FLOOR)
+
+
+def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
+
+    A weight's prior is complex normal of variance 1.
+    """
+    count = columns.shape[1]
+    weights = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / math.sqrt(2)
+    weights /= math.sqrt(float((np.abs(columns @ weights) ** 2).mean()))
+    scale, damping = SCALE_DB, 1e-2
+    for hidden, steps in STAGES:
+        now = _Misfit.of(columns, decibels, weights, hidden, scale)
+        scale = now.scale()
+        now = _Misfit.of(columns, decibels, weights, hidden, scale)
+        for _ in range(steps):
+            found = _step(columns, decibels, now, hidden, scale, damping)
+            if found is None:
+                break
+            better, damping = found
+            settled, now = now.value - better.value < SETTLED * now.value, better
+            if settled:
+                break
+        weights = now.weights
+    return weights
+
+
+@dataclass(frozen=True)
+class _Misfit:
+    """A negative log posterior at some weights, and what it is made of."""
+
+    weights: np.ndarray
+    field: np.ndarray
+    power: np.ndarray
+    error: np.ndarray
+    value: float
+
+    @classmethod
+    def of(
+        cls, columns: np.ndarray, decibels: np.ndarray, weights: np.ndarray, hidden: float, scale: float
+    ) -> _Misfit:
+        field = columns @ weights
+        power = np.abs(field) ** 2 + FLOOR + hidden
+        error = 10 * np.log10(power) - decibels
+        value = 0.5 * (DEGREES + 1) * float(np.log1p(error**2 / (DEGREES * scale**2)).sum())
+        return cls(weights, field, power, error, value + ALIKE * float((np.abs(weights) ** 2).sum()))
+
+    def scale(self) -> float:
+        """Of the errors [dB], by a few steps of expectation maximisation."""
+        found = SCALE_DB
+        for _ in range(5):
+            share = (DEGREES + 1) / (DEGREES + (self.error / found) ** 2)
+            found = max(math.sqrt(float((share * self.error**2).mean())), LEAST_DB)
+        return found
+
+
+def _step(
+    columns: np.ndarray, decibels: np.ndarray, now: _Misfit, hidden: float, scale: float, damping: float
+) -> tuple[_Misfit, float] | None:
+    """A better place and the next damping; None where none was found."""
+    count = columns.shape[1]
+    slope = (DECIBEL * now.field.conj() / now.power)[:, None] * columns
+    # Single precision: a step need not be exact, its worth is judged in double.
+    jacobian = np.concatenate([slope.real, -slope.imag], 1).astype(np.float32)
+    share = ((DEGREES + 1) / (DEGREES * scale**2 + now.error**2)).astype(np.float32)
+    normal = ((jacobian.T * share) @ jacobian).astype(np.float64)
+    right = (jacobian.T @ (share * now.error.astype(np.float32))).astype(np.float64)
+    right += 2 * ALIKE * np.concatenate([now.weights.real, now.weights.imag])
+    middle, diagonal = float(normal.diagonal().mean()), np.diag_indices(2 * count)
+    normal[diagonal] += 2 * ALIKE
+    for _ in range(TRIES):
+        damped = normal.copy()
+        damped[diagonal] += damping * middle
+        try:
+            by = -cho_solve(cho_factor(damped, lower=True, overwrite_a=True), right)
+        except LinAlgError:  # rounding: more damping mends it
+            damping *= 4
+            continue
+        better = _Misfit.of(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
+        if better.value < now.value:
+            return better, max(damping / 3, 1e-5)
+        damping *= 4
+    return None
