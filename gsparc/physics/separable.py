@@ -1,8 +1,8 @@
 """Smooth images by few numbers: what an array resolves is of low rank in rows and in columns.
 
 An image is `rows @ coefficients @ columns` with orthonormal factors, the two-mode case of Tucker's
-decomposition by principal vectors of each mode (De Lathauwer, De Moor and Vandewalle 2000). An 8 x 8 array sees
-90 x 360 pixels through some 19 x 78 numbers.
+decomposition by principal vectors of each mode (De Lathauwer, De Moor and Vandewalle 2000). An 8 x 8 array
+sees 90 x 360 pixels through 19 x 80 numbers.
 """
 
 from __future__ import annotations
