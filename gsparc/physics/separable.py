@@ -38,11 +38,11 @@ class Separable:
 
     def of(self, images: Tensor) -> Tensor:
         """Coefficients (n, R * C) of images (n, H, W), by least squares."""
-        return (self.rows.T @ (images @ self.columns.T)).flatten(1)
+        return ((self.rows.T @ images) @ self.columns.T).flatten(1)
 
     def images(self, coefficients: Tensor) -> Tensor:
         """Images (n, H, W) of coefficients (n, R * C)."""
-        return (self.rows @ coefficients.unflatten(1, (-1, len(self.columns)))) @ self.columns
+        return self.rows @ (coefficients.unflatten(1, (-1, len(self.columns))) @ self.columns)
 
     def thinned(self, stride: int) -> Separable:
         """Of every `stride`-th pixel; coefficients stay, `of` means nothing then."""

@@ -286,7 +286,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         # two images drawn at random differ by twice the variance
         prior = 2 * float((held.values - held.values.mean(0)).square().mean(0).sum()) / targets[0].size
         self.error_model = fit_error_model(
-            held.places, torch.cat(relative).double().numpy(), np.concatenate(features), kernel,
+            held.places, torch.cat(relative), torch.cat(features), kernel,
             float(np.mean([trend.kernel.length for trend in self.trends])), prior,
         )  # fmt: skip
         self._left_error = torch.cat(errors)
@@ -308,11 +308,12 @@ class MovingArrayField(Interpolator, PredictsVariance):
 
     @torch.no_grad()
     def _answer(self, where: Tensor) -> Posterior:
-        explained, mean, energy = self.query()(where)
-        features = image_features(mean.clamp_(0, 1), energy / mean[0].numel())
+        found = self.query()(where)
+        mean = found.image.clamp_(0, 1)
+        features = image_features(mean, found.added / mean[0].numel())
         power = mean.flatten(1).square().mean(1)
-        unknown, variance = self.error_model.expected(where.numpy(), features, power)
-        return Posterior(mean, variance, explained.clamp_(0, 1), unknown)
+        unknown, variance = self.error_model.expected(found.far, features, power)
+        return Posterior(mean, variance, found.explained.clamp_(0, 1), unknown)
 
     def where(self, tx: Tensor, rx: Pose) -> Tensor:
         """Receivers' places (B, 3) float64 [m]; `ValueError` before `fit` or `restore`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -39,6 +40,22 @@ class Array:
         return found.sqrt() if self.exponent == 2 else found
 
 
+class Found(NamedTuple):
+    """Answers at m places.
+
+    Attributes:
+        explained: (m, H, W) images of the sources, not clamped.
+        image: (m, H, W) in all, not clamped.
+        added: (m,) energy of what the process adds, on all pixels.
+        far: (m, n) [m] from the training receivers.
+    """
+
+    explained: Tensor
+    image: Tensor
+    added: Tensor
+    far: Tensor
+
+
 class Query:
     """What a fitted field answers with.
 
@@ -65,15 +82,12 @@ class Query:
         self._middle = places.mean(0)
         self._places = (places - self._middle).float()
 
-    def __call__(self, where: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """At places (m, 3) float64 [m]: images (m, H, W) of the sources, and in all; the residual's energy.
-
-        Images are not clamped; the energy (m,) is that of what is added to the sources', on all pixels.
-        """
+    def __call__(self, where: Tensor) -> Found:
+        """At places (m, 3) float64 [m]."""
         receivers, centred = where.float(), (where - self._middle).float()
         # exact differences: the expanded square loses the digits of what is near
         far = torch.cdist(centred, self._places, compute_mode="donot_use_mm_for_euclid_dist")
         images = [self._array.render(t.sources, receivers, t.powers(far)) for t in self._trends]
         explained = images[0] if len(images) == 1 else torch.stack(images).mean(0)
         added = self._residual.coefficients(far)
-        return explained, self._basis.images(added).add_(explained), added.square().sum(1)
+        return Found(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)

@@ -59,7 +59,7 @@ class ReducedMean(View):
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """See `Method.predict`."""
-        return Prediction(self._query(self._method.where(tx, rx))[1].clamp_(0, 1))
+        return Prediction(self._query(self._method.where(tx, rx)).image.clamp_(0, 1))
 
     def size(self) -> int:
         """Components kept."""

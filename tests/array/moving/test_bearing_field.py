@@ -52,7 +52,7 @@ def test_sources_are_found_within_the_settings(data, found):
 def test_the_mean_is_what_sources_explain_and_the_residual(data, field):
     batch = data.batch(np.arange(1, 31, 2))
     posterior, method = field(batch.tx, batch.rx), field.method
-    explained, mean, energy = method.query()(method.where(batch.tx, batch.rx))
+    explained, mean, energy, _ = method.query()(method.where(batch.tx, batch.rx))
     torch.testing.assert_close(posterior.explained, explained.clamp(0, 1))
     added = method.basis.of(mean - explained)
     torch.testing.assert_close(added.square().sum(1), energy, rtol=1e-3, atol=1e-6)
