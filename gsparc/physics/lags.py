@@ -11,9 +11,11 @@ import torch
 from torch import Tensor
 
 from gsparc.ops import SphereGrid
+from gsparc.physics.separable import Separable, separable
 
 BLOCK = 128  # images at once
 RIDGE = 1e-7  # of the mean energy: directions beyond the horizon leave some lags undetermined
+LOST = 1e-12  # of the energy of a lag's image in its separable form: a float32's rounding
 
 
 class Lags:
@@ -26,6 +28,7 @@ class Lags:
 
     Attributes:
         count: real numbers per spectrum.
+        pixels: basis of all spectra.
     """
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
@@ -33,33 +36,37 @@ class Lags:
         unique, pairs = np.unique(np.round(between, 6), axis=0, return_counts=True)
         # d and -d are conjugates: the half whose first coordinate other than zero is positive is enough
         sign = np.array([next((np.sign(v) for v in row if v != 0), 0.0) for row in unique])
-        half = sign >= 0
-        self._differences = 2 * np.pi * unique[half]  # radians per unit of direction
-        self._share = pairs[half] / len(array) ** 2
-        self._sine = sign[half] > 0  # the zero lag has none
-        self.count = len(self._share) + int(self._sine.sum())
-        self.image = (grid.height, grid.width)
-        directions = grid.directions().numpy().reshape(-1, 3)
-        twice = np.where(self._sine, 2.0, 1.0)
-        weight = np.concatenate([twice, twice[self._sine]])
-        angle = directions @ self._differences.T
-        waves = np.concatenate([np.cos(angle), np.sin(angle)[:, self._sine]], axis=1)
-        self._basis = torch.from_numpy((waves * weight).astype(np.float32)).T
-        gram = (self._basis @ self._basis.T).double().numpy()
-        gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / len(gram)
-        self._inverse = torch.from_numpy(np.linalg.inv(gram)).float()
+        half = sign >= 0  # of sorted rows: the zero lag, which has no sine, is the first
+        differences = 2 * np.pi * unique[half]  # radians per unit of direction
+        self._differences = torch.from_numpy(differences.T.astype(np.float32))
+        self._share = torch.from_numpy((pairs[half] / len(array) ** 2).astype(np.float32))
+        self.count = 2 * len(self._share) - 1
+        angle = differences @ grid.directions().numpy().reshape(-1, 3).T
+        waves = np.concatenate([np.cos(angle), np.sin(angle[1:])])
+        waves[1 : len(angle)] *= 2
+        waves[len(angle) :] *= 2
+        basis = torch.from_numpy(waves).reshape(self.count, grid.height, grid.width)
+        self.pixels = separable(basis.split(BLOCK), LOST)  # in float64
+        self._basis = self.pixels.of(basis.float())
+        exact = self._basis.double()  # in float32, rounding would be most of the weakest lags
+        gram = exact @ exact.T
+        gram.diagonal().add_(RIDGE * gram.diagonal().mean())
+        self._inverse = torch.linalg.solve(gram, exact).T
+
+    @property
+    def image(self) -> tuple[int, int]:
+        """Height and width [pixels]."""
+        return self.pixels.image
 
     def atoms(self, directions: Tensor) -> Tensor:
         """Lags (..., count) float32 of plane waves of unit power from unit vectors (..., 3)."""
-        angle = directions @ torch.from_numpy(self._differences.astype(np.float32)).T
-        share = torch.from_numpy(self._share.astype(np.float32))
-        sine = torch.from_numpy(self._sine)
-        return torch.cat([share * angle.cos(), (share * angle.sin())[..., sine]], dim=-1)
+        angle = directions @ self._differences
+        return torch.cat([self._share * angle.cos(), self._share[1:] * angle[..., 1:].sin()], dim=-1)
 
     def of(self, power: Tensor) -> Tensor:
         """Lags (n, count) of spectra (n, H, W) in power, by least squares."""
-        return (power.reshape(len(power), -1) @ self._basis.T) @ self._inverse
+        return (self.pixels.of(power).double() @ self._inverse).float()
 
-    def spectrum(self, lags: Tensor) -> Tensor:
-        """Power (n, H, W), at least 0, of lags (n, count)."""
-        return (lags @ self._basis).clamp_(min=0).reshape(-1, *self.image)
+    def spectrum(self, lags: Tensor, pixels: Separable | None = None) -> Tensor:
+        """Power (n, H, W), at least 0, of lags (n, count); on `pixels`, these lags' thinned, if given."""
+        return (pixels or self.pixels).images(lags @ self._basis).clamp_min(0)

@@ -1,40 +1,44 @@
-"""Error model: expected relative error at a place, regressed on the leave-one-out errors of training rows.
+"""Error model: expected error at a place, regressed on the leave-one-out errors of training rows.
 
 The posterior variance of a process on images depends on the sampling density alone; errors do not: they are
 large at shadow boundaries and where paths interfere. The logarithm of the leave-one-out relative error is
-regressed on what is known of a prediction without a measurement.
+regressed on what is known of a prediction without a measurement. Far from all rows nothing is known: the
+error is that of an image drawn at random.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from sklearn.linear_model import RidgeCV
+from torch import Tensor
 
-NEIGHBOURS = 16  # whose leave-one-out errors are averaged
+from gsparc.array.moving.power_gp import matern
+from gsparc.methods.gp import Kernel
+
+NEIGHBOURS = 16  # whose leave-one-out errors are averaged, and on which variances are conditioned
 NEAR = 4  # the distance to this neighbour is the reach of the average
 MIN_ERROR, MAX_ERROR = 1e-4, 10.0  # relative errors are clipped to
-ARRAYS = ("places", "errors", "centre", "scale", "slope", "low", "high")
+LEAST_NOISE = 1e-6  # of neighbours that nearly coincide
 RIDGES = np.logspace(-2, 4, 13)  # chosen by leave-one-out
 
 
-def image_features(variance: np.ndarray, image: torch.Tensor, added: torch.Tensor) -> np.ndarray:
-    """Features (n, 4) of predicted images (n, P).
+def image_features(image: Tensor, added: Tensor) -> Tensor:
+    """Features (n, 3) of predicted images: logarithms of brightness and of what is added, largest pixel.
 
     Args:
-        variance: (n,) of the residual process, relative to its prior.
-        image: the prediction; its brightness and its largest pixel.
-        added: what the process adds to the sources' image; its mean square.
+        image: (n, H, W), the prediction.
+        added: (n,) mean square of what the process adds to the sources' image.
     """
-    power = (variance, *(part.mean(1).double().numpy() for part in (image, added.square())))
-    logs = (np.log(np.maximum(x, 1e-9)) for x in power)
-    return np.column_stack([*logs, image.amax(1).double().numpy()])
+    flat = image.flatten(1)
+    power = torch.stack([flat.mean(1), added], 1).clamp_min(1e-9).log()
+    return torch.cat([power, flat.amax(1, keepdim=True)], 1)
 
 
 @dataclass(frozen=True)
@@ -42,71 +46,131 @@ class ErrorModel:
     """The regression.
 
     Attributes:
-        places: (n, 3) [m] learned from.
-        errors: (n,) logarithms of their leave-one-out relative errors.
-        centre, scale, slope: (5,) of the standardised columns; the first is the neighbours' error.
+        near: (n, k) rows nearest to each of the n training rows, itself first.
+        precision: (n, k, k) float64, inverse of these rows' correlations with noise.
+        errors: (n,) logarithms of leave-one-out relative errors.
+        centre, scale, slope: (5,) of the standardised columns: the neighbours' error, the logarithm of the
+            residual's variance given the neighbours, and `image_features`.
         low, high: (5,) range of the columns, beyond which nothing is extrapolated.
+        kernel: of the residual.
         level: mean of the logarithm, corrected so that the mean error is unbiased.
         farthest: largest distance of a learned place to its nearest other [m].
+        reach: correlation length of the sources' powers [m].
+        prior: mean square error per pixel of an image drawn at random.
     """
 
-    places: np.ndarray
-    errors: np.ndarray
-    centre: np.ndarray
-    scale: np.ndarray
-    slope: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    near: Tensor
+    precision: Tensor
+    errors: Tensor
+    centre: Tensor
+    scale: Tensor
+    slope: Tensor
+    low: Tensor
+    high: Tensor
+    kernel: Kernel
     level: float
     farthest: float
+    reach: float
+    prior: float
 
-    def relative_error(self, places: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Expected |e|^2 / |h|^2 (m,) at places (m, 3) [m], of `image_features` (m, 4).
+    def expected(self, far: Tensor, features: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+        """What is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
+
+        An image is known to its relative error with weight c and not at all with weight 1 - c, the
+        correlation c of a source's power over what the nearest row is farther than the largest gap of rows.
+
+        Args:
+            far: (m, n) [m] from the training rows.
+            features: (m, 3), see `image_features`.
+            power: (m,) mean square of the predicted images.
+        """
+        error, nearest = self.relative_error(far, features)
+        known = matern((nearest - self.farthest).clamp_min(0), self.reach)
+        variance = known * (error * power).clamp_max(self.prior) + (1 - known) * self.prior
+        return 1 - known / (1 + error), variance
+
+    def relative_error(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m] to the nearest; see `expected`.
 
         Beyond the largest distance between training places it grows with the distance squared.
         """
-        distance, row = self._tree.query(places, k=np.arange(1, min(NEIGHBOURS, len(self.places)) + 1))
-        columns = np.column_stack([_average(distance, self.errors[row]), features])
-        columns = np.clip(columns, self.low, self.high)
+        nearest, row = far.min(1)
+        near = self.near[row]
+        distance = far.gather(1, near)
+        columns = _columns(self.kernel, distance, self.precision[row], self.errors[near], features)
+        columns = columns.clamp(self.low, self.high)
         predicted = self.level + ((columns - self.centre) / self.scale) @ self.slope
-        beyond = np.maximum(distance[:, 0] / self.farthest, 1.0) ** 2
-        return np.exp(np.clip(predicted, np.log(MIN_ERROR), np.log(MAX_ERROR))) * beyond
-
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.places)
+        beyond = (nearest / self.farthest).clamp_min(1.0).square()
+        return predicted.clamp(math.log(MIN_ERROR), math.log(MAX_ERROR)).exp() * beyond, nearest
 
     def state(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        arrays = {name: torch.from_numpy(getattr(self, name)) for name in ARRAYS}
-        return {**arrays, "level": self.level, "farthest": self.farthest}
+        return {**vars(self), "kernel": [*vars(self.kernel).values()]}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> ErrorModel:
         """Inverse of `state`."""
-        arrays = {name: state[name].numpy() for name in ARRAYS}
-        return ErrorModel(**arrays, level=float(state["level"]), farthest=float(state["farthest"]))
+        return ErrorModel(**{**state, "kernel": Kernel(*map(float, state["kernel"]))})
 
 
-def fit_error_model(places: np.ndarray, relative_error: np.ndarray, features: np.ndarray) -> ErrorModel:
-    """From leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 4) at places (n, 3) [m]; n at least 2."""
-    errors = np.log(np.clip(relative_error, MIN_ERROR, MAX_ERROR))
-    distance, row = cKDTree(places).query(places, k=np.arange(2, min(NEIGHBOURS + 1, len(places)) + 1))
-    columns = np.column_stack([_average(distance, errors[row]), features])
-    centre, scale = columns.mean(0), np.maximum(columns.std(0), 1e-9)
-    model = RidgeCV(RIDGES).fit((columns - centre) / scale, errors)
-    residual = errors - model.predict((columns - centre) / scale)
+def fit_error_model(
+    places: np.ndarray,
+    relative_error: Tensor,
+    features: Tensor,
+    kernel: Kernel,
+    reach: float,
+    prior: float,
+) -> ErrorModel:
+    """From leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
+
+    `kernel`, `reach` and `prior` are `ErrorModel`'s.
+    """
+    errors = relative_error.clamp(MIN_ERROR, MAX_ERROR).log()
+    distance, rows = (
+        torch.from_numpy(found)
+        for found in cKDTree(places).query(places, k=np.arange(1, min(NEIGHBOURS + 1, len(places)) + 1))
+    )
+    distance, others = distance.float()[:, 1:], rows[:, 1:]  # a row is not its own neighbour
+    known = torch.from_numpy(places)
+    columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
+    centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(1e-3)
+    standard = ((columns - centre) / scale).double().numpy()
+    model = RidgeCV(RIDGES).fit(standard, errors.double().numpy())
+    residual = errors.numpy() - model.predict(standard)
     # the mean of a relative error is not the exponential of its logarithm's mean (Duan 1983)
     level = float(model.intercept_ + np.log(np.exp(residual).mean()))
-    farthest = max(float(distance[:, 0].max()), 1e-6)
+    near = rows[:, :NEIGHBOURS].contiguous()
     return ErrorModel(
-        places, errors, centre, scale, np.asarray(model.coef_, dtype=np.float64),
-        columns.min(0), columns.max(0), level, farthest,
+        near, _precision(kernel, known[near]), errors, centre, scale, torch.from_numpy(model.coef_).float(),
+        columns.amin(0), columns.amax(0), kernel, level, max(float(distance[:, 0].max()), 1e-6), reach, prior,
     )  # fmt: skip
 
 
-def _average(distance: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Mean (m,) of neighbours' values (m, k) with exponential weights of the sorted distances (m, k)."""
-    reach = np.maximum(distance[:, min(NEAR, distance.shape[1]) - 1, None], 1e-9)
-    weight = np.exp(-distance / reach)
-    return (weight * values).sum(1) / weight.sum(1)
+def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:
+    """Columns (m, 5) of the regression from k neighbours: (m, k) distances [m], (m, k, k), (m, k) errors."""
+    variance = _variance(kernel, distance, precision).log().float()
+    return torch.cat([torch.stack([_average(distance, errors), variance], 1), features], 1)
+
+
+def _precision(kernel: Kernel, places: Tensor) -> Tensor:
+    """Inverse correlations (m, k, k) with noise, of rows at (m, k, 3) float64 [m]."""
+    between = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+    noise = max(kernel.noise, LEAST_NOISE) * torch.eye(places.shape[1], dtype=torch.float64)
+    return torch.linalg.inv(matern(between, kernel.length) + noise)
+
+
+def _variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
+    """Posterior variance (m,) float64 over the amplitude at a `distance` (m, k) [m] from k neighbours.
+
+    The nearest rows screen off the others (Stein 2002), whose Cholesky factor would be most of a query.
+    """
+    cross = matern(distance.double(), kernel.length)[:, None]
+    prior = 1 + kernel.noise
+    return (prior - (cross @ precision @ cross.mT)[:, 0, 0]).clamp(max(kernel.noise, LEAST_NOISE), prior)
+
+
+def _average(distance: Tensor, values: Tensor) -> Tensor:
+    """Mean (m,) of neighbours' values (m, k) with exponential weights of the distances (m, k)."""
+    near = min(NEAR, distance.shape[1])
+    reach = distance.kthvalue(near, dim=1, keepdim=True).values.clamp_min(1e-9)
+    return ((-distance / reach).softmax(1) * values).sum(1)

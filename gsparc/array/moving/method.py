@@ -1,8 +1,7 @@
 """`model=moving_array`: sources, their powers as smooth trends, a Gaussian process on residual spectra.
 
 The trend moves directions of arrival with the receiver, which interpolating images cannot; the residual
-(interference, shadow boundaries) goes to the Gaussian process on images of `gsparc.methods.gp` (universal
-kriging; Matheron 1969). Images of several searches are averaged.
+goes to a Gaussian process on images. Images of several searches are averaged.
 """
 
 from __future__ import annotations
@@ -10,34 +9,63 @@ from __future__ import annotations
 import logging
 import math
 import time
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from gsparc.array.moving import reduce
-from gsparc.array.moving.compress import components
 from gsparc.array.moving.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.array.moving.power_gp import Trend, TrendSettings, fit_trend
-from gsparc.array.moving.triangulate import SearchSettings, bearings, find_sources, mixture, powers
+from gsparc.array.moving.query import Array, Query
+from gsparc.array.moving.residual import Residual, fit_residual, left_out_error
+from gsparc.array.moving.triangulate import SearchSettings, find_sources, powers
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods.gp import Kernel, choose_kernel
+from gsparc.field.conditional import LeftOutRows, Posterior
+from gsparc.methods.censored import heard
+from gsparc.methods.gp import Kernel
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import FitContext, FitReport, Prediction, PredictsVariance
-from gsparc.methods.target_rows import to_real
+from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.ops import Pose
 from gsparc.physics.lags import BLOCK, Lags
+from gsparc.physics.separable import Separable, separable
 
 log = logging.getLogger(__name__)
 
-KERNEL_COMPONENTS = 128  # principal components that kernels are chosen on
 MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
+UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
 MIN_GAIN = 0.005  # of the leave-one-out error: searches end when the last one gained less
 BUDGET_SHARE = 0.8  # of the budget, by which the last search must end
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """Training spectra as few numbers.
+
+    Attributes:
+        places: (n, 3) float64 [m].
+        lags: (n, Q) of their powers.
+        values: (n, R) of their pixels in the residual's basis.
+    """
+
+    places: np.ndarray
+    lags: Tensor
+    values: Tensor
+
+    @property
+    def receivers(self) -> Tensor:
+        """(n, 3) float32 [m]."""
+        return torch.from_numpy(self.places).float()
+
+    def at(self, rows: np.ndarray) -> Spectra:
+        """Some of them."""
+        return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
 class MovingArrayField(Interpolator, PredictsVariance):
@@ -53,6 +81,10 @@ class MovingArrayField(Interpolator, PredictsVariance):
         components: largest number of principal components of the residual; 0: the trends alone.
         seed: of the first search; the others have the next ones.
         name: as it appears in tables.
+        most_searches: with a budget, at most so many; None: as many as help.
+
+    Attributes:
+        left_powers: per search (n, K) float32, powers that the others' predict of each training row.
     """
 
     effects = "moving_array"
@@ -67,6 +99,7 @@ class MovingArrayField(Interpolator, PredictsVariance):
         components: int = 512,
         seed: int = 0,
         name: str = "moving_array",
+        most_searches: int | None = None,
     ) -> None:
         super().__init__()
         if searches < 1 or rest_rows < 3:
@@ -75,8 +108,9 @@ class MovingArrayField(Interpolator, PredictsVariance):
             )
         self.search, self.trend = search or SearchSettings(), trend or TrendSettings()
         self.searches, self.rest_rows, self.components = searches, rest_rows, components
-        self.seed, self.name = seed, name
+        self.seed, self.name, self.most_searches = seed, name, most_searches
         self.trends: list[Trend] = []
+        self.left_powers: list[Tensor] = []
         self._budget = TimeBudget()
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -88,18 +122,12 @@ class MovingArrayField(Interpolator, PredictsVariance):
         problem = site_problem(data)
         if problem is not None:
             raise ValueError(f"{self.name}: {problem}")
-        self._budget = context.time_budget()
+        self._budget, self._lags = context.time_budget(), None
         return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
 
     def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
         """See `Explains`."""
-        problem, site = site_problem(data), data.site
-        if problem is not None:
-            return False, problem
-        images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
-        _, residual = unexplained_energy(Lags(*site.array_geometry()), images)
-        share = f"{residual:.1%} of the energy of {len(rows)} probed images"
-        return residual <= MAX_UNEXPLAINED, f"{share} is outside the moving array's lags"
+        return explains(data, rows)
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`; searches where there are several."""
@@ -112,174 +140,207 @@ class MovingArrayField(Interpolator, PredictsVariance):
 
     reduced = reduce.reduced
 
+    # -- learning ----------------------------------------------------------------------------------
+
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        begin = time.perf_counter()
-        space = self.lags()
-        self.positions = positions
-        self.exponent, lags = self._lags(space, targets)
-        budget, longest = self._budget, 0.0
-        # sum over searches of leave-one-out images
-        modelled = np.zeros((len(targets), *space.image), dtype=np.float32)
-        self.trends, errors = [], []
+        begin, budget, longest = time.perf_counter(), self._budget, 0.0
+        self.exponent = self._exponent(targets)
+        self.basis = separable(self._blocks(targets), UNRESOLVED)
+        held = self._held(positions, targets)
+        self.trends, self.left_powers, errors = [], [], []
+        modelled = torch.zeros_like(held.values)  # sum over searches of left-out images
         while True:
             start = time.perf_counter()
-            trend, left_out = self._search(space, lags, positions, targets)
-            self._add_images(space, trend.sources, left_out, modelled, positions)
-            self.trends.append(trend)
-            errors.append(self._left_out_error(positions, targets, modelled))
+            sources = self._find(held)
+            power = self._powers(held, sources)
+            modelled += self._add(held, sources, power, self._choose_kernel(held, sources, power))
+            rows = _spread(len(positions), self.trend.rows)
+            left = held.values[rows] - modelled[rows] / len(self.trends)
+            errors.append(left_out_error(positions[rows], left)[0] / targets[0].size)
             now = time.perf_counter()
             longest = max(longest, now - start)
             log.info(
                 "%s: search %d, %d sources, trend length %.3g m, leave-one-out error %.4g, %.0f s",
-                self.name, len(errors), len(trend.sources), trend.kernel.length, errors[-1], now - begin,
+                self.name, len(errors), len(sources), self.trends[-1].kernel.length, errors[-1], now - begin,
             )  # fmt: skip
             if budget.seconds == math.inf:
                 done = len(errors) == self.searches
             else:
                 late = budget.over(BUDGET_SHARE - longest / budget.seconds)
-                done = late or (len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2])
+                done = late or len(errors) == self.most_searches
+                done |= len(errors) > 1 and errors[-1] > (1 - MIN_GAIN) * errors[-2]
             if done:
                 break
-        modelled /= -len(self.trends)
-        residual = self._add_targets(targets, modelled)
-        rows = _spread(len(residual), self.rest_rows)
-        self.residual_kernel = _residual_error(positions[rows], residual[rows])[1]
-        self._fit_residual(residual, targets)
+        modelled /= len(self.trends)
+        rows = _spread(len(positions), self.rest_rows)
+        kernel = left_out_error(positions[rows], held.values[rows] - modelled[rows])[1]
+        self._complete(held, modelled, kernel, targets)
         note = f"{self.name}: {len(self.trends)} searches, {self.size()} sources, leave-one-out error "
         note += " ".join(f"{error:.4g}" for error in errors)
-        kernel = self.residual_kernel
         fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
-        return (note, f"{self.name}: residual of {fitted}")
+        return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
 
-    def _search(
-        self, space: Lags, lags: Tensor, positions: np.ndarray, targets: np.ndarray
-    ) -> tuple[Trend, np.ndarray]:
-        """The next search's trend, and its leave-one-out powers (n, K)."""
-        assert self.site is not None and self.site.grid is not None
-        receivers = torch.from_numpy(positions).float()
-        rows = _spread(len(targets), self.search.rows)
-        static = self.site.static_position
-        first = None if static is None else torch.from_numpy(np.asarray(static)).float()
-        sources = find_sources(
-            lags[rows], receivers[rows], first, self.rotation(), space, self.site.grid, self.search,
-            self.seed + len(self.trends),
-        )  # fmt: skip
-        power = torch.cat([
-            powers(part, self._atoms(space, sources, places), self.search.ridge)
-            for part, places in zip(lags.split(BLOCK), receivers.split(BLOCK), strict=True)
-        ]).double().numpy()  # fmt: skip
-        kernel = self._choose_kernel(space, sources, positions, power, targets)
-        return fit_trend(sources, kernel, positions, power)
+    @torch.no_grad()
+    def condition(self, data: Measurements, rows: np.ndarray, sources: Sequence[Tensor]) -> np.ndarray:
+        """Powers, trends, residual and errors anew, with the kernels of the fit.
 
-    def _lags(self, space: Lags, targets: np.ndarray) -> tuple[int, Tensor]:
-        """Whether pixels are amplitude (2) or power (1), and the lags (n, Q) of all spectra.
+        Args:
+            data: of the site that was fitted.
+            rows: (n,) to learn from.
+            sources: (K, 3) [m] of each search.
+
+        Returns:
+            Those of the rows where something was heard.
+        """
+        rows = heard(data, rows)
+        if not len(rows):
+            raise ValueError(f"{self.name}: the training set is empty")
+        targets, self.seen = training_targets(data, rows), len(rows)
+        held, kernels = self._held(data.moving[rows], targets), [trend.kernel for trend in self.trends]
+        self.trends, self.left_powers = [], []
+        modelled = torch.zeros_like(held.values)
+        for place, kernel in zip(sources, kernels, strict=True):
+            modelled += self._add(held, place, self._powers(held, place), kernel)
+        self._complete(held, modelled / len(self.trends), self.residual.kernel, targets)
+        return rows
+
+    def _exponent(self, targets: np.ndarray) -> int:
+        """Whether pixels are amplitude (2) or power (1).
 
         Raises:
             ValueError: neither is a spectrum of the declared array.
         """
-        exponent, residual = unexplained_energy(space, self._images(targets[_spread(len(targets), 16)]))
-        if residual > MAX_UNEXPLAINED:
+        exponent, left = unexplained_energy(self.lags(), self._images(targets[_spread(len(targets), 16)]))
+        if left > MAX_UNEXPLAINED:
             raise ValueError(
                 f"{self.name}: the declared array cannot have measured these spectra "
-                f"({residual:.0%} of their energy is outside its lags)"
+                f"({left:.0%} of their energy is outside its lags)"
             )
-        parts = [
-            space.of(self._images(targets[i : i + BLOCK]) ** exponent) for i in range(0, len(targets), BLOCK)
-        ]
-        return exponent, torch.cat(parts)
+        return exponent
 
-    def _choose_kernel(
-        self, space: Lags, sources: Tensor, positions: np.ndarray, power: np.ndarray, targets: np.ndarray
-    ) -> Kernel:
+    def _held(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
+        parts = [(self.lags().of(b**self.exponent), self.basis.of(b)) for b in self._blocks(targets)]
+        lags, values = (torch.cat(part) for part in zip(*parts, strict=True))
+        return Spectra(places, lags, values)
+
+    def _find(self, held: Spectra) -> Tensor:
+        """Sources (K, 3) [m] of the next search."""
+        assert self.site is not None and self.site.grid is not None
+        some, static = held.at(_spread(len(held.places), self.search.rows)), self.site.static_position
+        first = None if static is None else torch.from_numpy(np.asarray(static)).float()
+        return find_sources(
+            some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
+            self.seed + len(self.trends),
+        )  # fmt: skip
+
+    def _powers(self, held: Spectra, sources: Tensor) -> np.ndarray:
+        """Powers (n, K) float64 that explain each row best."""
+        array = self.array()
+        return torch.cat([
+            powers(part, array.atoms(sources, places), self.search.ridge)
+            for part, places in zip(held.lags.split(BLOCK), held.receivers.split(BLOCK), strict=True)
+        ]).double().numpy()  # fmt: skip
+
+    def _add(self, held: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
+        """Append the trend of powers (n, K); its left-out images (n, R)."""
+        trend, left = fit_trend(sources, kernel, held.places, power)
+        self.trends.append(trend)
+        self.left_powers.append(torch.from_numpy(left).float())
+        return self._modelled(held, sources, self.left_powers[-1])
+
+    def _modelled(self, held: Spectra, sources: Tensor, power: Tensor) -> Tensor:
+        """Images (n, R) of sources of powers (n, K)."""
+        array = self.array()
+        return torch.cat([
+            self.basis.of(array.render(sources, places, part))
+            for places, part in zip(held.receivers.split(BLOCK), power.split(BLOCK), strict=True)
+        ])  # fmt: skip
+
+    def _choose_kernel(self, held: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
         """Kernel of a trend, by leave-one-out error."""
-        rows = _spread(len(positions), self.trend.rows)
-        diagonal = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
+        rows = _spread(len(held.places), self.trend.rows)
+        some, diagonal = held.at(rows), float(np.linalg.norm(np.ptp(held.places, axis=0))) or 1.0
         errors = {}
         for length in self.trend.lengths:
             kernel = Kernel(length * diagonal, self.trend.noise)
-            predicted = fit_trend(sources, kernel, positions[rows], power[rows])[1]
-            modelled = np.zeros((len(rows), *space.image), dtype=np.float32)
-            self._add_images(space, sources, predicted, modelled, positions[rows])
-            errors[kernel] = _residual_error(positions[rows], self._add_targets(targets[rows], -modelled))[0]
+            left = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
+            missed = some.values - self._modelled(some, sources, left)
+            errors[kernel] = left_out_error(some.places, missed)[0]
         return min(errors, key=lambda kernel: errors[kernel])
 
-    def _left_out_error(self, positions: np.ndarray, targets: np.ndarray, modelled: np.ndarray) -> float:
-        """Leave-one-out error (mean square) of all searches so far together."""
-        rows = _spread(len(positions), self.trend.rows)
-        residual = self._add_targets(targets[rows], modelled[rows] / -len(self.trends))
-        return _residual_error(positions[rows], residual)[0]
+    def _complete(self, held: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
+        """The process on what left-out trends (n, R) miss, and the error model of the sum."""
+        self.positions, missed = held.places, held.values - modelled
+        self.residual, added = fit_residual(kernel, held.places, missed, self.components)
+        self._left, self._query = modelled + added, None
+        self.trend_error = max(float(missed.square().mean(0).sum()) / targets[0].size, 1e-12)
+        energy = added.square().sum(1) / targets[0].size
+        relative, features, errors = [], [], []
+        for start, image in zip(range(0, len(targets), BLOCK), self._blocks(targets), strict=True):
+            part = slice(start, start + BLOCK)
+            found = self.basis.images(self._left[part]).clamp_(0, 1)
+            error = (found - image).square().mean((1, 2))
+            relative.append(error / image.square().mean((1, 2)).clamp_min(1e-12))
+            errors.append(error)
+            features.append(image_features(found, energy[part]))
+        # two images drawn at random differ by twice the variance
+        prior = 2 * float((held.values - held.values.mean(0)).square().mean(0).sum()) / targets[0].size
+        self.error_model = fit_error_model(
+            held.places, torch.cat(relative), torch.cat(features), kernel,
+            float(np.mean([trend.kernel.length for trend in self.trends])), prior,
+        )  # fmt: skip
+        self._left_error = torch.cat(errors)
 
-    def _add_images(
-        self, space: Lags, sources: Tensor, power: np.ndarray, modelled: np.ndarray, places: np.ndarray
-    ) -> None:
-        """Add to images (n, H, W) those of sources of powers (n, K) at places (n, 3)."""
-        for start in range(0, len(modelled), BLOCK):
-            rows = slice(start, start + BLOCK)
-            receivers = torch.from_numpy(places[rows]).float()
-            modelled[rows] += self._render(space, sources, receivers, power[rows]).numpy()
+    def left_out(self, rows: np.ndarray) -> LeftOutRows:
+        """Images of the training rows (n,), each predicted from the others; of a field just conditioned."""
+        mean = torch.cat([self.basis.images(part).clamp_(0, 1) for part in self._left.split(BLOCK)])
+        return LeftOutRows(rows, mean, self._left_error)
 
-    def _add_targets(self, targets: np.ndarray, minus: np.ndarray) -> np.ndarray:
-        """Targets plus `minus` (n, H, W) float32, written to `minus`: one copy of thousands of images."""
-        for start in range(0, len(targets), BLOCK):
-            rows = slice(start, start + BLOCK)
-            minus[rows] += self._images(targets[rows]).numpy()
-        return minus
+    # -- answering ---------------------------------------------------------------------------------
 
-    def _fit_residual(self, residual: np.ndarray, targets: np.ndarray) -> None:
-        """The process on residual images (n, H, W), and the error model of the sum."""
-        self._factor = cho_factor(self.residual_kernel.gram(self.positions), lower=True)
-        if self.components == 0:
-            self.mean = torch.from_numpy(residual.mean(0).ravel())
-            self.axes, scores = torch.zeros(0, len(self.mean)), np.zeros((len(residual), 0))
-        else:
-            parts = components(residual, self.components)
-            self.axes, self.mean = torch.from_numpy(parts.axes), torch.from_numpy(parts.mean)
-            scores = parts.scores
-        weights = cho_solve(self._factor, scores)
-        self.weights = torch.from_numpy(weights)
-        # leave-one-out variance, over the amplitude
-        spread = 1 / np.diag(cho_solve(self._factor, np.eye(len(residual))))
-        predicted = torch.from_numpy(scores - weights * spread[:, None]).float()
-        error, features = np.empty(len(residual)), []
-        for start in range(0, len(residual), BLOCK):
-            rows = slice(start, start + BLOCK)
-            image = self._images(targets[rows]).flatten(1)
-            added = torch.addmm(self.mean, predicted[rows], self.axes)
-            found = (image - torch.from_numpy(residual[rows]).flatten(1) + added).clamp_(0, 1)
-            error[rows] = ((found - image).square().sum(1) / image.square().sum(1).clamp_min(1e-12)).numpy()
-            features.append(image_features(spread[rows], found, added))
-        self.error_model = fit_error_model(self.positions, error, np.concatenate(features))
+    def posterior(self, tx: Tensor, rx: Pose) -> Posterior:
+        """What is known at queries; `explained` are the sources' images alone."""
+        return self._answer(self.where(tx, rx))
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        space, receivers = self.lags(), torch.from_numpy(queries).float()
-        modelled = torch.zeros(len(queries), space.image[0] * space.image[1])
-        for trend in self.trends:
-            power = trend.powers_at(queries, self.positions)
-            modelled += self._render(space, trend.sources, receivers, power).flatten(1)
-        cross = self.residual_kernel.cross(queries, self.positions)
-        added = torch.addmm(self.mean, (torch.from_numpy(cross) @ self.weights).float(), self.axes)
-        mean = self._decode(modelled.div_(len(self.trends)).add_(added))
-        prior = 1 + self.residual_kernel.noise
-        variance = np.clip(prior - (cross * cho_solve(self._factor, cross.T).T).sum(1), 1e-9, prior)
-        features = image_features(variance, mean.flatten(1), added)
-        relative = torch.from_numpy(self.error_model.relative_error(queries, features)).float()
-        return Prediction(mean, 1 / (1 + relative), relative * mean.square().flatten(1).mean(1))
+        found = self._answer(torch.from_numpy(queries))
+        return Prediction(found.mean, 1 - found.unknown, found.variance)
+
+    @torch.no_grad()
+    def _answer(self, where: Tensor) -> Posterior:
+        found = self.query()(where)
+        mean = found.image.clamp_(0, 1)
+        features = image_features(mean, found.added / mean[0].numel())
+        power = mean.flatten(1).square().mean(1)
+        unknown, variance = self.error_model.expected(found.far, features, power)
+        return Posterior(mean, variance, found.explained.clamp_(0, 1), unknown)
+
+    def where(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Receivers' places (B, 3) float64 [m]; `ValueError` before `fit` or `restore`."""
+        if self.site is None:
+            raise ValueError(f"{self.name}: fit or restore it first")
+        return self._queries(tx, rx).detach()
+
+    def query(self, searches: int | None = None, count: int | None = None, stride: int = 1) -> Query:
+        """Answers with the first searches and components (None: all) on every `stride`-th pixel."""
+        if self._query is not None and (searches, count, stride) == (None, None, 1):
+            return self._query
+        residual = self.residual if count is None else self.residual.first(count)
+        query = Query(
+            self.array(stride), self.basis, self.trends[:searches], residual,
+            torch.from_numpy(self.positions), stride,
+        )  # fmt: skip
+        if (searches, count, stride) == (None, None, 1):
+            self._query = query
+        return query
 
     def size(self) -> int:
         """Number of sources of all searches."""
         return sum(len(trend.sources) for trend in self.trends)
 
-    def _render(self, space: Lags, sources: Tensor, receivers: Tensor, power: np.ndarray) -> Tensor:
-        """Images (n, H, W) of sources of powers (n, K) at receivers (n, 3) [m]."""
-        lags = mixture(torch.from_numpy(power).float(), self._atoms(space, sources, receivers))
-        image = space.spectrum(lags)
-        return image.sqrt_() if self.exponent == 2 else image
-
-    def _atoms(self, space: Lags, sources: Tensor, receivers: Tensor) -> Tensor:
-        return space.atoms(bearings(sources, receivers, self.rotation()))
-
-    def _images(self, targets: np.ndarray) -> Tensor:
-        return torch.from_numpy(to_real(targets, "spectrum")).reshape(len(targets), *targets.shape[1:])
+    def array(self, stride: int = 1) -> Array:
+        """That looks, at every `stride`-th pixel."""
+        return Array(self.lags(), self.rotation(), self.exponent, stride)
 
     def rotation(self) -> Tensor:
         """(3, 3) of the array, receiver to world."""
@@ -289,31 +350,46 @@ class MovingArrayField(Interpolator, PredictsVariance):
     def lags(self) -> Lags:
         """The array's, computed once."""
         assert self.site is not None
-        if self._prepared is None:
-            self._prepared = Lags(*self.site.array_geometry())
-        return self._prepared
+        if self._lags is None:
+            self._lags = Lags(*self.site.array_geometry())
+        return self._lags
 
-    _prepared: Lags | None = None
+    _lags: Lags | None = None
+    _query: Query | None = None
+
+    def _images(self, targets: np.ndarray) -> Tensor:
+        return torch.from_numpy(to_real(targets, "spectrum")).reshape(targets.shape)
+
+    def _blocks(self, targets: np.ndarray) -> Iterator[Tensor]:
+        return (self._images(targets[i : i + BLOCK]) for i in range(0, len(targets), BLOCK))
 
     def _learned(self) -> dict[str, Any]:
         return {
             "trends": [trend.state() for trend in self.trends],
             "exponent": self.exponent,
-            "rest": [*vars(self.residual_kernel).values()],
+            "basis": vars(self.basis),
+            "residual": self.residual.state(),
             "positions": torch.from_numpy(self.positions),
-            "mean": self.mean,
-            "axes": self.axes,
-            "weights": self.weights,
-            "doubt": self.error_model.state(),
+            "errors": self.error_model.state(),
         }
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        self._prepared = None
+        self._lags = self._query = None
         self.trends = [Trend.from_state(trend) for trend in state["trends"]]
-        self.exponent, self.residual_kernel = int(state["exponent"]), Kernel(*map(float, state["rest"]))
-        self.positions, self.error_model = state["positions"].numpy(), ErrorModel.from_state(state["doubt"])
-        self.mean, self.axes, self.weights = state["mean"], state["axes"], state["weights"]
-        self._factor = cho_factor(self.residual_kernel.gram(self.positions), lower=True)
+        self.exponent, self.basis = int(state["exponent"]), Separable(**state["basis"])
+        self.residual, self.positions = Residual.from_state(state["residual"]), state["positions"].numpy()
+        self.error_model = ErrorModel.from_state(state["errors"])
+
+
+def explains(data: Measurements, rows: np.ndarray) -> tuple[bool, str]:
+    """Whether a moving array can have measured the spectra of rows (n,), and the measurement that decided."""
+    problem, site = site_problem(data), data.site
+    if problem is not None:
+        return False, problem
+    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
+    _, residual = unexplained_energy(Lags(*site.array_geometry()), images)
+    share = f"{residual:.1%} of the energy of {len(rows)} probed images"
+    return residual <= MAX_UNEXPLAINED, f"{share} is outside the moving array's lags"
 
 
 def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
@@ -339,19 +415,6 @@ def site_problem(data: Measurements) -> str | None:
     if not np.allclose(data.rx_rotation, data.rx_rotation[0], atol=1e-6):
         return "the receiver turns as it moves; bearings need one orientation"
     return None
-
-
-def _residual_error(positions: np.ndarray, residual: np.ndarray) -> tuple[float, Kernel]:
-    """Leave-one-out mean square of images (n, H, W) under the kernel of largest likelihood, and that kernel.
-
-    Rasmussen and Williams (2006), eq. 5.12.
-    """
-    parts = components(residual, KERNEL_COMPONENTS)
-    kernel = choose_kernel(positions, parts.scores, len(parts.mean))
-    factor = cho_factor(kernel.gram(positions), lower=True)
-    inverse = cho_solve(factor, np.eye(len(positions)))
-    missed = (cho_solve(factor, parts.scores) / np.diag(inverse)[:, None]) ** 2
-    return float(missed.sum(1).mean()) / len(parts.mean) + parts.lost, kernel
 
 
 def _spread(count: int, limit: int) -> np.ndarray:

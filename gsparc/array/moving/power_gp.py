@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_solve, cholesky
+from scipy.linalg.lapack import dtrtri
 from torch import Tensor
 
 from gsparc.methods.gp import Kernel
@@ -36,44 +38,52 @@ class Trend:
     Attributes:
         sources: (K, 3) float32 [m].
         kernel: of the powers over the receivers' places.
-        level: (K,) mean powers.
-        weights: (n, K), one row per training receiver.
+        level: (K,) float32 mean powers.
+        weights: (n, K) float32, one row per training receiver.
     """
 
     sources: Tensor
     kernel: Kernel
-    level: np.ndarray
-    weights: np.ndarray
+    level: Tensor
+    weights: Tensor
 
-    def powers_at(self, places: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """Power (m, K) of every source at places (m, 3) [m]; `known` (n, 3) are the training places."""
-        return self.level + self.kernel.cross(places, known) @ self.weights
+    def powers(self, far: Tensor) -> Tensor:
+        """Power (m, K) of every source at places that are `far` (m, n) [m] from the training receivers."""
+        return torch.addmm(self.level, matern(far, self.kernel.length), self.weights)
 
     def state(self) -> dict[str, Any]:
         """Plain tensors and numbers."""
-        return {
-            "sources": self.sources,
-            "kernel": [*vars(self.kernel).values()],
-            "level": torch.from_numpy(self.level),
-            "weights": torch.from_numpy(self.weights),
-        }
+        return {**vars(self), "kernel": [*vars(self.kernel).values()]}
 
     @staticmethod
     def from_state(state: Mapping[str, Any]) -> Trend:
         """Inverse of `state`."""
         kernel = Kernel(*map(float, state["kernel"]))
-        return Trend(state["sources"], kernel, state["level"].numpy(), state["weights"].numpy())
+        return Trend(state["sources"], kernel, state["level"].float(), state["weights"].float())
+
+
+def matern(far: Tensor, length: float) -> Tensor:
+    """Matern-3/2 correlations of distances [m], as `gsparc.methods.gp.Kernel`."""
+    scaled = far * (math.sqrt(3) / length)
+    return (1 + scaled) * torch.exp(-scaled)
+
+
+def solved(kernel: Kernel, places: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out variances (n,).
+
+    Variances are over the kernel's amplitude; a left-out prediction is `values - weights * variance`
+    (Rasmussen and Williams 2006, eq. 5.12).
+    """
+    factor = cholesky(kernel.gram(places), lower=True)
+    spread = 1 / (dtrtri(factor, lower=1)[0] ** 2).sum(0)  # of the inverse's diagonal, without forming it
+    return cho_solve((factor, True), values), spread
 
 
 def fit_trend(
     sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
 ) -> tuple[Trend, np.ndarray]:
-    """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K).
-
-    Rasmussen and Williams (2006), eq. 5.12.
-    """
-    factor = cho_factor(kernel.gram(places), lower=True)
+    """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
-    weights = cho_solve(factor, power - level)
-    inverse = cho_solve(factor, np.eye(len(places)))
-    return Trend(sources, kernel, level, weights), power - weights / np.diag(inverse)[:, None]
+    weights, spread = solved(kernel, places, power - level)
+    trend = Trend(sources, kernel, torch.from_numpy(level).float(), torch.from_numpy(weights).float())
+    return trend, power - weights * spread[:, None]

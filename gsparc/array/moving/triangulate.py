@@ -116,7 +116,7 @@ def find_sources(
         new = _best(candidates, amplitude, receivers, rotation, grid, settings)
         if not len(new):
             break
-        found = torch.cat([found, new])
+        found = torch.cat([found, new[: settings.sources - len(found)]])
         residual = left(lags, receivers, found)
         before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before:

@@ -117,7 +117,7 @@ def test_the_variance_is_about_the_error(data, fold, fitted):
 def test_power_spectra_are_recognised(fold, tmp_path):
     method = MovingArrayField(search=dataclasses.replace(SEARCH, sources=9, steps=0), components=0)
     method.fit(room_of_spectra(scale="power"), fold, FitContext(tmp_path))
-    assert method.exponent == 1 and method.axes.shape[0] == 0
+    assert method.exponent == 1 and method.residual.axes.shape[0] == 0
 
 
 def test_unusable_data_are_refused(data, fold, tmp_path):
