@@ -58,10 +58,12 @@ class ConditionalField(nn.Module, ABC):
     `parameters()` are what gradient steps move; `condition` sets everything else.
 
     Attributes:
+        kind: the initialiser that makes it, see `gsparc.methods.registry.FIELDS`; none of composed ones.
         site: what the dataset declares; set where the field is made.
         rates: Adam's rate by the beginning of a parameter's name; what is not named has `RATE`.
     """
 
+    kind: ClassVar[str] = ""
     site: Site
     RATE: ClassVar[float] = 0.01  # of logarithms of lengths and variances
     rates: ClassVar[dict[str, float]] = {}
@@ -165,8 +167,8 @@ class StackedField(ConditionalField):
         return LeftOutRows(found[0].rows, mean, variance)
 
     def state(self) -> dict[str, Any]:
-        """States of all."""
-        return {"members": [member.state() for member in self._fields()], "weights": list(self.weights)}
+        """That of none: members are stored by their kinds."""
+        return {"weights": list(self.weights)}
 
 
 class CompletedField(ConditionalField):
@@ -212,8 +214,8 @@ class CompletedField(ConditionalField):
         return LeftOutRows(found.rows, found.mean + self.weight * more.mean, found.variance)
 
     def state(self) -> dict[str, Any]:
-        """States of both."""
-        return {"field": self.field.state(), "residual": self.residual.state(), "weight": self.weight}
+        """That of neither: parts are stored by their kinds."""
+        return {"weight": self.weight}
 
 
 def learns(field: nn.Module) -> bool:

@@ -47,17 +47,18 @@ def initialiser(name: str) -> Any:
     return get_class(INITIALISERS[name])()
 
 
-CONDITIONAL = "gsparc.multipath.initialise.{}", "gsparc.multipath.source_field.restored"
-FIELDS = {  # initialisers of fields whose weights are in closed form, and what reads them back
-    "sources": CONDITIONAL,
-    "rays": CONDITIONAL,
-    "diffuse": CONDITIONAL,
+FIELDS = {  # fields whose weights are in closed form: what makes them of measurements, and of a state
+    "sources": ("gsparc.multipath.initialise.sources", "gsparc.multipath.source_field.restored_sources"),
+    "rays": ("gsparc.multipath.initialise.rays", "gsparc.multipath.source_field.restored_rays"),
+    "diffuse": ("gsparc.multipath.initialise.diffuse", "gsparc.multipath.waves.field.restored"),
+    "powers": ("gsparc.multipath.initialise.powers", "gsparc.multipath.powers.field.restored"),
+    "bearings": ("gsparc.array.moving.initialise.bearings", "gsparc.array.moving.bearing_field.restored"),
 }
 
 
 def field_initialiser(name: str) -> Any:
     """The initialiser `(data, rows, init, clutter, context) -> (field, report)` called `name`."""
-    return get_method(FIELDS[name][0].format(name))
+    return get_method(FIELDS[name][0])
 
 
 def field_restored(name: str) -> Any:

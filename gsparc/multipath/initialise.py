@@ -13,10 +13,13 @@ from gsparc.data.splits import Fold
 from gsparc.field.conditional import CompletedField, ConditionalField, residuals
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport
-from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.multipath.source_field import DiffuseField, RayField, SourceField
+from gsparc.multipath.powers import field as power_field
+from gsparc.multipath.powers.field import PowerSettings
+from gsparc.multipath.source_field import RayField, SourceField
+from gsparc.multipath.waves import initial as waves
+from gsparc.multipath.waves.settings import ChannelSettings
 
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
@@ -46,10 +49,20 @@ def rays(
 def diffuse(
     data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
-    """No Gaussians: waves from everywhere."""
-    began, field = time.monotonic(), DiffuseField(ComplexGP())
+    """Leakage, a direct wave and waves from all around, without Gaussians."""
+    budget = context.time_budget()
+    field, notes = waves.initialise(data, rows, ChannelSettings(), context.seed, budget)
+    return field, FitReport(budget.counted.wall, notes, budget.limited_by)
+
+
+def powers(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """What the path loses in Gaussians, or coherent waves, and a process of the rest."""
+    budget = context.time_budget()
+    field, notes = power_field.initialise(data, rows, PowerSettings(), context.seed, budget)
     field.condition(data, rows)
-    return field, FitReport(time.monotonic() - began)
+    return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 
 
 def _completed(
@@ -60,8 +73,8 @@ def _completed(
         return field, report
     began = time.monotonic()
     left = field.left_out()
-    residual = DiffuseField(ComplexGP())
-    residual.condition(residuals(field, data), left.rows)
+    remainder = residuals(field, data)
+    residual, _ = waves.initialise(remainder, left.rows, ChannelSettings(direct=False, constant=False))
     missed = torch.from_numpy(data.target[left.rows]).flatten() - left.mean.flatten()
     predicted = residual.left_out().mean.flatten()
     overlap = float((predicted.conj() * missed).real.sum())

@@ -18,7 +18,6 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
 from gsparc.methods.method import FitContext
-from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.diffraction import subtract_edges
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import correlations
@@ -36,6 +35,7 @@ class SourceField(ConditionalField):
         method: fitted.
     """
 
+    kind = "sources"
     rates: ClassVar[dict[str, float]] = {"planes": 1e-4}  # [m] of a plane's offset, and of its unit normal
 
     def __init__(self, method: ImageSourceGP) -> None:
@@ -106,7 +106,7 @@ class SourceField(ConditionalField):
 
     def state(self) -> dict[str, Any]:
         """The method's."""
-        return {"kind": "sources", "method": self.method.state()}
+        return {"method": self.method.state()}
 
 
 class RayField(ConditionalField):
@@ -115,6 +115,8 @@ class RayField(ConditionalField):
     Args:
         method: fitted.
     """
+
+    kind = "rays"
 
     def __init__(self, method: DirectionalGP) -> None:
         super().__init__()
@@ -150,69 +152,21 @@ class RayField(ConditionalField):
 
     def state(self) -> dict[str, Any]:
         """The method's."""
-        return {"kind": "rays", "method": self.method.state()}
+        return {"method": self.method.state()}
 
 
-class DiffuseField(ConditionalField):
-    """Waves from all around, without Gaussians: the plain process.
-
-    Args:
-        method: fitted, or to be conditioned.
-    """
-
-    def __init__(self, method: ComplexGP) -> None:
-        super().__init__()
-        self.method = method
-
-    @property
-    def count(self) -> int:
-        """None."""
-        return 0
-
-    @property
-    def terms(self) -> tuple[str, ...]:
-        """The residual alone."""
-        return ("residual",)
-
-    def loss(self, batch: Batch) -> Tensor:
-        """Nothing is left to gradient steps."""
-        raise NotImplementedError
-
-    @torch.no_grad()
-    def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ConditionalField`."""
-        self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
-        self.rows, self.target = rows, torch.from_numpy(np.asarray(data.target[rows]))
-
-    @torch.no_grad()
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`."""
-        found = self.method.predict(tx, rx)
-        assert found.variance is not None and found.confidence is not None
-        return Posterior(found.mean, found.variance, None, 1 - found.confidence)
-
-    def left_out(self) -> LeftOutRows:
-        """See `ConditionalField`."""
-        left = self.method.leave_one_out()
-        mean = self.target - left.residual.reshape(self.target.shape).to(self.target.dtype)
-        return LeftOutRows(self.rows, mean, torch.full((len(self.rows),), float("nan")))
-
-    def state(self) -> dict[str, Any]:
-        """The method's."""
-        return {"kind": "diffuse", "method": self.method.state()}
-
-
-def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
+def restored_sources(site: Site, state: dict[str, Any]) -> SourceField:
     """The field whose `state()` this was."""
-    makers = {
-        "sources": (ImageSourceGP, SourceField),
-        "rays": (DirectionalGP, RayField),
-        "diffuse": (ComplexGP, DiffuseField),
-    }
-    make, wrap = makers[state["kind"]]
-    method = make()
+    method = ImageSourceGP()
     method.restore(site, state["method"])
-    return wrap(method)
+    return SourceField(method)
+
+
+def restored_rays(site: Site, state: dict[str, Any]) -> RayField:
+    """The field whose `state()` this was."""
+    method = DirectionalGP()
+    method.restore(site, state["method"])
+    return RayField(method)
 
 
 def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:

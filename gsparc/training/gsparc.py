@@ -353,7 +353,7 @@ class Gsparc(LearnedField):
             beside = {"name": method.name, "state": method.state(), "weight": weight}
         return {
             "inner": super().state() if self.field is None else None,
-            "field": None if self.field is None else self.field.state(),
+            "field": None if self.field is None else _stored(self.field),
             "beside": beside,
             "facts": {"explained": self.explained, "steps": self.steps, "init_s": self.init_s},
             "init": self.started,
@@ -426,6 +426,16 @@ class Summed(View):
         """See `Method.predict`."""
         found = self.inner.predict(tx, rx)
         return replace(found, mean=found.mean + self.weight * self.residual(tx, rx).mean)
+
+
+def _stored(field: ConditionalField) -> dict[str, Any]:
+    """What `restored` reads."""
+    if isinstance(field, StackedField):
+        return {"members": [_stored(member) for member in field.members], "weights": list(field.weights)}  # type: ignore[arg-type]
+    if isinstance(field, CompletedField):
+        parts = {"field": _stored(field.field), "residual": _stored(field.residual)}
+        return {**parts, "weight": field.weight}
+    return {"kind": field.kind, **field.state()}
 
 
 def restored(site: Site, state: dict[str, Any]) -> ConditionalField:

@@ -46,7 +46,9 @@ def test_opacity_scale_and_ids_are_as_asked(init, count):
     assert len(field) == count and field.ids.tolist() == list(range(count)) and int(field.next_id) == count
     assert torch.allclose(field.opacities, torch.full((count,), 0.2))
     assert torch.allclose(field.scales, torch.full((count, 3), 0.4))
-    assert initial_field(FieldSettings(count=count, placement=init), BOX, RECEIVER, TURN).scales.isfinite().all()
+    assert (
+        initial_field(FieldSettings(count=count, placement=init), BOX, RECEIVER, TURN).scales.isfinite().all()
+    )
 
 
 def test_a_flat_box_still_gives_positive_scales():

@@ -30,6 +30,7 @@ class BearingField(ConditionalField):
         rows: (n,) of the measurements it was fitted on, in its order; none where it was restored.
     """
 
+    kind = "bearings"
     rates: ClassVar[dict[str, float]] = {"places": 0.01}  # [m]
 
     def __init__(self, method: MovingArrayField, rows: np.ndarray) -> None:
@@ -97,7 +98,7 @@ class BearingField(ConditionalField):
     def state(self) -> dict[str, Any]:
         """The method's, and the places."""
         places = [place.detach() for place in self.places]
-        return {"kind": "bearings", "method": self.method.state(), "places": places}
+        return {"method": self.method.state(), "places": places}
 
 
 def restored(site: Site, state: dict[str, Any]) -> BearingField:

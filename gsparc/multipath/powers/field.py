@@ -85,6 +85,8 @@ class PowerField(ConditionalField):
         log_lengths, share_logit, log_noise, log_amplitude: of the process, see `Covariance`.
     """
 
+    kind = "powers"
+
     def __init__(
         self,
         site: Site,

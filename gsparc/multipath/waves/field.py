@@ -56,6 +56,8 @@ class ChannelField(ConditionalField):
         sources: (N, 3) [m], local.
     """
 
+    kind = "diffuse"
+
     def __init__(self, site: Site, shape: Shape, values: Values, channel: tuple[int, int]) -> None:
         super().__init__()
         self.site, self.shape, self.channel = site, shape, channel
