@@ -62,6 +62,7 @@ class BearingField(ConditionalField):
         that a source gains nothing from a place that explains this row only; they are constants here, as is
         the variance, the left-out mean square error of the sources' images.
         """
+        self._need_rows()
         where = batch.rx.position.reshape(-1, 3).expand(len(batch), 3)
         array, images = self.method.array(), []
         for sources, power in zip(self._sources(), self._powers(batch.index.numpy(), where), strict=True):
@@ -93,7 +94,15 @@ class BearingField(ConditionalField):
 
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`."""
+        self._need_rows()
         return self.method.left_out(self.rows)
+
+    def _need_rows(self) -> None:
+        """`ValueError` where a restored field was not conditioned again: left-out rows are not stored."""
+        if not len(self.rows):
+            raise ValueError(
+                "bearings: condition the field on rows first, a stored one has none to leave out"
+            )
 
     def state(self) -> dict[str, Any]:
         """The method's, and the places."""

@@ -139,11 +139,16 @@ def fit_error_model(
     residual = errors.numpy() - model.predict(standard)
     # the mean of a relative error is not the exponential of its logarithm's mean (Duan 1983)
     level = float(model.intercept_ + np.log(np.exp(residual).mean()))
-    near = rows[:, :NEIGHBOURS].contiguous()
     return ErrorModel(
-        near, _precision(kernel, known[near]), errors, centre, scale, torch.from_numpy(model.coef_).float(),
+        *neighbourhoods(kernel, places), errors, centre, scale, torch.from_numpy(model.coef_).float(),
         columns.amin(0), columns.amax(0), kernel, level, max(float(distance[:, 0].max()), 1e-6), reach, prior,
     )  # fmt: skip
+
+
+def neighbourhoods(kernel: Kernel, places: np.ndarray) -> tuple[Tensor, Tensor]:
+    """`near` and `precision` of an `ErrorModel` of rows at places (n, 3) [m]."""
+    rows = cKDTree(places).query(places, k=np.arange(1, min(NEIGHBOURS, len(places)) + 1))[1]
+    return torch.from_numpy(rows), _precision(kernel, torch.from_numpy(places[rows]))
 
 
 def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:

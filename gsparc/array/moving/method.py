@@ -18,7 +18,9 @@ import torch
 from torch import Tensor
 
 from gsparc.array.moving import reduce
+from gsparc.array.moving.checks import MAX_UNEXPLAINED, explains, site_problem, unexplained_energy
 from gsparc.array.moving.error_model import ErrorModel, fit_error_model, image_features
+from gsparc.array.moving.old_state import renewed
 from gsparc.array.moving.power_gp import Trend, TrendSettings, fit_trend
 from gsparc.array.moving.query import Array, Query
 from gsparc.array.moving.residual import Residual, fit_residual, left_out_error
@@ -38,7 +40,6 @@ from gsparc.physics.separable import Separable, separable
 
 log = logging.getLogger(__name__)
 
-MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
 UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
 MIN_GAIN = 0.005  # of the leave-one-out error: searches end when the last one gained less
 BUDGET_SHARE = 0.8  # of the budget, by which the last search must end
@@ -374,47 +375,21 @@ class MovingArrayField(Interpolator, PredictsVariance):
         }
 
     def _relearn(self, state: dict[str, Any]) -> None:
-        self._lags = self._query = None
+        self._lags = None
+        self._take(renewed(state, self.lags().image, self._images_of))
+
+    def _images_of(self, state: dict[str, Any]) -> Tensor:
+        """Answers at some training places of the field with this state."""
+        self._take(state)
+        where = torch.from_numpy(self.positions[_spread(len(self.positions), BLOCK)])
+        return self.query()(where).image.clamp_(0, 1)
+
+    def _take(self, state: dict[str, Any]) -> None:
+        self._query = None
         self.trends = [Trend.from_state(trend) for trend in state["trends"]]
         self.exponent, self.basis = int(state["exponent"]), Separable(**state["basis"])
         self.residual, self.positions = Residual.from_state(state["residual"]), state["positions"].numpy()
         self.error_model = ErrorModel.from_state(state["errors"])
-
-
-def explains(data: Measurements, rows: np.ndarray) -> tuple[bool, str]:
-    """Whether a moving array can have measured the spectra of rows (n,), and the measurement that decided."""
-    problem, site = site_problem(data), data.site
-    if problem is not None:
-        return False, problem
-    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
-    _, residual = unexplained_energy(Lags(*site.array_geometry()), images)
-    share = f"{residual:.1%} of the energy of {len(rows)} probed images"
-    return residual <= MAX_UNEXPLAINED, f"{share} is outside the moving array's lags"
-
-
-def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:
-    """Whether images (n, H, W) are amplitude (2) or power (1), and the share of energy outside the lags."""
-    residual = {}
-    for exponent in (2, 1):
-        power = images**exponent
-        again = space.spectrum(space.of(power))
-        residual[exponent] = float((again - power).square().sum() / power.square().sum().clamp_min(1e-12))
-    exponent = min(residual, key=lambda e: residual[e])
-    return exponent, residual[exponent]
-
-
-def site_problem(data: Measurements) -> str | None:
-    """Why sources cannot be triangulated from these measurements; None when they can."""
-    site = data.site
-    if site.kind != "spectrum":
-        return f"bearings need spectra, these are {site.kind}"
-    if site.static_end != "tx":
-        return "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
-    if site.array is None or site.grid is None or site.wavelength is None:
-        return "the dataset does not say which array (array_position) and carrier its spectra are of"
-    if not np.allclose(data.rx_rotation, data.rx_rotation[0], atol=1e-6):
-        return "the receiver turns as it moves; bearings need one orientation"
-    return None
 
 
 def _spread(count: int, limit: int) -> np.ndarray:

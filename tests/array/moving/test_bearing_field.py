@@ -8,8 +8,8 @@ import torch
 from boxes import room_of_spectra
 
 from gsparc.array.moving.bearing_field import BearingField, restored
+from gsparc.array.moving.checks import explains
 from gsparc.array.moving.initialise import bearings
-from gsparc.array.moving.method import explains
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext
 
@@ -138,6 +138,9 @@ def test_a_restored_field_answers_the_same(data, field, tmp_path):
         torch.testing.assert_close(value, theirs[name])
     torch.testing.assert_close(field.places[0], again.places[0])
     assert isinstance(again, BearingField)
+    for asked in (again.left_out, lambda: again.loss(batch)):
+        with pytest.raises(ValueError, match="condition the field"):
+            asked()
 
 
 def test_an_empty_set_of_rows_is_refused(data, field):
