@@ -48,7 +48,7 @@ from gsparc.ops import Pose
 
 QUERIES = 512  # at a time: memory
 SOUGHT_ON = 600  # rows: each look factors a matrix
-FOLDS = 3
+FOLDS = 5
 RIDGE_STEPS = 5  # of the variance of what is left
 LEAST = 40  # rows that were heard, for seeking Gaussians
 
@@ -377,7 +377,7 @@ def gain_of_groups(
     Both are found without the groups, on a part of many rows.
     """
     group = groups(rows.places)
-    with_them, plain, told = [], [], []
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for part in folds(group, FOLDS, seed):
         if budget and budget.over():
             return None
@@ -393,11 +393,11 @@ def gain_of_groups(
         if found is not None:
             process, _ = conditioned(known, found[0], found[1], seed)
         error = process.mean_and_variance(queries)[0] - measured
-        with_them, plain, told = [*with_them, error], [*plain, without], [*told, group[asked]]
-    if not told:
+        parts.append((error**2, without**2, group[asked]))
+    if not parts:
         return None
-    squares = (np.concatenate(part) ** 2 for part in (with_them, plain))
-    return compared(*squares, np.concatenate(told))
+    one, other, told = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return compared(one, other, told)
 
 
 def restored(site: Site, state: dict[str, Any]) -> PowerField:

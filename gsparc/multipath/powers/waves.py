@@ -72,7 +72,7 @@ def fit_waves(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generato
     A weight's prior is complex normal of variance 1.
     """
     count = columns.shape[1]
-    weights = (rng.standard_normal(count) + 1j * rng.standard_normal(count)) / math.sqrt(2)
+    weights: np.ndarray = rng.standard_normal((count, 2)) @ np.array([1, 1j]) / math.sqrt(2)
     weights /= math.sqrt(float((np.abs(columns @ weights) ** 2).mean()))
     scale, damping = SCALE_DB, 1e-2
     for hidden, steps in STAGES:
