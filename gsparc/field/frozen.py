@@ -70,7 +70,7 @@ class FrozenArray:
         _check_version(self.version, model)
         response = model.response
         assert isinstance(response, ArrayResponse)
-        if self.weights is None:
+        if self.weights is None or self.offset is None:
             emitted = torch.view_as_complex(model.features(tx, rx).contiguous())
             unknown = model.unknown(tx, rx)
             return Rendered(response.spectra(emitted @ self.view, unknown), None, unknown)

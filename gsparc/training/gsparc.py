@@ -29,10 +29,11 @@ from gsparc.ops import Pose
 from gsparc.training import weighing
 from gsparc.training.checkpoint_io import GsparcCheckpointIO
 from gsparc.training.fit import run_stage, total_steps
-from gsparc.training.keep_best import KeepBest
+from gsparc.training.keep_best import SHORT, KeepBest
 from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.splatting import QUERY_CHUNK, LearnedField
 from gsparc.training.terms import EffectSettings, Plan, plan
+from gsparc.training.time_budget import Pace
 
 log = logging.getLogger(__name__)
 
@@ -141,13 +142,12 @@ class Gsparc(LearnedField):
     def _fit_conditional(
         self, chosen: Plan, data: Measurements, fold: Fold, context: FitContext
     ) -> FitReport:
-        open_ended = any(part in OPEN_ENDED for part in chosen.parts)
-        if context.budget_s is None and open_ended:
+        if context.budget_s is None:
             context = replace(context, budget_s=DEFAULT_BUDGET_S)
         budget = context.time_budget()
         log.info(
-            "training a Gaussian field with closed-form weights: init=%s, %s", "+".join(chosen.parts),
-            "no end" if context.budget_s is None else f"{context.budget_s:g} s",
+            "training a Gaussian field with closed-form weights: init=%s, %g s", "+".join(chosen.parts),
+            context.budget_s,
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
         trials, limited = self._try(chosen.parts, data, fold, context, budget)
@@ -259,11 +259,14 @@ class Gsparc(LearnedField):
             )
             return 0
         folder = context.run_dir / "steps"
-        module = GaussianModule(field, self.loss, self.rates, total_steps(context), folder)
+        steps = total_steps(context) if self.most_steps is None else self.most_steps
+        pace = Pace(steps, budget.seconds - budget.spent)
+        module = GaussianModule(field, self.loss, self.rates, steps, folder, pace)
         files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
         inner = replace(context, run_dir=folder, resume=None)
         budget.pause()
-        ran = run_stage(module, data, fold, inner, files, budget, [KeepBest()], VALIDATE_EVERY)
+        ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
+        budget.go()
         return ran.steps
 
     # -- answering ---------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 import torch
 from known_arrays import array_site, measure, room_vectors, spectra, walk
 
-from gsparc.array import vector_cache
+from gsparc.array import splat_init, vector_cache
 from gsparc.array.method import ArrayField
 from gsparc.array.phase_retrieval import recover
 from gsparc.array.vector_gp import align, mirror_elements, twin
@@ -74,6 +74,7 @@ def test_rows_that_seconds_gave_up_are_known_also_from_the_cache(known_campaign,
     for cache in (tmp_path, tmp_path):
         found, _ = vector_cache.recovered(spoilt, np.arange(8), cache)
         assert np.flatnonzero(found.time_limited).tolist() == [5]
+    monkeypatch.setattr(splat_init, "platform_cache", lambda: None)
     fold = Fold(np.arange(30), np.arange(0), np.arange(30, 40))
     for measured, clock in ((spoilt, "processor"), (data, None)):
         assert ArrayField().fit(measured, fold, FitContext(tmp_path)).limited_by == clock
