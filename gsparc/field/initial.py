@@ -32,7 +32,8 @@ class InitSettings(Checked):
         name: `sphere` around a static receiver and `uniform` in the scene box with random weights; `images`,
             the sphere with weights fitted to spectra; `vectors`, the same through an array whose phases are
             retrieved; `sources`, image sources searched for; `rays`, where measured directions meet;
-            `bearings`, where those of a moving array cross; `scene`, mirror images in known walls.
+            `bearings`, where those of a moving array cross; `scene`, mirror images in known walls; `diffuse`,
+            nowhere: the residual alone.
         file: of the walls, for `scene`.
         searches: of sources: how many, with different seeds; all are kept and averaged.
         search_rows, rows: receivers times tones of a search, and of the final weights.

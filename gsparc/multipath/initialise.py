@@ -60,7 +60,9 @@ def powers(
 ) -> tuple[ConditionalField, FitReport]:
     """What the path loses in Gaussians, or coherent waves, and a process of the rest."""
     budget = context.time_budget()
-    field, notes = power_field.initialise(data, rows, PowerSettings(), context.seed, budget)
+    none = init.name == "diffuse"
+    settings = PowerSettings(most=0, fringes=False) if none else PowerSettings()
+    field, notes = power_field.initialise(data, rows, settings, context.seed, budget)
     field.condition(data, rows)
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 

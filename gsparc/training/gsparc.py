@@ -95,7 +95,8 @@ class Gsparc(LearnedField):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the terms, initialise, weigh, take the steps that pay."""
         self.site, self.field, self._beside = data.site, None, None
-        self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden)
+        count = self.settings.field.count
+        self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden, count)
         for reason in self.plan.reasons:
             log.info("%s", reason)
         if self.plan.rasterized:
@@ -175,7 +176,8 @@ class Gsparc(LearnedField):
         self, part: str, data: Measurements, rows: np.ndarray, context: FitContext
     ) -> tuple[ConditionalField, FitReport]:
         clutter = self.switches.visibility is not False
-        field, report = field_initialiser(part)(data, rows, self.init, clutter, context)
+        init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
+        field, report = field_initialiser(part)(data, rows, init, clutter, context)
         if self.switches.residual is False and isinstance(field, CompletedField):
             field = field.field
         return field, report

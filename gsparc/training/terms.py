@@ -55,7 +55,9 @@ class Plan:
     reasons: tuple[str, ...] = field(default=())
 
 
-def plan(switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int) -> Plan:
+def plan(
+    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int = 1
+) -> Plan:
     """The terms for these measurements.
 
     Args:
@@ -63,6 +65,7 @@ def plan(switches: EffectSettings, init: InitSettings, data: Measurements, hidde
         init: as configured.
         data: measurements; targets are not looked at.
         hidden: units of the emission's networks: a network is trained by rendering.
+        count: of Gaussians to start from; 0 is the residual alone.
 
     Raises:
         ValueError: a term that is asked for means nothing here.
@@ -84,29 +87,20 @@ def plan(switches: EffectSettings, init: InitSettings, data: Measurements, hidde
             raise ValueError(f"model.effects.{name}=true is not possible: {obstacle}")
         on[name] = switch is not False and obstacle is None
         if obstacle is None:
-            reasons.append(
-                f"effects.{name} -> {'on' if on[name] else 'off'}"
-                + (": as configured" if switch != "auto" else "")
-            )
+            said = "" if switch == "auto" else ": as configured"
+            reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{said}")
     if on["power"]:
         return Plan(False, parts=("powers",), reasons=tuple(reasons))
     if on["moving_array"]:
         return Plan(False, parts=("bearings",), plain=plain, reasons=tuple(reasons))
-    if on["phase"]:
-        named = init.name if init.name != "auto" else None
-        parts = (named,) if named else ("sources", "rays") if data.directions is not None else ("sources",)
-        parts = tuple(str(part) for part in parts)
+    if on["phase"] and (count or not plain):
+        searched = ("sources", "rays") if data.directions is not None else ("sources",)
+        parts = searched if init.name == "auto" else (str(init.name),)
         return Plan(False, parts=parts + (("diffuse",) if plain else ()), reasons=tuple(reasons))
-    if (
-        site.kind == "csi"
-        and plain
-        and site.wavelength is not None
-        and drawn is None
-        and switches.image is not True
-    ):
-        reasons.append(
-            f"effects.phase -> off: {obstacles['phase'] or 'as configured'}; the residual is all there is"
-        )
+    rendered = drawn is not None or switches.image is True
+    if site.kind == "csi" and plain and site.wavelength is not None and not rendered:
+        why = obstacles["phase"] or ("no Gaussians are asked for" if on["phase"] else "no phase is asked for")
+        reasons.append(f"the residual is all there is: {why}")
         return Plan(False, parts=("diffuse",), reasons=tuple(reasons))
     return Plan(True, array=on["array"], plain=plain, reasons=tuple(reasons))
 
