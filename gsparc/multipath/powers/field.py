@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, choice, setting, switch, whole
+from gsparc.data.limits import Checked, choice, number, setting, switch, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
@@ -61,11 +61,13 @@ class PowerSettings(Checked):
         most: Gaussians; 0 leaves the plain process.
         mean: of the plain process: `constant`, `distance`, or `auto`, the likelier.
         fringes: whether coherent waves are sought where neighbours are closer than half a wavelength.
+        sure: standard errors that the gain of Gaussians at groups of places left out must exceed.
     """
 
     most: int = setting(12, whole(0))
     mean: MeanName = setting("auto", choice(*MEANS))
     fringes: bool = setting(True, switch())
+    sure: float = setting(1.0, number(0))
 
 
 class PowerField(ConditionalField):
@@ -341,7 +343,7 @@ def initialise(
     before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
     said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
     said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
-    if not gain.pays:
+    if not gain.exceeds(settings.sure):
         return bare, (*notes, f"no Gaussians; {said}")
     trend, kernel, more = found
     assert trend.blockers is not None

@@ -200,9 +200,9 @@ def find_fringes(
         powers, blind = level + decibels_of(columns @ np.stack(weights, 1)), np.arange(len(weights)) % FOLDS
         blend, gain = _blend(rows, group, fold, powers, blind, process)
         fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
-        if len(weights) >= TRIED and not gain.pays:
+        if len(weights) >= TRIED and not gain.exceeds(0.0):
             break
-    if fringes is None or gain is None or not gain.pays:
+    if fringes is None or gain is None or not gain.exceeds(0.0):
         return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better"
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
     said = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"

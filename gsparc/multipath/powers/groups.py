@@ -24,10 +24,9 @@ class Gain:
     error: float
     others: float
 
-    @property
-    def pays(self) -> bool:
-        """Whether there is one."""
-        return self.squares > 0
+    def exceeds(self, errors: float) -> bool:
+        """Whether it is more than so many standard errors."""
+        return self.squares > errors * self.error
 
 
 def groups(places: np.ndarray, sides: int = SIDES) -> np.ndarray:

@@ -26,8 +26,8 @@ def test_one_place_is_one_fold():
 def test_a_gain_counts_groups_not_rows():
     one, other = np.ones(400), np.full(400, 2.0)
     group = np.repeat(np.arange(4), 100)
-    assert compared(one**2, other**2, group).pays
+    assert compared(one**2, other**2, group).exceeds(2.0)
     other[group > 0] = 0.9  # one group gains, three lose
     gain = compared(one**2, other**2, group)
     assert gain.squares == pytest.approx((3.0 + 3 * (0.81 - 1)) / 4)
-    assert gain.pays and gain.error > gain.squares
+    assert gain.exceeds(0.0) and not gain.exceeds(1.0)
