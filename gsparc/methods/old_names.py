@@ -43,8 +43,9 @@ OLD_KEYS = {"furniture": "clutter"}  # settings of models
 FIELD = "gsparc.training.gsparc.Gsparc"
 CHOSEN = (  # settings of the models that it chose among
     *("phase_model", "phase_probe", "array_model", "moving_array_model", "directional_model"),
-    *("bearing_model", "directed_model"),
+    *("bearing_model", "directed_model", "warm_start"),
 )
+EFFECTS = "gsparc.training.terms.EffectSettings"
 GONE = {  # arguments that a class of that path no longer takes
     "gsparc.array.method.ArrayField": ("packets", "rows", "cache", "seed"),
 }
@@ -55,7 +56,7 @@ def renamed(node: Any) -> Any:
     if isinstance(node, dict):
         now = {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
         target = now.get("_target_")
-        if target == FIELD and "phase_model" in now:
+        if target == FIELD and "warm_start" in now:
             return _one_field(now)
         gone = GONE.get(target, ()) if isinstance(target, str) else ()
         return {key: value for key, value in now.items() if key not in gone}
@@ -67,6 +68,9 @@ def renamed(node: Any) -> Any:
 def _one_field(node: dict[str, Any]) -> dict[str, Any]:
     """Settings of `model=gsparc` from when it chose among other methods: those of its own field."""
     found = {key: value for key, value in node.items() if key not in CHOSEN}
-    array = found["effects"].get("array") == "splat"
-    found["effects"] = {"_target_": found["effects"]["_target_"], "array": array}
+    effects = found.get("effects") or {}
+    found["effects"] = {"_target_": EFFECTS, "array": effects.get("array") == "splat"}
+    for part, gone in (("field", "init"), ("response", "carrier")):
+        if isinstance(found.get(part), dict):
+            found[part] = {key: value for key, value in found[part].items() if key != gone}
     return found

@@ -360,7 +360,7 @@ class Gsparc(LearnedField):
             "inner": super().state() if self.field is None else None,
             "field": None if self.field is None else _stored(self.field),
             "beside": beside,
-            "facts": {"explained": self.explained, "steps": self.steps, "init_s": self.init_s},
+            "facts": {"explained": self.explained, "steps": self.steps},
             "init": self.started,
             "array": self.settings.response.array,
         }
@@ -371,10 +371,7 @@ class Gsparc(LearnedField):
         Raises:
             ValueError: an earlier version's, in which another method had been chosen.
         """
-        if state.get("chosen") is not None:
-            raise ValueError(
-                f"model=gsparc of an earlier version, which had chosen {state['chosen']} here; train again"
-            )
+        state = _as_today(state)
         self.site, self.field, self._beside = site, None, None
         response = replace(
             self.settings.response, array=bool(state.get("array", self.switches.array is True))
@@ -390,7 +387,7 @@ class Gsparc(LearnedField):
             self._beside = method, float(state["beside"]["weight"])
         facts = state.get("facts", {})
         self.explained, self.steps = facts.get("explained"), int(facts.get("steps", 0))
-        self.init_s, self.started = float(facts.get("init_s", 0.0)), str(state.get("init", ""))
+        self.started = str(state.get("init", ""))
 
     def size(self) -> int:
         """Number of Gaussians."""
@@ -431,6 +428,28 @@ class Summed(View):
         """See `Method.predict`."""
         found = self.inner.predict(tx, rx)
         return replace(found, mean=found.mean + self.weight * self.residual(tx, rx).mean)
+
+
+def _as_today(state: dict[str, Any]) -> dict[str, Any]:
+    """A state of today's keys, of one from when `model=gsparc` chose among other methods.
+
+    Raises:
+        ValueError: it had chosen what is no longer there.
+    """
+    if "chosen" not in state:
+        return state
+    chosen = {"bearings": "moving_array"}.get(state["chosen"], state["chosen"])
+    if chosen == "array":
+        raise ValueError("it is made of wave packets, as earlier versions were; train it again")
+    if state.get("rest") is not None:
+        raise ValueError("it has a companion of an earlier version; train it again")
+    if chosen is None:
+        stored = state["inner"]["model"]
+        if "response.steering" in stored and "response.delays" not in stored:
+            raise ValueError("its carrier phase is of splatted Gaussians, as in earlier versions; train anew")
+        return {"inner": state["inner"], "init": state["inner"]["choices"]["init"]}
+    kind = {"phase": "sources", "directions": "rays", "moving_array": "bearings"}[chosen]
+    return {"inner": None, "field": {"kind": kind, "method": state["inner"]}, "init": kind}
 
 
 def _stored(field: ConditionalField) -> dict[str, Any]:

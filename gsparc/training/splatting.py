@@ -97,7 +97,8 @@ class LearnedField(Method):
         self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
         self._prior: Prior | None = None
         self._paying: int | None = None  # position in the schedule after which steps did not pay
-        self.steps, self.init_s = 0, 0.0  # gradient steps of the last stage, seconds of all initialisers
+        self.steps = 0  # of gradient, of the last stage
+        self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
         self._left_out: Any = None  # of the initialiser; not stored
@@ -190,7 +191,7 @@ class LearnedField(Method):
             self.fitted().confidence = confidence.requires_grad_(False)
         budget.pause()
         prepared = (budget.counted - started).wall
-        self.init_s += prepared
+        self.init_s = (self.init_s or 0.0) + prepared
         if stage == "train" and self._solved(fold):
             return prepared
         steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None

@@ -39,7 +39,7 @@ def test_pruning_stops_at_the_floor(tmp_path):
 @pytest.mark.parametrize("maker", [spectra, channels, powers])
 def test_no_gaussians_at_all(tmp_path, maker):
     file = maker(tmp_path / "own.npz")
-    settings = brief(file, "init=sphere", "model.field.count=0", "callbacks=densify")
+    settings = brief(file, "init=uniform", "model.field.count=0", "callbacks=densify")
     facts, _ = train(compose(*settings), tmp_path / "run")
     assert facts["model/num_gaussians"] == 0
     assert facts["test/nmse"] == pytest.approx(1.0)  # silence

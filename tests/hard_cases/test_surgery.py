@@ -90,7 +90,7 @@ EDIT = st.fixed_dictionaries(
 def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
     model, trainer = fresh(count)
     optimizer = trainer.optimizers[0]
-    module = SimpleNamespace(model=model, total_steps=99)
+    module = SimpleNamespace(model=model, total_steps=99, conditional=False)
     draw = torch.Generator().manual_seed(seed)
     ever = set(model.gaussians.ids.tolist())
     for number, edit in enumerate(edits, start=1):

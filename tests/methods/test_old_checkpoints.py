@@ -22,8 +22,15 @@ FIXTURES = HERE / "old_checkpoints"
 NAMES = sorted(path.stem for path in FIXTURES.glob("*.ckpt"))
 KINDS = ("learned", "expected", "distance", "gp_variance")  # of confidence
 PACKETS = ["array", "gsparc_array", "gsparc_array_beside", "traded_array"]  # made of wave packets
-READ = [name for name in NAMES if name not in PACKETS]
+COMPANIONS = ["gsparc_phase_rest", "gsparc_phase_told", "gsparc_phase_told_rest", "traded_phase_rest"]
+GONE = {
+    **dict.fromkeys(PACKETS, "it is made of wave packets, as earlier versions were; train"),
+    **dict.fromkeys(COMPANIONS, "it has a companion of an earlier version; train"),
+    "gsparc_splat_phase": "its carrier phase is of splatted Gaussians, as in earlier versions; train",
+}
+READ = [name for name in NAMES if name not in GONE]
 RTOL, ATOL = 2e-4, 1e-5  # the second in units of the largest value
+APPROXIMATE = 2e-3  # RTOL of what is answered from images of low rank since
 
 
 @pytest.fixture(autouse=True)
@@ -51,19 +58,26 @@ def holding(part: str) -> list[str]:
     return [name for name in READ if part in everything()[name]]
 
 
-def check_equal(found: Any, expected: np.ndarray, what: str) -> None:
+def close_to(name: str) -> float:
+    return APPROXIMATE if "bearings" in name else RTOL
+
+
+def check_equal(found: Any, expected: np.ndarray, what: str, rtol: float = RTOL) -> None:
     found = found.detach().numpy() if isinstance(found, torch.Tensor) else np.asarray(found)
     assert found.shape == expected.shape and found.dtype == expected.dtype, what
     scale = float(np.abs(expected).max()) if expected.size else 0.0
-    np.testing.assert_allclose(found, expected, rtol=RTOL, atol=ATOL * max(scale, 1e-30), err_msg=what)
+    least = ATOL * rtol / RTOL * max(scale, 1e-30)
+    np.testing.assert_allclose(found, expected, rtol=rtol, atol=least, err_msg=what)
 
 
-def check_prediction(prediction: Any, known: dict[str, np.ndarray], prefix: str = "") -> None:
+def check_prediction(
+    prediction: Any, known: dict[str, np.ndarray], prefix: str = "", rtol: float = RTOL
+) -> None:
     for part in ("mean", "confidence", "variance"):
         value = getattr(prediction, part)
         assert (value is None) == (prefix + part not in known), prefix + part
         if value is not None:
-            check_equal(value, known[prefix + part], prefix + part)
+            check_equal(value, known[prefix + part], prefix + part, rtol)
 
 
 def question_of(known: dict[str, np.ndarray]) -> Batch:
@@ -90,9 +104,9 @@ def test_nothing_is_missing():
     assert sorted(everything()) == NAMES and len(NAMES) > 40
 
 
-@pytest.mark.parametrize("name", PACKETS)
-def test_wave_packets_are_refused_in_one_line(name):
-    with pytest.raises(CheckpointError, match="it is made of wave packets, as earlier versions were; train"):
+@pytest.mark.parametrize("name", GONE)
+def test_what_is_gone_is_refused_in_one_line(name):
+    with pytest.raises(CheckpointError, match=GONE[name]):
         load(FIXTURES / f"{name}.ckpt")
 
 
@@ -102,9 +116,9 @@ def test_predictions_are_the_same(name):
     method, _ = load(FIXTURES / f"{name}.ckpt")
     batch = question_of(known)
     with torch.no_grad():
-        check_prediction(method.answer(batch), known)
+        check_prediction(method.answer(batch), known, rtol=close_to(name))
         if "uplink" not in known:
-            check_prediction(method.predict(batch.tx, batch.rx), known)
+            check_prediction(method.predict(batch.tx, batch.rx), known, rtol=close_to(name))
 
 
 @pytest.mark.parametrize("name", sorted({*holding("asked_at"), *holding("asked")}))
@@ -114,9 +128,11 @@ def test_predictions_in_world_coordinates_are_the_same(name):
     predictor = gsparc.load(FIXTURES / f"{name}.ckpt")
     question = in_the_world(predictor, known)
     expected = known.get("asked", known["mean"] * np.float32(predictor.site.target_scale))
-    check_equal(getattr(predictor, predictor.site.kind)(**question), expected, "asked")
+    check_equal(getattr(predictor, predictor.site.kind)(**question), expected, "asked", close_to(name))
     if "confidence" in known:
-        check_equal(predictor.confidence(**question), known.get("sure", known["confidence"]), "sure")
+        check_equal(
+            predictor.confidence(**question), known.get("sure", known["confidence"]), "sure", close_to(name)
+        )
 
 
 @pytest.mark.parametrize("name", holding("paths_gain"))
@@ -168,7 +184,7 @@ def test_reduced_models_predict_the_same(name):
     for number, point in enumerate(points):
         if point.settings:
             view = reduced(method, point.settings, measured)
-            check_prediction(view.predict(batch.tx, batch.rx), known, f"point{number}/")
+            check_prediction(view.predict(batch.tx, batch.rx), known, f"point{number}/", close_to(name))
             reductions += 1
     assert (
         reductions == len([part for part in known if part.endswith("/mean") and part.startswith("point")]) > 0

@@ -45,7 +45,7 @@ DECLARED = {
 }
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
 SMOOTH = {
-    "gsparc": ["gsparc_field", "gsparc_splat_phase"],
+    "gsparc": ["gsparc_field"],
     "gp": ["gp", "gp_power_process"],
     "array": ["traded_array_field"],
 }

@@ -12,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 
 from gsparc.commands.study.command import study_of, task
 
-PLAIN = "{effects: {phase: false, array: false}, field: {count: 20}}"
+PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
 LINES = {
     "effects": (["base=plain"], ["none"], "study/plain/psnr_db"),
     "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train"], "study/mean/query/0.1/psnr_db"),
@@ -45,6 +45,6 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
 def test_each_kind_has_its_variants_and_baselines():
     effects, positions, measured = (study_of(compose(f"kind={kind}", config="study")) for kind in LINES)
     names = [variant.name for variant in effects.variants]
-    assert names[0] == effects.base == "plain" and {"array", "phase", "directions", "gp"} <= set(names)
+    assert names[0] == effects.base == "plain" and {"array", "phase", "power", "gp"} <= set(names)
     assert [v.name for v in positions.variants] == [v.name for v in measured.variants]
     assert len(positions.conditions) == 13 and len(measured.conditions) == 4 and measured.rounds == 3

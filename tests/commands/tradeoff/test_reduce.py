@@ -220,15 +220,17 @@ def test_channels_keep_the_strongest_and_spare_directions(tmp_path):
     assert away(method, reduced.reduced(method, {"stride": 2}, measured), data, fold.test) < 0.2
 
 
-def test_what_a_hybrid_adds_stays_unless_it_is_spared(field):
+def test_what_a_process_beside_adds_stays_unless_it_is_spared(field):
     data, fold = field.data, field.split.folds[0]
     method = copy.copy(field.methods[0])
     measured = reduced.contributions(method, data, fold.train)
     assert "hybrid" not in reduced.knobs(method)
-    method._companion = SimpleNamespace(completed=lambda mean, tx, rx: mean + 1.0)
+    mean = answer(method, data, fold.test).mean
+    beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(mean)))
+    method._beside = (beside, 0.25)
     assert "hybrid" in reduced.knobs(method)
     plain, added = (
         answer(reduced.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
         for on in (False, True)
     )
-    assert torch.equal(plain + 1, added)
+    assert torch.allclose(0.75 * plain + 0.25, added)
