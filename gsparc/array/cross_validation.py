@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
 from gsparc.array.vector_gp import Kernel, align, refine_alignment
-from gsparc.field.confidence import LEAST_UNKNOWN
+from gsparc.field.confidence import fit_errors
 from gsparc.methods.gp import choose_kernel
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
@@ -111,17 +111,9 @@ class Tuned:
     def error_model(self) -> tuple[float, float]:
         """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
 
-        The likeliest for errors that are exponential about it, so that their mean is right at every level: a
-        line through logarithms would fit the many small errors and miss the few large ones.
+        See `fit_errors`.
         """
-        x, y = np.log(self.unknown + LEAST_UNKNOWN), self.error + 1e-9
-
-        def deviance(parameters: np.ndarray) -> float:
-            level = parameters[0] + np.clip(parameters[1], 0.0, 2.0) * x
-            return float((y * np.exp(-level) + level).mean())
-
-        found = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
-        return float(np.exp(found[0])), float(np.clip(found[1], 0.0, 2.0))
+        return fit_errors(self.unknown, self.error)
 
 
 def tune(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 import torch
+from scipy.optimize import minimize
 from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, number, setting, whole
@@ -67,6 +69,22 @@ class ErrorModel(nn.Module):
     def set_extra_state(self, state: dict[str, float]) -> None:
         """From `state_dict`."""
         self.far, self.power = float(state["far"]), float(state["power"])
+
+
+def fit_errors(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+    """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
+
+    The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
+    line through logarithms would fit the many small errors and miss the few large ones.
+    """
+    x, y = np.log(unknown + LEAST_UNKNOWN), error + 1e-9
+
+    def deviance(parameters: np.ndarray) -> float:
+        level = parameters[0] + np.clip(parameters[1], 0.0, 2.0) * x
+        return float((y * np.exp(-level) + level).mean())
+
+    found = minimize(deviance, np.array([np.log(y.mean()), 0.5]), method="Nelder-Mead").x
+    return float(np.exp(found[0])), float(np.clip(found[1], 0.0, 2.0))
 
 
 class Confidence(nn.Module):

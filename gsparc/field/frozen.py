@@ -42,7 +42,8 @@ class FrozenView:
             StalePlan: the field has changed since.
         """
         _check_version(self.version, model)
-        return Rendered(self.plan.compose(self.visible.features(tx, rx)).squeeze(1), None)
+        image = self.plan.compose(self.visible.features(tx, rx)).squeeze(1)
+        return Rendered(image, None, self.visible.unknown(tx, rx))
 
 
 @dataclass(frozen=True)

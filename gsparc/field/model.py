@@ -167,8 +167,8 @@ class GaussianModel(nn.Module):
 
     @property
     def tells_unknown(self) -> bool:
-        """Whether the emission's features tell what training positions leave unknown, and spectra show it."""
-        return self.settings.response.array and self.emission.encoding.tells_share
+        """Whether the emission's features tell what training positions leave unknown."""
+        return self.site.kind == "spectrum" and self.emission.encoding.tells_share
 
     @torch.autocast("cpu", enabled=False)
     def unknown(self, tx: Tensor, rx: Pose) -> Tensor | None:

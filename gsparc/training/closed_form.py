@@ -8,46 +8,104 @@ is not the one of least norm).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.field.confidence import fit_errors
 from gsparc.field.encoding import Prior
+from gsparc.field.kernels import Whitened, whitened
 from gsparc.field.model import GaussianModel
-from gsparc.methods.gp import choose_kernel, principal_components
-from gsparc.methods.target_rows import training_targets
+from gsparc.methods.gp import Kernel, choose_kernel, principal_components
+from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 
 IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
 CHUNK = 256  # images held as floats at a time
 KERNEL_ROWS = 1024  # leave-one-out factors a matrix of this size at every look
 COMPONENTS = 128
+LEAST_NOISE = 1e-6  # of the kernel's variance
 
 
 def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Prior:
     """Smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
     generator = np.random.default_rng(seed)
     chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
+    kernel = _kernel(data, chosen)
+    return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process of position, conditioned on training rows.
+
+    Attributes:
+        prior: of the emission's encoding.
+        features: with what maps values at the rows to weights.
+    """
+
+    prior: Prior
+    features: Whitened
+
+
+def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Process:
+    """Of training rows (n,), at up to `anchors` places."""
+    generator = np.random.default_rng(seed)
+    chosen = rows if len(rows) <= anchors else np.sort(generator.choice(rows, anchors, replace=False))
+    kernel = _kernel(data, chosen)
+    noise = max(kernel.noise, LEAST_NOISE)
+    places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
+    features = whitened(places, kernel.length, noise, "matern32", anchors)
+    prior = Prior(features.places.float(), kernel.length, noise, "matern32", features.whitening.float())
+    return Process(prior, features)
+
+
+def _kernel(data: Measurements, chosen: np.ndarray) -> Kernel:
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
     parts = principal_components(training_targets(data, looked_at), data.site.kind, COMPONENTS)
-    kernel = choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
-    return Prior(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
+    return choose_kernel(data.moving[looked_at], parts.scores, len(parts.mean))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Training images as emissions of fixed footprints.
+
+    Attributes:
+        weights: (P, N), pixels by Gaussians.
+        images: (n, P), the targets.
+        outputs: (n, N) float64, of the emission's read-out.
+        attenuation: (n, N), or None.
+    """
+
+    weights: Tensor
+    images: Tensor
+    outputs: Tensor
+    attenuation: Tensor | None
+
+    def rendered(self, outputs: Tensor) -> Tensor:
+        """Images (n, P) of other outputs (n, N) at the same places."""
+        emission = outputs.float()
+        return (emission if self.attenuation is None else emission * self.attenuation) @ self.weights.mT
 
 
 @torch.no_grad()
 @torch.autocast("cpu", enabled=False)  # a Gram matrix rounded to half precision has no Cholesky factor
 def warm_start(
-    model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, noise: float
+    model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, process: Process
 ) -> None:
     """Set the emission's last layer so that the model reproduces the training spectra as well as it can.
 
+    What the process leaves unknown becomes the model's error model.
+
     Args:
-        model: spectra, a static receiver, a linear read-out (`emission.hidden=0`).
+        model: spectra, a static receiver, a linear read-out (`emission.hidden=0`) of the process's features.
         data: all measurements.
         rows: (n,) training rows.
         receiver: the static pose.
-        noise: ridge of the regression over position, relative to the unit variance of the kernel.
+        process: of these rows.
 
     Raises:
         ValueError: the emission has hidden units.
@@ -56,30 +114,43 @@ def warm_start(
         raise ValueError("init=images solves a linear read-out: set model.emission.hidden=0")
     version = int(model.gaussians.version)
     weights = model.freeze(receiver).render(torch.eye(len(model.gaussians)), version).flatten(1).mT
-    gram = weights.mT @ weights
-    ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
-    factor = torch.linalg.cholesky(gram + ridge)
-    logits, encoded = [], []
-    targets = training_targets(data, rows)  # holes are filled
-    for start in range(0, len(rows), CHUNK):
-        batch = data.batch(rows[start : start + CHUNK])
-        images = torch.from_numpy(targets[start : start + CHUNK]).flatten(1)
-        images = images.float() / 255 if images.dtype == torch.uint8 else images.float()
-        emission = torch.cholesky_solve(weights.mT @ images.mT, factor).mT
-        distance = model.distances(batch.tx)
-        attenuation = model.attenuation(distance)
-        emission = emission if attenuation is None else emission / attenuation
-        logits.append(model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1))
-        encoded.append(model.emission.encoding(model.site.moving(batch.tx, batch.rx)))
-    outputs, features = torch.cat(logits).double(), torch.cat(encoded).double()
+    parts = [_seen(model, data, part, weights) for part in np.array_split(rows, -(-len(rows) // CHUNK))]
+    outputs = torch.cat([part.outputs for part in parts])
     mean = outputs.mean(0)
-    readout = _ridge(features, outputs - mean, noise)
+    readout = process.features.weigh @ (outputs - mean)
     model.emission.weight2.copy_(readout.mT.unsqueeze(-1).float())
     model.emission.bias2.copy_(mean.unsqueeze(-1).float())
+    if model.error is not None:
+        model.error.set(*_errors(parts[0], process, rows[: len(parts[0].outputs)], data, mean))
 
 
-def _ridge(features: Tensor, targets: Tensor, noise: float) -> Tensor:
-    """(features' features + noise)^-1 features' targets: (n, M), (n, N) -> (M, N)."""
-    gram = features.mT @ features
-    gram.diagonal().add_(max(noise, 1e-6))
-    return torch.cholesky_solve(features.mT @ targets, torch.linalg.cholesky(gram))
+def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> Seen:
+    """Emissions (least squares) that show the images of rows (n,)."""
+    gram = weights.mT @ weights
+    ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
+    batch = data.batch(rows)
+    images = torch.from_numpy(to_real(training_targets(data, rows), "spectrum")).flatten(1)  # holes filled
+    emission = torch.linalg.solve(gram + ridge, weights.mT @ images.mT).mT
+    distance = model.distances(batch.tx)
+    attenuation = model.attenuation(distance)
+    emission = emission if attenuation is None else emission / attenuation
+    outputs = model.emission.inverse(emission.unsqueeze(-1), distance).squeeze(-1)
+    return Seen(weights, images, outputs.double(), attenuation)
+
+
+def _errors(
+    seen: Seen, process: Process, rows: np.ndarray, data: Measurements, mean: Tensor
+) -> tuple[float, float]:
+    """Level and power of the `ErrorModel`: errors of rows (n,) left out one by one, and of the mean alone.
+
+    Rasmussen and Williams (2006), eq. 5.12.
+    """
+    places = torch.from_numpy(data.moving[rows]).float().double()
+    alone = whitened(places, process.prior.length, process.prior.noise, "matern32", len(rows))
+    inverse = alone.weigh.mT @ alone.weigh
+    diagonal = inverse.diagonal()
+    left_out = seen.outputs - inverse @ (seen.outputs - mean) / diagonal[:, None]
+    unknown = (1 / diagonal - process.prior.noise).clamp(0, 1)
+    shown = [seen.rendered(left_out), seen.rendered(mean.expand_as(seen.outputs))]
+    error = torch.cat([(image - seen.images).square().mean(1) for image in shown])
+    return fit_errors(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())

@@ -6,7 +6,7 @@ from functools import partial
 
 from gsparc.field.initial import InitTask, Start, unchanged
 from gsparc.methods.registry import initialiser
-from gsparc.training.closed_form import learn_prior, warm_start
+from gsparc.training.closed_form import learn_prior, learn_process, warm_start
 
 
 def prepare(task: InitTask) -> Start:
@@ -17,10 +17,11 @@ def prepare(task: InitTask) -> Start:
     """
     if task.settings.response.array and task.closed_form:
         return initialiser("array")(task)
+    if task.closed_form:
+        assert task.receiver is not None  # else `auto_settings` refuses
+        process = learn_process(task.data, task.rows, task.anchors, task.seed)
+        solve = partial(warm_start, data=task.data, rows=task.rows, receiver=task.receiver, process=process)
+        return Start(process.prior, solve)
     kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
     prior = learn_prior(task.data, task.rows, task.anchors, task.seed) if kernel else None
-    if not task.closed_form:
-        return Start(prior, unchanged)
-    assert prior is not None and task.receiver is not None  # else `auto_settings` refuses
-    solve = partial(warm_start, data=task.data, rows=task.rows, receiver=task.receiver, noise=prior.noise)
-    return Start(prior, solve)
+    return Start(prior, unchanged)

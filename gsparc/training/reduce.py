@@ -42,7 +42,7 @@ def knobs(model: GaussianModel) -> tuple[str, ...]:
     Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
     places that the features are told by, and pixels.
     """
-    if model.tells_unknown:
+    if through_array(model) and model.tells_unknown:
         return ("anchors", "stride", "confidence", "frozen")
     stride = () if through_array(model) else ("stride",)
     static = model.site.kind == "spectrum" and model.site.static_end == "rx"
@@ -111,7 +111,12 @@ def reduced(method: LearnedField, settings: Settings, measured: dict[str, Tensor
         model.confidence = model.error = None
     model.gaussians.version += 1  # a plan frozen before is stale
     found: Method = twin if settings.get("frozen", True) else Live(twin)
-    if model.tells_unknown and found is twin and not {"keep", "cutoff", "projection"} & set(settings):
+    if (
+        through_array(model)
+        and model.tells_unknown
+        and found is twin
+        and not {"keep", "cutoff", "projection"} & set(settings)
+    ):
         twin.frozen, grid = _frozen_again(method, model, measured["receiver"], stride)
         return Filled(found, grid, stride) if stride > 1 else found
     if stride == 1:

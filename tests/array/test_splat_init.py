@@ -152,7 +152,7 @@ def test_a_closed_form_that_cannot_be_is_refused(known_campaign, tmp_path):
     data, _ = known_campaign
     fold = Fold(np.arange(20), np.arange(20, 24), np.arange(24, 30))
     for setting in ("emission.hidden=4", "attenuation.inverse_distance=true"):
-        with pytest.raises(ValueError, match="asks for networks|solves a linear read-out"):
+        with pytest.raises(ValueError, match=r"asks for networks|solves a linear read-out"):
             _trained(data, fold, tmp_path, "init=vectors", "model.field.count=20", f"model.{setting}")
 
 

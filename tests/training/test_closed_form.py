@@ -11,7 +11,7 @@ from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings
 from gsparc.ops import Pose
-from gsparc.training.closed_form import learn_prior, warm_start
+from gsparc.training.closed_form import learn_prior, learn_process, warm_start
 
 KERNEL = EmissionSettings(EncodingSettings("kernel"), activation="linear", init_bias=0.0)
 RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
@@ -20,14 +20,14 @@ ROWS = np.arange(40)
 
 def started(data, emission=KERNEL, count: int = 150, on: bool = False) -> GaussianModel:
     torch.manual_seed(0)
-    prior = learn_prior(data, ROWS, 1024, 0)
+    process = learn_process(data, ROWS, 1024, 0)
     settings = ModelSettings(
         field=FieldSettings(count=count, placement="sphere"),
         emission=emission,
         attenuation=AttenuationSettings(inverse_distance=on),
     )
-    model = GaussianModel(settings, data.site, RECEIVER, prior=prior)
-    warm_start(model, data, ROWS, RECEIVER, prior.noise)
+    model = GaussianModel(settings, data.site, RECEIVER, prior=process.prior)
+    warm_start(model, data, ROWS, RECEIVER, process)
     return model
 
 
@@ -93,3 +93,17 @@ def test_holes_of_masked_spectra_are_filled_not_learned(smooth):
     assert error(model, smooth, ROWS) < 0.2 * spread(smooth)
     naive = started(dataclasses.replace(smooth, target=holes))
     assert error(naive, smooth, ROWS) > 2 * error(model, smooth, ROWS)
+
+
+def test_what_is_unknown_far_away_and_near_the_rows(smooth):
+    """A hundred metres outside a splatted model was as sure as beside its rows."""
+    model = started(smooth)
+    assert model.error is not None
+    batch = smooth.batch(ROWS)
+    with torch.no_grad():
+        near, far = (model(tx, batch.rx).unknown for tx in (batch.tx, batch.tx + 100.0))
+        sure, variance = model.error(near)
+        unsure, most = model.error(far)
+    assert (far == 1).all() and (unsure == 0).all() and (sure > 0.3).float().mean() > 0.9
+    assert float(variance.mean()) < 0.5 * float(most.mean())
+    assert 0.3 * spread(smooth) < float(most.mean()) < 3 * spread(smooth)
