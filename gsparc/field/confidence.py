@@ -62,13 +62,13 @@ class ErrorModel(nn.Module):
         share = torch.lerp(unknown, ONE, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow_(self.power)
         return torch.sub(ONE, share), share * self.far
 
-    def get_extra_state(self) -> dict[str, float]:
+    def get_extra_state(self) -> Tensor:
         """For `state_dict`."""
-        return {"far": self.far, "power": self.power}
+        return torch.tensor([self.far, self.power], dtype=torch.float64)
 
-    def set_extra_state(self, state: dict[str, float]) -> None:
+    def set_extra_state(self, state: Tensor) -> None:
         """From `state_dict`."""
-        self.far, self.power = float(state["far"]), float(state["power"])
+        self.far, self.power = (float(value) for value in state)
 
 
 def fit_errors(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:

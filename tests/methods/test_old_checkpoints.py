@@ -30,7 +30,7 @@ GONE = {
 }
 READ = [name for name in NAMES if name not in GONE]
 RTOL, ATOL = 2e-4, 1e-5  # the second in units of the largest value
-APPROXIMATE = 2e-3  # RTOL of what is answered from images of low rank since
+APPROXIMATE = 2e-3  # RTOL of what is answered from images of low rank since, and ten times that of variances
 
 
 @pytest.fixture(autouse=True)
@@ -77,7 +77,8 @@ def check_prediction(
         value = getattr(prediction, part)
         assert (value is None) == (prefix + part not in known), prefix + part
         if value is not None:
-            check_equal(value, known[prefix + part], prefix + part, rtol)
+            loose = 10 if part == "variance" and rtol == APPROXIMATE else 1
+            check_equal(value, known[prefix + part], prefix + part, loose * rtol)
 
 
 def question_of(known: dict[str, np.ndarray]) -> Batch:
