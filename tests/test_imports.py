@@ -29,7 +29,7 @@ ARROWS = {
     "array": "data field methods ops physics training",
     "multipath": "data field methods ops physics",
     "peers": "data field methods ops physics training",
-    "auto": "data field methods ops training",
+    "auto": "data methods ops",
     "evaluation": "data methods",
     "callbacks": "data evaluation field",
     "commands": "data evaluation field methods multipath ops simulate training",

@@ -185,7 +185,6 @@ def test_left_out_rows_are_predicted_by_a_fit_without_them(monkeypatch):
         ("traded_gp", {"keep": 0.5, "confidence": False}),
         ("traded_array_field", {"anchors": 0.5}),
         ("traded_bearings", {"keep": 0.5}),
-        ("traded_phase_rest", {"keep": 0.5, "hybrid": False}),
         ("traded", {"keep": 0.5, "confidence": False}),
     ],
 )

@@ -31,7 +31,9 @@ def renewed(
     errors = {name: value.float() if isinstance(value, Tensor) else value for name, value in errors.items()}
     reach = float(np.mean([float(trend["kernel"][0]) for trend in state["trends"]]))
     errors |= {"near": near, "precision": precision, "kernel": state["rest"], "reach": reach, "prior": 1.0}
-    residual = {name: state[name].float() for name in ("mean", "axes", "weights")}
+    strongest = state["weights"].square().sum(0).argsort(descending=True)
+    axes, weights = state["axes"][strongest].float(), state["weights"][:, strongest].float()
+    residual = {"mean": state["mean"].float(), "axes": axes, "weights": weights}
     new = {name: state[name] for name in ("trends", "exponent", "positions", "shape", "seen")}
     new["basis"] = {"rows": torch.eye(image[0]), "columns": torch.eye(image[1])}
     new |= {"residual": {**residual, "kernel": state["rest"]}, "errors": errors}
