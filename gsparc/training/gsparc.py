@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.conditional import CompletedField, ConditionalField, Posterior, StackedField, learns
+from gsparc.field.conditional import CompletedField, ConditionalField, StackedField, learns
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
@@ -39,7 +39,7 @@ log = logging.getLogger(__name__)
 
 DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
 TRIAL_S, TRIAL_SHARE = 10.0, 0.2  # of a search whose worth is weighed on held-out rows, at most
-TRIAL = {"searches": 1, "search_rows": 200, "max_sources": 8, "edges": False}
+TRIAL: dict[str, Any] = {"searches": 1, "search_rows": 200, "max_sources": 8, "edges": False}
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 HOPELESS = 0.9  # share of the energy that a short fit misses, from which on a long one promises nothing
@@ -281,8 +281,10 @@ class Gsparc(LearnedField):
                 self.field(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
                 for i in range(0, len(tx), QUERY_CHUNK)
             ]
-            found = Posterior(*(_joined([getattr(p, name) for p in parts]) for name in vars(parts[0])))
-            return Prediction(found.mean, (1 - found.unknown).clamp(0, 1), found.variance)
+            mean, variance, unknown = (
+                torch.cat([getattr(part, name) for part in parts]) for name in ("mean", "variance", "unknown")
+            )
+            return Prediction(mean, (1 - unknown).clamp(0, 1), variance)
         own = super().predict(tx, rx)
         if self._beside is None:
             return own
@@ -469,8 +471,8 @@ def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
             [restored(site, m) for m in state["members"]], state["weights"]
         )
     elif "residual" in state:
-        parts = (restored(site, state[name]) for name in ("field", "residual"))
-        found = CompletedField(*parts, float(state["weight"]))
+        field, residual = restored(site, state["field"]), restored(site, state["residual"])
+        found = CompletedField(field, residual, float(state["weight"]))
     else:
         found = field_restored(str(state["kind"]))(site, state)
     found.site = site
@@ -484,7 +486,3 @@ def _rows(data: Measurements, rows: np.ndarray) -> Tensor:
 def _comparable(values: Tensor, site: Site) -> Tensor:
     """Values in the unit that errors are counted in: powers in decibels."""
     return 10 * values.clamp_min(1e-30).log10() if site.kind == "rssi" else values
-
-
-def _joined(parts: list[Tensor | None]) -> Tensor | None:
-    return None if parts[0] is None else torch.cat(parts)  # type: ignore[arg-type]
