@@ -54,7 +54,7 @@ GONE = {  # arguments that a class of that path no longer takes
 def renamed(node: Any) -> Any:
     """A configuration (plain containers) of an earlier version in today's names, without what is gone."""
     if isinstance(node, dict):
-        now: dict[str, Any] = {OLD_KEYS.get(key, key): renamed(value) for key, value in node.items()}
+        now = {str(OLD_KEYS.get(key, key)): renamed(value) for key, value in node.items()}
         target = now.get("_target_")
         if target == FIELD and "warm_start" in now:
             return _one_field(now)
