@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import CompletedField, ConditionalField, StackedField, learns
+from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
@@ -38,26 +39,12 @@ from gsparc.training.time_budget import Pace
 log = logging.getLogger(__name__)
 
 DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
-TRIAL_S, TRIAL_SHARE = 10.0, 0.2  # of a search whose worth is weighed on held-out rows, at most
-TRIAL: dict[str, Any] = {"searches": 1, "search_rows": 200, "max_sources": 8, "edges": False}
+FEW: dict[str, Any] = {"searches": 1, "search_rows": 200, "max_sources": 8, "edges": False}
+FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
-HOPELESS = 0.9  # share of the energy that a short fit misses, from which on a long one promises nothing
 LEAST_HELD = 4  # rows, for weights to mean anything
 OPEN_ENDED = ("sources", "bearings")  # initialisers that take what seconds they are given
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What a short fit predicts of held-out rows.
-
-    Attributes:
-        error: share of the energy that it misses.
-        ratio: of that to what it misses of its own rows, left out one by one; at least 1.
-    """
-
-    error: float
-    ratio: float
 
 
 class Gsparc(LearnedField):
@@ -151,17 +138,8 @@ class Gsparc(LearnedField):
             context.budget_s,
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
-        trials, limited = self._try(chosen.parts, data, fold, context, budget)
-        self.started = "+".join(trials)
-        members: dict[str, ConditionalField] = {}
-        notes: list[str] = []
-        for part in sorted(trials, key=OPEN_ENDED.__contains__):  # what takes all that is left comes last
-            left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
-            within = replace(context, budget_s=left if part in OPEN_ENDED else None)
-            members[part], report = self._initialise(part, data, known, within)
-            limited = less_repeatable(limited, report.limited_by)
-            notes += report.notes
-        self.field = self._stacked(members, trials, data)
+        solutions, notes, limited = self._solutions(chosen.parts, data, fold, context, budget)
+        self.field = self._stacked(solutions, data, fold)
         self.field.site = data.site
         self.init_s = budget.counted.wall
         self.steps = self._take_steps(data, fold, context, budget)
@@ -172,74 +150,71 @@ class Gsparc(LearnedField):
         )
         return FitReport(seconds, tuple(notes), limited)
 
+    def _solutions(
+        self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
+    ) -> tuple[dict[str, ConditionalField], list[str], Clock | None]:
+        """What initialisers find on training rows, what must be said of it, and the clock that limited it.
+
+        Validation rows weigh several; where there is one solution, or no such row, all rows are learned from.
+        A search with few sources is a solution of its own beside the one that takes what seconds are left:
+        many sources fit rows near others better, few of them what is far.
+        """
+        weighed = len(parts) > 1 and len(fold.val) >= LEAST_HELD
+        rows = fold.train if weighed else np.sort(np.concatenate([fold.train, fold.val]))
+        plans = [(part, self.init, None) for part in parts if part not in OPEN_ENDED]
+        for part in (part for part in parts if part in OPEN_ENDED):
+            if weighed:
+                plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))
+            plans.append((part, self.init, 1.0))
+        found: dict[str, ConditionalField] = {}
+        notes: list[str] = []
+        limited: Clock | None = None
+        for name, init, share in plans:
+            left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
+            within = replace(context, budget_s=None if share is None else share * left)
+            if name.startswith("few "):
+                within = replace(within, run_dir=Path(), resume=None)
+            try:
+                found[name], report = self._initialise(name.split()[-1], init, data, rows, within)
+            except ValueError as error:
+                if len(parts) == 1 or name == self.init.name:
+                    raise
+                log.info("init=%s is left out: %s", name, error)
+                continue
+            limited = less_repeatable(limited, report.limited_by)
+            notes += report.notes
+        return found, notes, limited
+
     def _initialise(
-        self, part: str, data: Measurements, rows: np.ndarray, context: FitContext
+        self, part: str, init: InitSettings, data: Measurements, rows: np.ndarray, context: FitContext
     ) -> tuple[ConditionalField, FitReport]:
         clutter = self.switches.visibility is not False
-        init = self.init if self.settings.field.count else replace(self.init, name="diffuse")
+        init = init if self.settings.field.count else replace(init, name="diffuse")
         field, report = field_initialiser(part)(data, rows, init, clutter, context)
         if self.switches.residual is False and isinstance(field, CompletedField):
             field = field.field
         return field, report
 
-    def _try(
-        self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
-    ) -> tuple[dict[str, Trial], Clock | None]:
-        """What each part predicts of held-out rows after a short fit, hopeless ones left out, and what
-        limited that."""
-        forced = self.switches.phase is True or self.init.name in parts
-        if len(parts) == 1 or len(fold.val) < LEAST_HELD or (forced and len(parts) == 2):
-            return {parts[0]: Trial(0.0, 1.0)}, None
-        batch, limited, found = data.batch(fold.val), None, {}
-        target = _comparable(batch.target, data.site)
-        for part in parts:
-            short = replace(self.init, **TRIAL) if part in OPEN_ENDED else self.init
-            trial_s = min(TRIAL_S, TRIAL_SHARE * budget.seconds) if part in OPEN_ENDED else None
-            within = replace(context, run_dir=Path(), resume=None, budget_s=trial_s)
-            try:
-                field, report = field_initialiser(part)(data, fold.train, short, False, within)
-            except ValueError as error:
-                if forced:
-                    raise
-                log.info("init=%s is left out: %s", part, error)
-                continue
-            limited = less_repeatable(limited, report.limited_by)
-            missed = weighing.error(_comparable(field(batch.tx, batch.rx).mean, data.site), target)
-            own = missed
-            if data.target[0].size == 1:
-                left = field.left_out()
-                own = weighing.error(
-                    *(_comparable(v, data.site) for v in (left.mean, _rows(data, left.rows)))
-                )
-            found[part] = Trial(missed, max(missed / max(own, 1e-30), 1.0))
-            log.info(
-                "held-out rows: %s misses %.3f of the energy, %.1f times what it promises", part, missed,
-                found[part].ratio,
-            )  # fmt: skip
-        best = min(found, key=lambda part: found[part].error)
-        return {part: t for part, t in found.items() if part == best or t.error < HOPELESS}, limited
-
     def _stacked(
-        self, members: dict[str, ConditionalField], trials: dict[str, Trial], data: Measurements
+        self, solutions: dict[str, ConditionalField], data: Measurements, fold: Fold
     ) -> ConditionalField:
-        """The members weighed by what each left out, its error raised by what held-out rows showed."""
-        if len(members) == 1:
-            return next(iter(members.values()))
-        if data.target[0].size > 1:
-            best = min(members, key=lambda part: trials[part].error)
-            return members[best]
-        left = {part: field.left_out() for part, field in members.items()}
-        rows = next(iter(left.values())).rows
-        predicted = []
-        for part, one in left.items():
-            order = np.argsort(one.rows)[np.searchsorted(one.rows, rows, sorter=np.argsort(one.rows))]
-            target, mean = _rows(data, rows), one.mean[order]
-            missed = _comparable(target, data.site) - _comparable(mean, data.site)
-            predicted.append(_comparable(target, data.site) - trials[part].ratio ** 0.5 * missed)
-        found = weighing.weights(predicted, _comparable(_rows(data, rows), data.site))
-        log.info("weights: %s", ", ".join(f"{part} {w:.2f}" for part, w in zip(members, found, strict=True)))
-        kept = [(field, weight) for field, weight in zip(members.values(), found, strict=True) if weight > 0]
-        return kept[0][0] if len(kept) == 1 else StackedField(*zip(*kept, strict=True))
+        """The solutions by the weights that validation rows give them."""
+        self.started = "+".join(solutions)
+        if len(solutions) == 1:
+            return next(iter(solutions.values()))
+        batch = data.batch(fold.val)
+        target = _comparable(batch.target, data.site)
+        predicted = [_comparable(f(batch.tx, batch.rx).mean, data.site) for f in solutions.values()]
+        found = weighing.weights(predicted, target)
+        for name, one, weight in zip(solutions, predicted, found, strict=True):
+            log.info(
+                "held-out rows: %s misses %.3f of the energy, weight %.2f", name,
+                weighing.error(one, target), weight,
+            )  # fmt: skip
+        kept = {name: weight for name, weight in zip(solutions, found, strict=True) if weight > 0}
+        self.started = "+".join(kept)
+        fields = [solutions[name] for name in kept]
+        return fields[0] if len(fields) == 1 else StackedField(fields, list(kept.values()))
 
     def _take_steps(self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget) -> int:
         """Gradient steps under Lightning, as many as validation gains by; their number."""
@@ -477,10 +452,6 @@ def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
         found = field_restored(str(state["kind"]))(site, state)
     found.site = site
     return found
-
-
-def _rows(data: Measurements, rows: np.ndarray) -> Tensor:
-    return torch.from_numpy(np.asarray(data.target[rows]))
 
 
 def _comparable(values: Tensor, site: Site) -> Tensor:
