@@ -43,9 +43,11 @@ def check(
     for note in reading.notes:
         _line(console, f"{'note':<12}{note}")
     levels = link_levels(reading.data)
-    steps = [] if levels is None else steps_of(levels)
-    for warning in [] if levels is None else plausibility_warnings(levels, steps):
-        _line(console, f"{'warning':<12}{warning}")
+    steps = []
+    if levels is not None:
+        steps = steps_of(levels)
+        for warning in plausibility_warnings(levels, steps):
+            _line(console, f"{'warning':<12}{warning}")
     if draw is not None:
         from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
 

@@ -73,6 +73,9 @@ def test_a_place_without_a_fix_is_refused(tmp_path):
     arrays = {**fix, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
     with pytest.raises(DataError, match="row 7: latitude and longitude are 0: no fix"):
         write_own(tmp_path / "a.npz", arrays)
+    at_sea = {name: fix[name] - middle for name, middle in (("latitude", 40.78), ("longitude", -111.82))}
+    at_sea["latitude"][7] = at_sea["longitude"][7] = 0
+    write_own(tmp_path / "b.npz", {**arrays, **at_sea})  # measured around that very place
 
 
 def test_receivers_in_one_plane_are_noted(tmp_path, arrays):
