@@ -27,7 +27,7 @@ class Argos(DataModule):
         positions: `encoder`, or `true` (stand-in only).
         align: turn snapshots by the phase and mean delay of their own uplink.
         encoder: `file` or `folder`, and `EncoderSettings`.
-        stand_in: used, loudly, when root is not on disk.
+        stand_in: used, loudly, when no root is given.
         name, batch_size: see `DataModule`.
     """
 
@@ -56,7 +56,7 @@ class Argos(DataModule):
         if self.root is not None and self.root.exists():
             return self._folder(self.root)
         missing = describe_missing(self.root)
-        if self.stand_in is None:
+        if self.root is not None or self.stand_in is None:
             raise DataError(missing)
         log.warning("%s Using the SIMULATED stand-in argos-sim instead.", missing)
         return self._simulated(self.stand_in)

@@ -25,7 +25,7 @@ class RFID(DataModule):
         wavelength_m: carrier wavelength [m].
         array: rows, columns and spacing_m of the receiver's array, see `planar_array`; None: the release's.
         normalisation: how the published images were scaled.
-        stand_in: used, loudly, when root is not on disk.
+        stand_in: used, loudly, when no root is given.
         name, batch_size: see `DataModule`.
     """
 
@@ -50,7 +50,7 @@ class RFID(DataModule):
         """Spectra (S, 90, 360) uint8 of tags that move about a static gateway."""
         if self.root is None or not self.root.exists():
             missing = describe_missing(self.root)
-            if self.stand_in is None:
+            if self.root is not None or self.stand_in is None:
                 raise DataError(missing)
             log.warning("%s Using the SIMULATED stand-in rfid-sim instead.", missing)
             return simulated(self.stand_in)

@@ -6,6 +6,7 @@ import torch
 from poses import boresight_degrees
 
 from gsparc.data.campaigns.rfid import WAVELENGTH, load_rfid, planar_array
+from gsparc.data.errors import DataError
 from gsparc.data.load import load
 
 
@@ -91,14 +92,21 @@ def test_array_and_grid_explain_real_spectra_to_the_quantisation_floor(real_rfid
 def test_absent_release_is_loud_and_uses_the_stand_in(tmp_path, caplog):
     config = {
         "name": "rfid",
-        "root": str(tmp_path / "nowhere"),
+        "root": None,
         "stand_in": {"count": 4, "seed": 0, "root": str(tmp_path / "stand-ins")},
     }
     with caplog.at_level(logging.WARNING):
         data = load(config)
     assert data.site.name == "rfid-sim" and data.site.stand_in == "rfid"
     text = caplog.text
-    assert "NOT on disk" in text and "XPengZhao/NeRF2" in text and "rfid-sim" in text and "nowhere" in text
+    assert "NOT on disk" in text and "XPengZhao/NeRF2" in text and "rfid-sim" in text
+
+
+@pytest.mark.parametrize("name", ["rfid", "argos"])
+def test_a_mistyped_root_was_another_dataset(name, tmp_path):
+    """The stand-in took the place of any folder that is not there."""
+    with pytest.raises(DataError, match=r"nowhere (does not exist|is not there)"):
+        load({"name": name, "root": str(tmp_path / "nowhere")})
 
 
 def test_a_damaged_release_is_refused_not_replaced(rfid_folder):
