@@ -60,11 +60,13 @@ class ConditionalField(nn.Module, ABC):
     Attributes:
         kind: the initialiser that makes it, see `gsparc.methods.registry.FIELDS`; none of composed ones.
         site: what the dataset declares; set where the field is made.
+        held: rows of groups, predicted by searches that left their group out; None where none did.
         rates: Adam's rate by the beginning of a parameter's name; what is not named has `RATE`.
     """
 
     kind: ClassVar[str] = ""
     site: Site
+    held: LeftOutRows | None = None
     RATE: ClassVar[float] = 0.01  # of logarithms of lengths and variances
     rates: ClassVar[dict[str, float]] = {}
 
@@ -183,6 +185,7 @@ class CompletedField(ConditionalField):
     def __init__(self, field: ConditionalField, residual: ConditionalField, weight: float) -> None:
         super().__init__()
         self.field, self.residual, self.weight = field, residual, float(weight)
+        self.held = field.held
 
     @property
     def count(self) -> int:

@@ -65,6 +65,7 @@ class FitContext:
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
         stations: of several, whether `each` has a model or all are one's `together`.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
+        leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
         resume: what an interrupted run left, to go on from.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
@@ -84,6 +85,7 @@ class FitContext:
     budget_clock: Clock = "wall"
     stations: StationModels = "each"
     split: SplitSettings | FileSettings | None = None
+    leave_out: tuple[np.ndarray, ...] = ()
     resume: Path | None = None
     init_from: Path | None = None
     batch_size: int = 16

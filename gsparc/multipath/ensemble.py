@@ -68,7 +68,7 @@ def search_many(
         return stopped.is_set() or at_noise_floor(errors, noise_floor)
 
     def search(number: int) -> Member | None:
-        if done := cache.find(f"{stage} {number}"):
+        if done := cache.find(stage, number):
             errors.append(done.left_out)
             return done
         if unwanted() or (number > 0 and budget.over(LAST_START)):
@@ -76,7 +76,7 @@ def search_many(
         try:
             with ended_by(unwanted):
                 member = _search(
-                    row_sets[number], transmitter, settings, seed + number, noise_floor, budget, clutter
+                    row_sets[number], transmitter, settings, seed, number, noise_floor, budget, clutter
                 )
         except Ended:
             return None
@@ -87,7 +87,7 @@ def search_many(
             budget.spent, budget.seconds,
         )  # fmt: skip
         errors.append(member.left_out)
-        cache.put(f"{stage} {number}", member, budget.limited_by)
+        cache.put(stage, member, budget.limited_by)
         return member
 
     threads = torch.get_num_threads()
@@ -126,11 +126,13 @@ def _search(
     transmitter: Tensor,
     settings: SearchSettings,
     seed: int,
+    number: int,
     noise_floor: float,
     budget: TimeBudget,
     clutter: bool,
 ) -> Member:
-    """One search, its phases, and the clutter that the noise does not hide."""
+    """Search `number`, its phases, and the clutter that the noise does not hide."""
+    seed += number
     over = partial(budget.over, SEARCH_END)
     scene = Search(rows, transmitter, settings, seed, partial(budget.over, ROUNDS_END), over).run()
     phased = PhasedScene.of(rows, scene, QUADRATURE)
@@ -141,13 +143,13 @@ def _search(
         generator = torch.Generator().manual_seed(seed)
         phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
         error = _left_out(rows, phased, noise_floor)
-    return Member(phased, error)
+    return Member(phased, error, number)
 
 
 def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
     """A search's result on rows that have changed a little."""
     phased = refine_phase.refine(rows, member.phased, 20, noise_floor)
-    return Member(phased, _left_out(rows, phased, noise_floor))
+    return Member(phased, _left_out(rows, phased, noise_floor), member.number)
 
 
 def _left_out(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.field.conditional import LeftOutRows
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import MeanOnly
@@ -82,6 +83,8 @@ class ImageSourceGP(FramedMethod):
     """
 
     name = "image_source_gp"
+    held: LeftOutRows | None = None  # rows of `FitContext.leave_out`, by searches without them
+    _groups: tuple[np.ndarray, ...] = ()
     resumable = True  # finished searches are kept in `last.ckpt`
     takes_budget = True
 
@@ -123,6 +126,7 @@ class ImageSourceGP(FramedMethod):
         refuse(data.site, self.name)
         refuse_turning(data)
         known = np.concatenate([fold.train, fold.val])
+        self._groups = context.leave_out
         cache = SearchCache(context.run_dir, context.resume, self._depends_on(data, known))
         try:
             return self._fit(data, known, context, cache)
@@ -158,11 +162,11 @@ class ImageSourceGP(FramedMethod):
         found = self._search(row_sets, self.settings, searching, self.clutter, cache)
         budget.limited |= searching.limited
         if held.array is not None and self.offsets == "none":
-            again = self._calibrated(data, row_sets[0], found[0].phased.scene)
+            again = self._calibrated(data, row_sets[found[0].number], found[0].phased.scene)
             if again is not data:
                 data, row_sets = again, self._row_sets(again, known, self.searches)
                 held = self.frame.inside(gather(data, known, self.row_limit, self.seed))
-                found = [refined(*pair, self.noise_floor) for pair in zip(row_sets, found, strict=False)]
+                found = [refined(row_sets[one.number], one, self.noise_floor) for one in found]
         if self.look_for_edges and not at_noise_floor([found[0].left_out], self.noise_floor, least=1):
             found, held = self._search_with_edges(row_sets, found, held, cache, budget)
         self.weights = ensemble_weights(found)
@@ -173,6 +177,7 @@ class ImageSourceGP(FramedMethod):
             held = held.take(torch.linspace(0, len(held) - 1, affordable).long())
         self.members = [PhasedPosterior(held, member.phased, self.noise_floor) for member in found]
         self.query = Query(self.members)
+        self.held = self._held(data, known, found, len(held))
         notes += self._described(found, budget)
         limited = less_repeatable(budget.limited_by, cache.limited_by)
         return FitReport(budget.counted.wall, tuple(notes), limited)
@@ -211,7 +216,7 @@ class ImageSourceGP(FramedMethod):
     def _depends_on(self, data: Measurements, known: np.ndarray) -> dict[str, str]:
         """What a search depends on; neither the budget nor the number of searches."""
         settings = (self.search_rows, self.row_limit, self.offsets, self.clutter, self.settings)
-        rows = sha256(known.tobytes()).hexdigest()
+        rows = sha256(b"".join(part.tobytes() for part in (known, *self._groups))).hexdigest()
         return {"data": data.site.sha256, "rows": rows, "seed": str(self.seed), "settings": str(settings)}
 
     def _budget(self, measurements: int, given_s: float | None) -> float:
@@ -232,7 +237,7 @@ class ImageSourceGP(FramedMethod):
         self, row_sets: list[Rows], found: list[Member], held: Rows, cache: SearchCache, budget: TimeBudget
     ) -> tuple[list[Member], Rows]:
         """Searches and rows after subtracting accepted edges; unchanged when none is accepted."""
-        scene, rows = found[0].phased.scene, row_sets[0]
+        scene, rows = found[0].phased.scene, row_sets[found[0].number]
         transmitter, generator = scene.transmitter, torch.Generator().manual_seed(self.seed)
         late = partial(budget.over, 1 - EDGE_BUDGET / 2)
         edges = find_edges(rows, scene, box_of(rows, transmitter), generator, self.noise_floor, late)
@@ -243,7 +248,8 @@ class ImageSourceGP(FramedMethod):
         row_sets = [subtract_edges(part, edges, transmitter) for part in row_sets]
         with_edges = self._search(row_sets, self.settings, more, self.clutter, cache, "beside edges")
         budget.limited |= more.limited
-        power = float(row_sets[0].target.abs().square().mean())  # leave-one-out errors are relative to it
+        # leave-one-out errors are relative to the power
+        power = float(row_sets[with_edges[0].number].target.abs().square().mean())
         # the edges' gains were fitted to every row: ask for a clear margin
         if with_edges[0].left_out * power > MAX_EDGE_ERROR * found[0].left_out:
             return found, held
@@ -252,8 +258,37 @@ class ImageSourceGP(FramedMethod):
         return with_edges, subtract_edges(held, self.edges, scene.transmitter)
 
     def _row_sets(self, data: Measurements, known: np.ndarray, count: int) -> list[Rows]:
-        seeds = range(self.seed, self.seed + count)
-        return [self.frame.inside(gather(data, known, self.search_rows, seed)) for seed in seeds]
+        """Rows of each search, drawn with seeds of their own, without the group whose turn it is."""
+        parts = [gather(data, self._seen(known, i), self.search_rows, self.seed + i) for i in range(count)]
+        return [self.frame.inside(part) for part in parts]
+
+    def _seen(self, known: np.ndarray, number: int) -> np.ndarray:
+        """The rows of a search by its number."""
+        groups = self._groups
+        return np.setdiff1d(known, groups[number % len(groups)]) if groups else known
+
+    def _held(
+        self, data: Measurements, known: np.ndarray, found: list[Member], most: int
+    ) -> LeftOutRows | None:
+        """Rows of every group predicted by the searches that left it out, from at most `most` others."""
+        if not self._groups:
+            return None
+        rows, means = [], []
+        for turn, group in enumerate(self._groups):
+            members = [one for one in found if one.number % len(self._groups) == turn]
+            if not members:
+                continue
+            apart = self.frame.inside(gather(data, self._seen(known, turn), most, self.seed))
+            if len(self.edges):
+                apart = subtract_edges(apart, self.edges, self._transmitter())
+            twin = copy.copy(self)
+            twin.members = [PhasedPosterior(apart, member.phased, self.noise_floor) for member in members]
+            twin.weights, twin.query = ensemble_weights(members), Query(twin.members)
+            batch = data.batch(group)
+            rows.append(group)
+            means.append(twin.predict(batch.tx, batch.rx).mean)
+        mean = torch.cat(means)
+        return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
 
     def _transmitter(self) -> Tensor:
         assert self.site is not None and self.site.static_position is not None

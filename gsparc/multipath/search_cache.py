@@ -28,10 +28,12 @@ class Member:
     Attributes:
         phased: the scene.
         left_out: NMSE of its own rows, each receiver predicted from the others.
+        number: of the search, from 0.
     """
 
     phased: PhasedScene
     left_out: float
+    number: int = 0
 
 
 class SearchCache:
@@ -79,17 +81,22 @@ class SearchCache:
         self._kept, self.spent, self.limited_by = kept, spent, stored.get("limited_by")
         log.info("reusing %d cached searches (%.0f s of training time)", len(kept), wall)
 
-    def find(self, name: str) -> Member | None:
-        """The finished search of this name, or None."""
+    def find(self, name: str, number: int) -> Member | None:
+        """The finished search of this name and number, or None."""
         with self._lock:
-            kept = self._kept.get(name)
-        return None if kept is None else Member(PhasedScene.from_state(kept["scene"]), kept["left_out"])
+            kept = self._kept.get(f"{name} {number}")
+        return (
+            None if kept is None else Member(PhasedScene.from_state(kept["scene"]), kept["left_out"], number)
+        )
 
     def put(self, name: str, member: Member, limited_by: Clock | None) -> None:
         """Store a finished search, and what has ended one so far; the file is written atomically."""
         with self._lock:
             self.limited_by = less_repeatable(self.limited_by, limited_by)
-            self._kept[name] = {"scene": member.phased.state(), "left_out": member.left_out}
+            self._kept[f"{name} {member.number}"] = {
+                "scene": member.phased.state(),
+                "left_out": member.left_out,
+            }
             self._write()
 
     def interrupted(self) -> str:

@@ -40,7 +40,7 @@ class SourceField(ConditionalField):
 
     def __init__(self, method: ImageSourceGP) -> None:
         super().__init__()
-        self.method = method
+        self.method, self.held = method, method.held
         fixed = method.offsets != "none"  # those of every snapshot were estimated against these sources
         scenes = [] if fixed else [member.scene for member in method.members]
         self.planes = nn.ParameterList([scene.planes.clone() for scene in scenes])

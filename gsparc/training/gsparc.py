@@ -8,6 +8,7 @@ steps of gradient refine it as long as validation gains.
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 from dataclasses import replace
 from pathlib import Path
@@ -17,9 +18,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
-from gsparc.field.conditional import CompletedField, ConditionalField, StackedField, learns
+from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
@@ -39,7 +41,8 @@ from gsparc.training.time_budget import Pace
 log = logging.getLogger(__name__)
 
 DEFAULT_BUDGET_S = 60.0  # where a search is open-ended
-FEW: dict[str, Any] = {"searches": 1, "search_rows": 200, "max_sources": 8, "edges": False}
+GROUPS = 3  # of training rows, that solutions are weighed by
+FEW: dict[str, Any] = {"searches": GROUPS, "search_rows": 200, "max_sources": 8, "edges": False}
 FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
@@ -144,46 +147,62 @@ class Gsparc(LearnedField):
         self.init_s = budget.counted.wall
         self.steps = self._take_steps(data, fold, context, budget)
         self.field.condition(data, known)
+        kept = [note for name in self.started.split("+") for note in notes[name]]
         seconds = budget.counted.wall
         log.info(
             "initialisers %.1f s, %d gradient steps kept, %.1f s in all", self.init_s, self.steps, seconds
         )
-        return FitReport(seconds, tuple(notes), limited)
+        return FitReport(seconds, tuple(kept), limited)
 
     def _solutions(
         self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
-    ) -> tuple[dict[str, ConditionalField], list[str], Clock | None]:
-        """What initialisers find on training rows, what must be said of it, and the clock that limited it.
+    ) -> tuple[dict[str, ConditionalField], dict[str, tuple[str, ...]], Clock | None]:
+        """What initialisers find, what must be said of each, and the clock that limited them.
 
-        Validation rows weigh several; where there is one solution, or no such row, all rows are learned from.
-        A search with few sources is a solution of its own beside the one that takes what seconds are left:
-        many sources fit rows near others better, few of them what is far.
+        Where they are several, training rows are cut into groups as the test was cut, and each solution
+        predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
+        few sources is a solution of its own beside the one that takes what seconds are left: many sources fit
+        rows near others better, few of them what is far.
         """
-        weighed = len(parts) > 1 and len(fold.val) >= LEAST_HELD
+        weighed = len(parts) > 1
         rows = fold.train if weighed else np.sort(np.concatenate([fold.train, fold.val]))
+        groups = self._groups(data, fold, context) if weighed else ()
         plans = [(part, self.init, None) for part in parts if part not in OPEN_ENDED]
         for part in (part for part in parts if part in OPEN_ENDED):
             if weighed:
                 plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))
             plans.append((part, self.init, 1.0))
         found: dict[str, ConditionalField] = {}
-        notes: list[str] = []
+        notes: dict[str, tuple[str, ...]] = {}
         limited: Clock | None = None
         for name, init, share in plans:
             left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
             within = replace(context, budget_s=None if share is None else share * left)
             if name.startswith("few "):
                 within = replace(within, run_dir=Path(), resume=None)
+            part = name.split()[-1]
             try:
-                found[name], report = self._initialise(name.split()[-1], init, data, rows, within)
+                if part in OPEN_ENDED:
+                    within = replace(within, leave_out=groups)
+                    found[name], report = self._initialise(part, init, data, rows, within)
+                else:
+                    found[name], report = self._initialise(part, init, data, rows, within)
+                    found[name].held = _held(found[name], data, rows, groups)
             except ValueError as error:
                 if len(parts) == 1 or name == self.init.name:
                     raise
                 log.info("init=%s is left out: %s", name, error)
+                found.pop(name, None)
                 continue
             limited = less_repeatable(limited, report.limited_by)
-            notes += report.notes
+            notes[name] = report.notes
         return found, notes, limited
+
+    def _groups(self, data: Measurements, fold: Fold, context: FitContext) -> tuple[np.ndarray, ...]:
+        """Training rows (n,) of a few groups, cut as the test was."""
+        inner = cut_inside(data, fold, context.split, GROUPS, context.seed)
+        cut = [np.intersect1d(one.test, fold.train) for one in inner.folds]
+        return tuple(group for group in cut if 0 < len(group) < len(fold.train))
 
     def _initialise(
         self, part: str, init: InitSettings, data: Measurements, rows: np.ndarray, context: FitContext
@@ -198,17 +217,34 @@ class Gsparc(LearnedField):
     def _stacked(
         self, solutions: dict[str, ConditionalField], data: Measurements, fold: Fold
     ) -> ConditionalField:
-        """The solutions by the weights that validation rows give them."""
+        """The solutions by the weights that rows give them which they were not conditioned on."""
         self.started = "+".join(solutions)
         if len(solutions) == 1:
             return next(iter(solutions.values()))
+        held = [field.held for field in solutions.values() if field.held is not None]
+        rows = np.zeros(0, np.int64)
+        if len(held) == len(solutions):
+            rows = np.asarray(functools.reduce(np.intersect1d, [one.rows for one in held]), np.int64)
         batch = data.batch(fold.val)
-        target = _comparable(batch.target, data.site)
-        predicted = [_comparable(f(batch.tx, batch.rx).mean, data.site) for f in solutions.values()]
+        predicted = []
+        for field in solutions.values():
+            said = field(batch.tx, batch.rx).mean
+            if len(rows):
+                assert field.held is not None
+                order = {row: place for place, row in enumerate(field.held.rows.tolist())}
+                said = torch.cat([field.held.mean[[order[row] for row in rows.tolist()]], said])
+            predicted.append(_comparable(said, data.site))
+        rows = np.concatenate([rows, fold.val])
+        if len(rows) < LEAST_HELD:
+            name = next(iter(solutions))
+            log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), name)
+            self.started = name
+            return solutions[name]
+        target = _comparable(data.batch(rows).target, data.site)
         found = weighing.weights(predicted, target)
         for name, one, weight in zip(solutions, predicted, found, strict=True):
             log.info(
-                "held-out rows: %s misses %.3f of the energy, weight %.2f", name,
+                "%d held-out rows: %s misses %.3f of the energy, weight %.2f", len(rows), name,
                 weighing.error(one, target), weight,
             )  # fmt: skip
         kept = {name: weight for name, weight in zip(solutions, found, strict=True) if weight > 0}
@@ -452,6 +488,22 @@ def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
         found = field_restored(str(state["kind"]))(site, state)
     found.site = site
     return found
+
+
+def _held(
+    field: ConditionalField, data: Measurements, rows: np.ndarray, groups: tuple[np.ndarray, ...]
+) -> LeftOutRows | None:
+    """Rows of every group, predicted from the others with the parameters of all."""
+    if not groups:
+        return None
+    found = []
+    for group in groups:
+        field.condition(data, np.setdiff1d(rows, group))
+        batch = data.batch(group)
+        found.append(field(batch.tx, batch.rx))
+    field.condition(data, rows)
+    mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
+    return LeftOutRows(np.concatenate(groups), mean, variance)
 
 
 def _comparable(values: Tensor, site: Site) -> Tensor:

@@ -96,7 +96,10 @@ def plan(
     if on["phase"] and (count or not plain):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         parts = searched if init.name == "auto" else (str(init.name),)
-        return Plan(False, parts=parts + (("diffuse",) if plain else ()), reasons=tuple(reasons))
+        beside = (
+            ("diffuse",) if plain and init.snapshot == "none" else ()
+        )  # offsets are known to sources alone
+        return Plan(False, parts=parts + beside, reasons=tuple(reasons))
     rendered = drawn is not None or switches.image is True
     if site.kind == "csi" and plain and site.wavelength is not None and not rendered:
         why = obstacles["phase"] or ("no Gaussians are asked for" if on["phase"] else "no phase is asked for")
