@@ -137,27 +137,38 @@ class Gsparc(LearnedField):
             context = replace(context, budget_s=DEFAULT_BUDGET_S)
         budget = context.time_budget()
         log.info(
-            "training a Gaussian field with closed-form weights: init=%s, %g s", "+".join(chosen.parts),
-            context.budget_s,
+            "training a Gaussian field with closed-form weights: init=%s, then at most %d gradient steps, "
+            "within %g s; callbacks: %s", " and ".join(chosen.parts), self._most_steps(context),
+            context.budget_s, KeepBest.__name__,
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
-        solutions, notes, limited = self._solutions(chosen.parts, data, fold, context, budget)
+        solutions, reports = self._solutions(chosen.parts, data, fold, context, budget)
         self.field = self._stacked(solutions, data, fold)
         self.field.site = data.site
         self.init_s = budget.counted.wall
-        self.steps = self._take_steps(data, fold, context, budget)
-        self.field.condition(data, known)
-        kept = [note for name in self.started.split("+") for note in notes[name]]
-        seconds = budget.counted.wall
         log.info(
-            "initialisers %.1f s, %d gradient steps kept, %.1f s in all", self.init_s, self.steps, seconds
+            "%s of %d Gaussians from init=%s, terms %s", type(self.field).__name__, self.field.count,
+            self.started, ", ".join(self.field.terms) or "none",
+        )  # fmt: skip
+        self.steps = self._take_steps(data, fold, context, budget)
+        stepped = budget.counted.wall
+        self.field.condition(data, known)
+        seconds = budget.counted.wall
+        stages = {name: report.seconds for name, report in reports.items()}
+        stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
+        log.info(
+            "cost: %s; %.1f s in all", ", ".join(f"{name} {s:.1f} s" for name, s in stages.items()), seconds
         )
-        return FitReport(seconds, tuple(kept), limited)
+        notes = [note for name in self.started.split("+") for note in reports[name].notes]
+        limited: Clock | None = None
+        for report in reports.values():
+            limited = less_repeatable(limited, report.limited_by)
+        return FitReport(seconds, tuple(notes), limited)
 
     def _solutions(
         self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
-    ) -> tuple[dict[str, ConditionalField], dict[str, tuple[str, ...]], Clock | None]:
-        """What initialisers find, what must be said of each, and the clock that limited them.
+    ) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:
+        """What initialisers find, and what each cost.
 
         Where they are several, training rows are cut into groups as the test was cut, and each solution
         predicts every group from the others (`ConditionalField.held`): errors to weigh them by. A search with
@@ -173,8 +184,7 @@ class Gsparc(LearnedField):
                 plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))
             plans.append((part, self.init, 1.0))
         found: dict[str, ConditionalField] = {}
-        notes: dict[str, tuple[str, ...]] = {}
-        limited: Clock | None = None
+        reports: dict[str, FitReport] = {}
         for name, init, share in plans:
             left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
             within = replace(context, budget_s=None if share is None else share * left)
@@ -194,9 +204,8 @@ class Gsparc(LearnedField):
                 log.info("init=%s is left out: %s", name, error)
                 found.pop(name, None)
                 continue
-            limited = less_repeatable(limited, report.limited_by)
-            notes[name] = report.notes
-        return found, notes, limited
+            reports[name] = report
+        return found, reports
 
     def _groups(self, data: Measurements, fold: Fold, context: FitContext) -> tuple[np.ndarray, ...]:
         """Training rows (n,) of a few groups, cut as the test was."""
@@ -272,7 +281,7 @@ class Gsparc(LearnedField):
             )
             return 0
         folder = context.run_dir / "steps"
-        steps = total_steps(context) if self.most_steps is None else self.most_steps
+        steps = self._most_steps(context)
         pace = Pace(steps, budget.seconds - budget.spent)
         module = GaussianModule(field, self.loss, self.rates, steps, folder, pace)
         files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
@@ -281,6 +290,9 @@ class Gsparc(LearnedField):
         ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
         budget.go()
         return ran.steps
+
+    def _most_steps(self, context: FitContext) -> int:
+        return total_steps(context) if self.most_steps is None else self.most_steps
 
     # -- answering ---------------------------------------------------------------------------------
 
