@@ -8,9 +8,12 @@ from pathlib import Path
 import pytest
 from invented import divide, invent
 from releases import real
+from threadpoolctl import threadpool_limits
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
+
+threadpool_limits(1, "blas")  # as every command has it
 
 
 @pytest.fixture(scope="session")

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from threadpoolctl import threadpool_limits
 
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
@@ -22,7 +23,7 @@ class RunSettings(Checked):
 
     Attributes:
         seed: of whatever is random.
-        threads: CPU threads; None takes what torch finds.
+        threads: CPU threads of torch; None takes what it finds. NumPy's factorisations use one.
         eval_on: rows that are scored.
         baselines: names of methods; None: all plain ones that serve the data.
         budget_s: seconds of training, or of timing; None: as the rest is configured.
@@ -65,6 +66,9 @@ class RunSettings(Checked):
                 Limit("a finite number", math.isfinite).check(key, value)
         if found.threads is not None:
             torch.set_num_threads(found.threads)
+        threadpool_limits(
+            1, "blas"
+        )  # NumPy's: two threads beside other work took 10 to 400 times as long as one
         return found
 
 
