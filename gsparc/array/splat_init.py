@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.cross_validation import LeftOut, tune
+from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered, report
 from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
 from gsparc.data.files import platform_cache
@@ -47,7 +47,6 @@ class Learned:
         weights: (E, M) complex128, features to array vectors.
         background: (H, W) float32, the mean spectrum.
         error: level and power of the field's `ErrorModel`.
-        left_out: training spectra predicted without their neighbours; None for too few.
         elapsed, training: time of phase retrieval in this run, and when it was computed.
         time_limited: whether seconds ended it.
     """
@@ -56,7 +55,6 @@ class Learned:
     weights: Tensor
     background: Tensor
     error: tuple[float, float]
-    left_out: LeftOut | None
     elapsed: Spent
     training: Spent
     time_limited: bool
@@ -80,7 +78,7 @@ class ThroughArray:
         found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         return Start(
             found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
-            astuple(found.elapsed), found.time_limited, found.left_out,
+            astuple(found.elapsed), found.time_limited,
         )  # fmt: skip
 
 
@@ -129,7 +127,6 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         features.weigh.to(torch.complex128) @ torch.from_numpy(process.vectors),
         torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
         tuned.error_model(),
-        tuned.left_out,
         elapsed,
         training,
         bool(found.time_limited.any()),
