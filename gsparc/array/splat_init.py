@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered, report
-from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
+from gsparc.array.vector_gp import aligned_by, mirror_elements
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
@@ -113,7 +113,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
     partner, places = mirror_elements(site.array), data.tx[rows]
     tuned = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed)
     kernel = tuned.kernel
-    process = fit_vector_gp(found.vectors, places, partner, kernel)
+    vectors = aligned_by(found.vectors, places, partner, kernel)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
@@ -124,7 +124,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         Prior(
             features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
         ),
-        features.weigh.to(torch.complex128) @ torch.from_numpy(process.vectors),
+        features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
         tuned.error_model(),
         elapsed,
