@@ -8,11 +8,12 @@ likelihood).
 from __future__ import annotations
 
 import numpy as np
+import torch
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.field.kernels import ROUGH_RATIO, ROUGH_SHARE
+from gsparc.field.kernels import correlation
 from gsparc.methods import gp
 
 SWEEPS = 30
@@ -28,10 +29,7 @@ class Kernel(gp.Kernel):
 
     def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """See the base class."""
-        distance = cdist(a, b) / self.length
-        smooth, rough = 5**0.5 * distance, 3**0.5 / ROUGH_RATIO * distance
-        long = (1 + smooth + smooth**2 / 3) * np.exp(-smooth)
-        return (1 - ROUGH_SHARE) * long + ROUGH_SHARE * (1 + rough) * np.exp(-rough)
+        return correlation(*map(torch.from_numpy, (a, b)), self.length, "smooth_rough").numpy()
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
