@@ -93,9 +93,6 @@ def dataset_overrides() -> list[str]:
 
 def train(file: Path) -> None:
     """The same short training on the CPU and on the GPU, through train.py."""
-    import measure
-
-    update(file, learning=guarded(lambda: measure.learning(200)))
     results: dict[str, Any] = {"dataset": dataset_overrides()[0]}
     for accelerator in ("gpu", "cpu"):
         folder = Path("build") / f"train-{accelerator}"

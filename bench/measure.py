@@ -8,7 +8,6 @@ finished result.
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -385,31 +384,3 @@ def touch_everything() -> None:
     for samples in (1, 21):
         networks(torch.rand(samples, 19, device="cuda"), *weights).sum().backward()
     torch.cuda.synchronize()
-
-
-def learning(steps: int) -> dict[str, Any]:
-    """The same gradient descent on the CPU and on the GPU from the same start: losses side by side."""
-    target_model, pose = scene(400, seed=3), origin()
-    features = torch.rand(6, 400, 1, device="cuda")
-    target = rasterize(*target_model, features, pose, GRID).image.detach()
-    found: dict[str, Any] = {}
-    for device in ("cpu", "cuda"):
-        start = [tensor.to(device) for tensor in scene(300, seed=4)]
-        means, quats, log_scales, logits = start[0], start[1], start[2].log(), torch.logit(start[3])
-        emitted = torch.zeros(6, 300, 1, device=device)
-        leaves = [t.clone().requires_grad_() for t in (means, quats, log_scales, logits, emitted)]
-        optimizer = torch.optim.Adam(leaves, lr=0.01)
-        there, wanted = pose.to(device), target.to(device)
-        losses, started = [], time.perf_counter()
-        for _ in range(steps):
-            m, q, s, o, f = leaves
-            image = rasterize(m, q, s.exp(), torch.sigmoid(o), torch.sigmoid(f), there, GRID).image
-            loss = (image - wanted).square().mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
-            losses.append(loss.detach())
-        first, last = float(losses[0]), float(losses[-1])
-        found[device] = {"first": first, "last": last, "seconds": time.perf_counter() - started}
-    found["last_loss_ratio"] = found["cuda"]["last"] / found["cpu"]["last"]
-    return found

@@ -15,38 +15,13 @@ from scipy.spatial.distance import cdist
 
 from gsparc.array.vector_gp import Kernel, align, refine_alignment
 from gsparc.field.confidence import fit_errors
-from gsparc.methods.gp import choose_kernel
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
 PIXELS = 600  # drawn from the grid: the score needs no more
 ROWS = 384  # neighbouring samples used: the inverse costs their cube
 CENTRES = 160  # of them predicted
 STEPS = 36  # evaluations of Nelder-Mead
-WEIGHTS = np.linspace(0, 1, 21)  # candidates of the ensemble weight of a process on images
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """Training spectra predicted without their neighbours.
-
-    Attributes:
-        positions: (n, 3) [m].
-        images: (n, P) float64, some pixels of the spectra.
-        centres: (c,) rows that were held out.
-        gaps: (g,) [m] within which their neighbours were held out, too.
-        predicted: (g, c, P); NaN where no sample was left.
-    """
-
-    positions: np.ndarray
-    images: np.ndarray
-    centres: np.ndarray
-    gaps: np.ndarray
-    predicted: np.ndarray
-
-    def mismatch_db(self, predicted: np.ndarray) -> float:
-        """Minus the PSNR [dB] of predictions (g, c, P), averaged over samples and gaps."""
-        return 10 / np.log(10) * _mean_log_error(((predicted - self.images[self.centres]) ** 2).mean(-1))
 
 
 def predict_left_out(
@@ -100,13 +75,11 @@ class Tuned:
         kernel: length and noise.
         unknown: (k,) posterior variance of each held-out prediction, as a share of the prior's.
         error: (k,) mean squared error of its spectrum.
-        left_out: the held-out predictions; None for too few samples.
     """
 
     kernel: Kernel
     unknown: np.ndarray
     error: np.ndarray
-    left_out: LeftOut | None = None
 
     def error_model(self) -> tuple[float, float]:
         """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
@@ -179,8 +152,7 @@ def tune(
     unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
     error = samples.error(predicted)
     seen = ~np.isnan(error)
-    left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
-    return Tuned(kernel, unknown[seen], error[seen], left_out)
+    return Tuned(kernel, unknown[seen], error[seen])
 
 
 @dataclass(frozen=True)
@@ -204,18 +176,3 @@ class _Samples:
     def error(self, predicted: np.ndarray) -> np.ndarray:
         """(g, c) mean squared."""
         return ((predicted - self.images[self.centres]) ** 2).mean(-1)
-
-
-def compared(left: LeftOut) -> tuple[float, float]:
-    """Loss in PSNR [dB] of a Gaussian process on images to the array model, and its best ensemble weight.
-
-    On the same samples, gaps and pixels; the kernel is chosen on all samples.
-    """
-    mean = left.images.mean(0)
-    vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
-    kernel = choose_kernel(left.positions, vectors * lengths, len(mean))
-    inverse = np.linalg.inv(kernel.gram(left.positions))
-    distance = np.linalg.norm(left.positions[:, None] - left.positions[None], axis=-1)
-    predicted = mean + predict_left_out(inverse, left.images - mean, distance, left.centres, left.gaps)[0]
-    error = [left.mismatch_db((1 - w) * left.predicted + w * predicted) for w in WEIGHTS]
-    return error[-1] - error[0], float(WEIGHTS[int(np.argmin(error))])

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
-from gsparc.array.cross_validation import compared
-from gsparc.array.phase_retrieval import recover
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Site
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.methods.method import PredictsVariance
 from gsparc.training.splatting import LearnedField
-
-ARRAY_SHARE = 0.75  # of the probed images that the declared array must be able to have measured
 
 
 class ArrayField(LearnedField, PredictsVariance):
@@ -42,19 +36,6 @@ class ArrayField(LearnedField, PredictsVariance):
             name=name,
             steps=0,
         )
-
-    def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
-        """See `Explains`: whether vectors of one number per element make the images of rows (n,)."""
-        found = recover(data.site, data.target[rows], data.moving[rows], seed=seed)
-        share = 1 - float(found.suspect.mean())
-        assert data.site.array is not None
-        elements = len(data.site.array)
-        reason = f"{share:.0%} of {len(rows)} probed images are explained by {elements} complex numbers each"
-        return share >= ARRAY_SHARE, reason
-
-    def compared_with_gp(self) -> tuple[float, float] | None:
-        """See `ComparesWithGP`."""
-        return None if self._left_out is None else compared(self._left_out)
 
     def trainer_options(self) -> bool:
         """See `TrainsByGradient`: it is solved in closed form."""

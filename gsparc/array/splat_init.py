@@ -16,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.array.cross_validation import LeftOut, tune
+from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered, report
-from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
+from gsparc.array.vector_gp import aligned_by, mirror_elements
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
@@ -47,7 +47,6 @@ class Learned:
         weights: (E, M) complex128, features to array vectors.
         background: (H, W) float32, the mean spectrum.
         error: level and power of the field's `ErrorModel`.
-        left_out: training spectra predicted without their neighbours; None for too few.
         elapsed, training: time of phase retrieval in this run, and when it was computed.
         time_limited: whether seconds ended it.
     """
@@ -56,7 +55,6 @@ class Learned:
     weights: Tensor
     background: Tensor
     error: tuple[float, float]
-    left_out: LeftOut | None
     elapsed: Spent
     training: Spent
     time_limited: bool
@@ -80,7 +78,7 @@ class ThroughArray:
         found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         return Start(
             found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
-            astuple(found.elapsed), found.time_limited, found.left_out,
+            astuple(found.elapsed), found.time_limited,
         )  # fmt: skip
 
 
@@ -115,7 +113,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
     partner, places = mirror_elements(site.array), data.tx[rows]
     tuned = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed)
     kernel = tuned.kernel
-    process = fit_vector_gp(found.vectors, places, partner, kernel)
+    vectors = aligned_by(found.vectors, places, partner, kernel)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
@@ -126,10 +124,9 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         Prior(
             features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
         ),
-        features.weigh.to(torch.complex128) @ torch.from_numpy(process.vectors),
+        features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
         tuned.error_model(),
-        tuned.left_out,
         elapsed,
         training,
         bool(found.time_limited.any()),

@@ -1,26 +1,22 @@
-"""A complex Gaussian process on array vectors whose phases and twins are unknown; used in training only.
+"""Array vectors whose phases and twins are unknown, aligned under a Gaussian process; used in training only.
 
 Each spectrum gives its vector up to a global phase and a twin. Both are free parameters of every sample, set
 in turn to the value under which its vector is most likely given all others (coordinate ascent of the
-likelihood). The expected spectrum at a query is the mean amplitude of a Rice distribution, nearly the root of
-a coherent part `|A^H mu|^2` plus an incoherent one that grows with the variance up to the mean image, far
-from all data.
+likelihood).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
+import torch
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.field.kernels import ROUGH_RATIO, ROUGH_SHARE
+from gsparc.field.kernels import correlation
 from gsparc.methods import gp
 
 SWEEPS = 30
-QUERIES = 2048  # at a time: bounds the memory for thousands of samples
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
 TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
@@ -33,10 +29,7 @@ class Kernel(gp.Kernel):
 
     def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """See the base class."""
-        distance = cdist(a, b) / self.length
-        smooth, rough = 5**0.5 * distance, 3**0.5 / ROUGH_RATIO * distance
-        long = (1 + smooth + smooth**2 / 3) * np.exp(-smooth)
-        return (1 - ROUGH_SHARE) * long + ROUGH_SHARE * (1 + rough) * np.exp(-rough)
+        return correlation(*map(torch.from_numpy, (a, b)), self.length, "smooth_rough").numpy()
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
@@ -104,41 +97,6 @@ def _nearest_done(tree: cKDTree, positions: np.ndarray, i: int, done: np.ndarray
         reach *= 4
 
 
-@dataclass(frozen=True)
-class VectorGP:
-    """Posterior of the array vector as a function of the transmitter's position.
-
-    Attributes:
-        kernel: correlations of the field with itself.
-        positions: (n, 3) [m].
-        vectors: (n, M) complex128, phases and twins aligned.
-        inverse: (n, n) inverse of the correlation matrix with noise.
-    """
-
-    kernel: Kernel
-    positions: np.ndarray
-    vectors: np.ndarray
-    inverse: np.ndarray
-
-    def posterior(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (B, M) complex and variance (B,) in [0, 1], relative to the prior's, at (B, 3) [m]."""
-        weights = self.inverse @ self.vectors
-        mean = np.empty((len(queries), weights.shape[1]), dtype=np.complex128)
-        unknown = np.empty(len(queries))
-        for start in range(0, len(queries), QUERIES):
-            part = slice(start, start + QUERIES)
-            cross = self.kernel.cross(queries[part], self.positions)
-            mean[part] = cross @ weights
-            unknown[part] = 1 - np.einsum("ij,ij->i", cross @ self.inverse, cross)
-        return mean, np.clip(unknown, 0.0, 1.0)
-
-    def at_samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """`posterior(positions)` from `K = (K + noise) - noise`, without products of n x n matrices."""
-        noise = self.kernel.noise
-        mean = self.vectors - noise * (self.inverse @ self.vectors)
-        return mean, np.clip(noise - noise**2 * np.diag(self.inverse), 0.0, 1.0)
-
-
 def refine_alignment(
     vectors: np.ndarray, inverse: np.ndarray, partner: np.ndarray | None, sweeps: int = SWEEPS
 ) -> np.ndarray:
@@ -172,18 +130,16 @@ def refine_alignment(
     return aligned
 
 
-def fit_vector_gp(
+def aligned_by(
     vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
-) -> VectorGP:
-    """Align phases and twins, then fit the process.
+) -> np.ndarray:
+    """Vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
 
     Args:
         vectors: (n, M) complex, phases and twins unknown.
         positions: (n, 3) [m].
         partner: of `mirror_elements`.
-        kernel: length and noise; its amplitude is set here.
+        kernel: length and noise.
     """
     inverse = np.linalg.inv(kernel.gram(positions))
-    aligned = refine_alignment(align(vectors, positions, partner), inverse, partner)
-    amplitude = float(np.einsum("im,ij,jm->", aligned.conj(), inverse, aligned).real) / aligned.size
-    return VectorGP(replace(kernel, amplitude=amplitude), positions, aligned, inverse)
+    return refine_alignment(align(vectors, positions, partner), inverse, partner)

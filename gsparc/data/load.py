@@ -131,9 +131,19 @@ def _named(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
     return choices[str(name)]
 
 
+def _parameters(kind: Any) -> dict[str, inspect.Parameter]:
+    """What `kind` takes; what a dataset's class hands on by keyword is what its base takes."""
+    known = dict(inspect.signature(kind).parameters)
+    base = kind.__base__ if isinstance(kind, type) else None
+    handed = [name for name, p in known.items() if p.kind is p.VAR_KEYWORD]
+    if handed and base is not DataModule and issubclass(base or object, DataModule):
+        known = {**_parameters(base), **{name: p for name, p in known.items() if name not in handed}}
+    return known
+
+
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
     """The settings that `kind` takes, none unknown or missing; an unknown one that is null was not said."""
-    known = inspect.signature(kind).parameters
+    known = _parameters(kind)
     if any(p.kind is p.VAR_KEYWORD for p in known.values()):
         return settings
     kept, name = {}, settings.get("name")

@@ -191,22 +191,6 @@ class LeaveOneOut(Protocol):
 
 
 @runtime_checkable
-class ComparesWithGP(Protocol):
-    """Can say by left-out rows how much a Gaussian process on whole targets would add to it."""
-
-    def compared_with_gp(self) -> tuple[float, float] | None:
-        """How far the process is behind [dB], and its best weight in their mean; None: too few rows."""
-
-
-@runtime_checkable
-class Explains(Protocol):
-    """Can say before it is fitted whether its model of the measurement holds."""
-
-    def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
-        """Whether it can have made the targets of rows (n,), and the measurement that decided, one clause."""
-
-
-@runtime_checkable
 class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 

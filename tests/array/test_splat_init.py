@@ -14,7 +14,7 @@ from known_arrays import spectra
 from gsparc.array import splat_init
 from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered
-from gsparc.array.vector_gp import fit_vector_gp, mirror_elements
+from gsparc.array.vector_gp import aligned_by, mirror_elements
 from gsparc.data.files import platform_cache
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import seen_by_array
@@ -43,20 +43,22 @@ def trained(known_campaign, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def process(trained):
-    """The vector process of the same 100 spectra, and its mean and variance at the others."""
+    """Mean and variance of the vector process of the same 100 spectra, at the others."""
     _, data, fold = trained
     site, places = data.site, data.tx[fold.train]
     images = data.target[fold.train].reshape(100, -1).astype(np.float32) / 255
     matrix, partner = steering(site.array, site.grid, site.wavelength).numpy(), mirror_elements(site.array)
     found, _ = recovered(data, fold.train, platform_cache())  # the same solutions
     kernel = tune(found.vectors, places, images, matrix, site.wavelength, partner).kernel
-    return fit_vector_gp(found.vectors, places, partner, kernel)
+    vectors = aligned_by(found.vectors, places, partner, kernel)
+    inverse, cross = np.linalg.inv(kernel.gram(places)), kernel.cross(data.tx[fold.test], places)
+    return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
 
 
 def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     method, data, fold = trained
     model, batch = method.fitted(), data.batch(fold.test)
-    mean, variance = process.posterior(data.tx[fold.test])
+    mean, variance = process
     emitted = torch.view_as_complex(model.features(batch.tx, batch.rx).contiguous()).detach()
     vectors = (emitted @ seen_by_array(model, batch.rx)).numpy()
     # One phase is common to all vectors and known to nobody.
@@ -68,7 +70,7 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
 def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
     method, data, fold = trained
     said, batch = method.predict(*_ends(data, fold.test)), data.batch(fold.test)
-    mean, variance = process.posterior(data.tx[fold.test])
+    mean, variance = process
     background = torch.from_numpy(data.targets(fold.train).numpy().mean(0))
     known = spectra(data.site, torch.from_numpy(mean)).square()
     wanted = (known + torch.from_numpy(variance)[:, None, None] * background.square()).sqrt().clamp(max=1)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from sklearn.gaussian_process.kernels import Matern
 
-from gsparc.array.vector_gp import Kernel
 from gsparc.field.encoding import EncodingSettings, PositionEncoding, Prior, unknown_share
 from gsparc.field.kernels import apart, correlation, whitened, with_places
 
@@ -31,10 +31,10 @@ def told(features, values: torch.Tensor, asked: torch.Tensor):
     return seen @ (features.weigh @ values), unknown_share(seen)
 
 
-def test_the_correlation_is_that_of_the_vectors():
+def test_the_correlation_is_a_mixture_of_two_matern_functions():
     a, b = rows(7), rows(9, 1)
-    found = correlation(a, b, LENGTH, NAME).numpy()
-    np.testing.assert_allclose(found, Kernel(LENGTH, NOISE).cross(a.numpy(), b.numpy()), atol=1e-12)
+    long, short = (Matern(length, nu=nu)(a, b) for length, nu in ((LENGTH, 2.5), (LENGTH / 3, 1.5)))
+    np.testing.assert_allclose(correlation(a, b, LENGTH, NAME), 0.85 * long + 0.15 * short, atol=1e-12)
 
 
 def test_a_correlation_that_there_is_not_is_refused():

@@ -39,8 +39,8 @@ DECLARED = {
     "complex_gp": "HasVariance Differentiable LeaveOneOut",
     "directional_gp": "HasVariance Differentiable LeaveOneOut HasPaths",
     "image_source_gp": "HasVariance LeaveOneOut HasPaths Reducible",
-    "array": "HasVariance Differentiable Reducible Explains ComparesWithGP",
-    "moving_array": "HasVariance Reducible Explains",
+    "array": "HasVariance Differentiable Reducible",
+    "moving_array": "HasVariance Reducible",
     "gsparc": "Differentiable HasPaths Reducible",
 }
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})

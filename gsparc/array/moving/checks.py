@@ -3,25 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.methods.target_rows import to_real
 from gsparc.physics.lags import Lags
 
 MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
-
-
-def explains(data: Measurements, rows: np.ndarray) -> tuple[bool, str]:
-    """Whether a moving array can have measured the spectra of rows (n,), and the measurement that decided."""
-    problem, site = site_problem(data), data.site
-    if problem is not None:
-        return False, problem
-    images = torch.from_numpy(to_real(data.target[rows], site.kind)).reshape(data.target[rows].shape)
-    _, residual = unexplained_energy(Lags(*site.array_geometry()), images)
-    share = f"{residual:.1%} of the energy of {len(rows)} probed images"
-    return residual <= MAX_UNEXPLAINED, f"{share} is outside the moving array's lags"
 
 
 def unexplained_energy(space: Lags, images: Tensor) -> tuple[int, float]:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.array.moving import reduce
-from gsparc.array.moving.checks import MAX_UNEXPLAINED, explains, site_problem, unexplained_energy
+from gsparc.array.moving.checks import MAX_UNEXPLAINED, site_problem, unexplained_energy
 from gsparc.array.moving.error_model import ErrorModel, fit_error_model, image_features
 from gsparc.array.moving.old_state import renewed
 from gsparc.array.moving.power_gp import Trend, TrendSettings, fit_trend
@@ -125,10 +125,6 @@ class MovingArrayField(Interpolator, PredictsVariance):
             raise ValueError(f"{self.name}: {problem}")
         self._budget, self._lags = context.time_budget(), None
         return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
-
-    def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
-        """See `Explains`."""
-        return explains(data, rows)
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`; searches where there are several."""

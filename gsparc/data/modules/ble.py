@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gsparc.data.campaigns.ble import raw_of_ble
 from gsparc.data.modules.campaign import Campaign
@@ -15,22 +15,12 @@ class BLE(Campaign):
 
     Args:
         file: *.npz.
-        stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
-        name, batch_size: see `DataModule`.
+        name: of run directories.
+        **rest: see `Campaign`.
     """
 
-    def __init__(
-        self,
-        file: str | Path,
-        stations: Sequence[str | int] | None = None,
-        runs: Sequence[str | int] | None = None,
-        min_rssi_db: float | None = None,
-        max_rows: int | None = None,
-        level_steps: Mapping[str, Sequence[int]] | None = None,
-        name: str = "ble",
-        batch_size: int = 16,
-    ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
+    def __init__(self, file: str | Path, name: str = "ble", **rest: Any) -> None:
+        super().__init__(file, name, **rest)
 
     def raw(self) -> Raw:
         """Powers (S, T) of a moving transmitter at T stations."""

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from gsparc.data.campaigns.recognise import campaign_of
 from gsparc.data.checks.describe import raw_of
@@ -20,25 +21,21 @@ class Own(Campaign):
 
     Args:
         file: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
+        name: of run directories.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
-        name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
+        **rest: see `Campaign`.
     """
 
     def __init__(
         self,
         file: str | Path,
         name: str = "own",
-        batch_size: int = 16,
-        stations: Sequence[str | int] | None = None,
-        runs: Sequence[str | int] | None = None,
-        min_rssi_db: float | None = None,
-        max_rows: int | None = None,
-        level_steps: Mapping[str, Sequence[int]] | None = None,
         columns: Mapping[str, object] | None = None,
         stations_file: str | Path | None = None,
+        **rest: Any,
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
+        super().__init__(file, name, **rest)
         self.columns, self.stations_file = columns or {}, stations_file
 
     def raw(self) -> Raw:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gsparc.data.campaigns.powder import STATION_M, WALKER_M, raw_of_powder
 from gsparc.data.modules.campaign import Campaign
@@ -17,8 +17,8 @@ class Powder(Campaign):
         file: *.npz, or the release's *.csv.
         station_table: coordinates of the stations of a CSV; None: `location_coordinates.json` beside it.
         tx_height, station_height: above ground [m].
-        stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
-        name, batch_size: see `DataModule`.
+        name: of run directories.
+        **rest: see `Campaign`.
     """
 
     def __init__(
@@ -27,15 +27,10 @@ class Powder(Campaign):
         station_table: str | Path | None = None,
         tx_height: float = WALKER_M,
         station_height: float = STATION_M,
-        stations: Sequence[str | int] | None = None,
-        runs: Sequence[str | int] | None = None,
-        min_rssi_db: float | None = None,
-        max_rows: int | None = None,
-        level_steps: Mapping[str, Sequence[int]] | None = None,
         name: str = "powder",
-        batch_size: int = 16,
+        **rest: Any,
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
+        super().__init__(file, name, **rest)
         self.station_table, self.heights = station_table, (tx_height, station_height)
 
     def raw(self) -> Raw:

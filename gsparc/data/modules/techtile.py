@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from gsparc.data.campaigns.techtile import raw_of_techtile
 from gsparc.data.modules.campaign import Campaign
@@ -16,23 +16,14 @@ class Techtile(Campaign):
     Args:
         file: *.npz, or the release's *.nc.
         antennas: places of the antennas of a NetCDF file; None: `techtile_antenna_locations.yml` beside it.
-        stations, runs, min_rssi_db, max_rows, level_steps: see `Campaign`.
-        name, batch_size: see `DataModule`.
+        name: of run directories.
+        **rest: see `Campaign`.
     """
 
     def __init__(
-        self,
-        file: str | Path,
-        antennas: str | Path | None = None,
-        stations: Sequence[str | int] | None = None,
-        runs: Sequence[str | int] | None = None,
-        min_rssi_db: float | None = None,
-        max_rows: int | None = None,
-        level_steps: Mapping[str, Sequence[int]] | None = None,
-        name: str = "techtile",
-        batch_size: int = 16,
+        self, file: str | Path, antennas: str | Path | None = None, name: str = "techtile", **rest: Any
     ) -> None:
-        super().__init__(file, name, batch_size, stations, runs, min_rssi_db, max_rows, level_steps)
+        super().__init__(file, name, **rest)
         self.antennas = antennas
 
     def raw(self) -> Raw:
