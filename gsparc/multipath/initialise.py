@@ -8,13 +8,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.data.walls import EXPECTED, SceneWalls, read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, residuals
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.image_source_gp import ImageSourceGP
+from gsparc.multipath.known.method import KnownWallsGP
 from gsparc.multipath.powers import field as power_field
 from gsparc.multipath.powers.field import PowerSettings
 from gsparc.multipath.source_field import RayField, SourceField
@@ -35,6 +38,33 @@ def sources(
     )  # fmt: skip
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     return _completed(SourceField(method), data, report)
+
+
+def scene(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Images of the static end in the walls of `init.file`.
+
+    Raises:
+        DataError: no such file, or walls that cannot be.
+    """
+    method = KnownWallsGP(
+        walls_of(init), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
+        order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
+    )  # fmt: skip
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return _completed(SourceField(method), data, report)
+
+
+def walls_of(init: InitSettings) -> SceneWalls:
+    """The walls that `init=scene` names.
+
+    Raises:
+        DataError: none are named, no such file, or walls that cannot be.
+    """
+    if init.file is None:
+        raise DataError(f"init=scene: init.file is missing; expected a file of {EXPECTED}")
+    return read_walls(init.file)
 
 
 def rays(
