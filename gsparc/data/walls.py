@@ -1,4 +1,4 @@
-"""Known walls and boxes of a scene out of a file: YAML as `gsparc simulate` reads it, or a mesh as Wavefront OBJ.
+"""Known walls and boxes of a scene out of a file: YAML (a simulated room too), or a mesh as Wavefront OBJ.
 
 The format of meshes: Wavefront Technologies, "Object files (.obj)", Advanced Visualizer manual, appendix B1.
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import Problems, reason
+from gsparc.data.errors import DataError, Problems, reason
 from gsparc.data.files import read_yaml
 from gsparc.data.instantiate import suggest
 
@@ -40,12 +40,14 @@ class SceneWalls:
         return len(self.faces) + len(self.boxes)
 
 
-def read_walls(path: str | Path) -> SceneWalls:
+def read_walls(path: str | Path | None) -> SceneWalls:
     """Walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
 
     Raises:
-        DataError: no such file, of another kind, or with walls that cannot be.
+        DataError: none is named, no such file, of another kind, or with walls that cannot be.
     """
+    if path is None:
+        raise DataError(f"init.file is missing; expected a file of {EXPECTED}")
     path, problems = Path(path), Problems(path)
     found = SceneWalls((), np.zeros((0, 2, 3)))
     if path.suffix.lower() == ".obj":
@@ -53,7 +55,9 @@ def read_walls(path: str | Path) -> SceneWalls:
     elif path.suffix.lower() in (".yaml", ".yml"):
         found = _table(path, problems)
     else:
-        problems.add(path, "walls are read from *.yaml or *.obj; export meshes of other kinds as Wavefront OBJ")
+        problems.add(
+            path, "walls are read from *.yaml or *.obj; export meshes of other kinds as Wavefront OBJ"
+        )
     if not problems and not len(found):
         problems.add(path, f"no walls in it; expected {EXPECTED}")
     problems.raise_if_any()
@@ -103,7 +107,9 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
     if room.get("boxes_m"):
         found = _numbers(room["boxes_m"])
         if found is None or found.shape[1:] != (2, 3) or not (found[:, 0] < found[:, 1]).all():
-            problems.add(path, "room.boxes_m: expected [[x, y, z], [x, y, z]] of each, lower corner first [m]")
+            problems.add(
+                path, "room.boxes_m: expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
+            )
         else:
             boxes = found
     return faces, boxes
@@ -111,14 +117,13 @@ def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], 
 
 def _mesh(path: Path, problems: Problems) -> SceneWalls:
     """Faces of all objects; texture, normals and materials are not read."""
+    nothing = SceneWalls((), np.zeros((0, 2, 3)))
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except FileNotFoundError:
-        return problems.add(path, "missing; expected a mesh *.obj") or SceneWalls((), np.zeros((0, 2, 3)))
+        return problems.add(path, "missing; expected a mesh *.obj") or nothing
     except (UnicodeDecodeError, OSError) as error:
-        return problems.add(path, f"not readable as text ({reason(error)})") or SceneWalls(
-            (), np.zeros((0, 2, 3))
-        )
+        return problems.add(path, f"not readable as text ({reason(error)})") or nothing
     corners: list[list[float]] = []
     faces: list[np.ndarray] = []
     for number, line in enumerate(lines, 1):

@@ -34,7 +34,13 @@ def affordable_order(mirrors: int, order: int) -> int:
 
 
 def visible_words(
-    mirrors: Mirrors, letters: list[int], transmitter: Tensor, places: Tensor, order: int, most: int, hidden: bool
+    mirrors: Mirrors,
+    letters: list[int],
+    transmitter: Tensor,
+    places: Tensor,
+    order: int,
+    most: int,
+    hidden: bool,
 ) -> tuple[Word, ...]:
     """At most `most` words, the static end's own first, then by power expected at the places.
 
@@ -60,7 +66,9 @@ def visible_words(
     kept = scores.topk(min(SHORTLIST * most, len(words))).indices
     kept = kept[scores[kept] > 0]
     if hidden and len(kept):
-        parts = [_seen(mirrors, [words[i] for i in part.tolist()], transmitter, places) for part in kept.split(50)]
+        parts = [
+            _seen(mirrors, [words[i] for i in part.tolist()], transmitter, places) for part in kept.split(50)
+        ]
         seen = torch.cat(parts)
         kept, power = kept[seen > SEEN], (scores[kept] * seen)[seen > SEEN]
         kept = kept[power.argsort(descending=True)]
@@ -103,7 +111,9 @@ def _power(mirrors: Mirrors, words: list[Word], transmitter: Tensor, places: Ten
     order = torch.tensor([len(word) for word in words])
     power = away.square().reciprocal()
     if hidden:
-        power = power * _reflected(mirrors, Unfolding.of(transmitter, mirrors.planes, tuple(words)).paths(places))
+        power = power * _reflected(
+            mirrors, Unfolding.of(transmitter, mirrors.planes, tuple(words)).paths(places)
+        )
     return power.mean(1) * REFLECTED ** (2 * order)
 
 

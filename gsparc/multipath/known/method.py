@@ -8,7 +8,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from gsparc.data.walls import SceneWalls
@@ -64,7 +63,9 @@ class KnownWallsGP(ImageSourceGP):
         cost = partial(prior.cost, words=phased.scene.words)
         phased = refine_phase.refine(rows, phased, STEPS[2], floor, cost, over)
         error = left_out_error(rows, phased, floor)
-        log.info("known walls: %d sources over %d planes, error %.3f", len(scene.words), len(scene.planes), error)
+        log.info(
+            "known walls: %d sources over %d planes, error %.3f", len(scene.words), len(scene.planes), error
+        )
         return [Member(phased, error)]
 
     def _scene(self, rows: Rows, settings: SearchSettings, clutter: bool) -> Scene:
@@ -73,7 +74,9 @@ class KnownWallsGP(ImageSourceGP):
         transmitter = self._transmitter()
         mirrors = Mirrors.of(self.walls, self.site.origin + self.frame.middle.numpy())
         if mirrors.left_out:
-            log.info("the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES)
+            log.info(
+                "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
+            )
         letters = mirrors.mirroring(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
         order = affordable_order(len(letters), settings.order)
         if order < settings.order:

@@ -60,7 +60,9 @@ class Mirrors:
     def mirroring(self, smallest: float) -> list[int]:
         """Numbers of planes with a rectangle whose sides are at least so long [m]: others only block."""
         sides = (self.clutter.patches[:, 2:] - self.clutter.patches[:, :2]).amin(1)
-        wide = {plane for plane, side in zip(self.clutter.plane, sides.tolist(), strict=True) if side >= smallest}
+        wide = {
+            plane for plane, side in zip(self.clutter.plane, sides.tolist(), strict=True) if side >= smallest
+        }
         return sorted(wide)
 
 
