@@ -15,7 +15,7 @@ from gsparc.multipath.known.mirrors import Mirrors
 from gsparc.physics.mirror_planes import Word, all_words, images
 
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
-MOST_WORDS = 5_000  # sequences of walls that are looked at
+MOST_WORDS = 3_000  # sequences of walls of each length that are looked at, over the largest of them
 LOOKED_FROM = 100  # places
 WORDS_AT_ONCE = 400
 SHORTLIST = 4  # times as many as are wanted, before what walls hide is looked at
@@ -23,14 +23,12 @@ SEEN = 1e-3  # mean share of an image that is kept
 HIDES = 0.01  # share of one image that a rectangle takes, to be kept
 
 
-def affordable_order(mirrors: int, order: int) -> int:
-    """The largest order, at most `order`, of which there are at most `MOST_WORDS` sequences."""
-    total = 0
-    for length in range(1, order + 1):
-        total += mirrors * max(mirrors - 1, 0) ** (length - 1)
-        if total > MOST_WORDS:
-            return max(length - 1, 1)
-    return order
+def affordable(mirrors: int, length: int) -> int:
+    """How many mirrors, at most `mirrors`, have at most `MOST_WORDS` sequences of so many reflections."""
+    count = mirrors
+    while count > 1 and count * (count - 1) ** (length - 1) > MOST_WORDS:
+        count -= 1
+    return count
 
 
 def visible_words(
@@ -46,7 +44,7 @@ def visible_words(
 
     Args:
         mirrors: planes and rectangles.
-        letters: planes that mirror.
+        letters: planes that mirror, the largest first.
         transmitter: (3,) float64 [m].
         places: (n, 3) float64 [m] of receivers.
         order: largest number of reflections.
@@ -54,7 +52,13 @@ def visible_words(
         hidden: whether walls end and hide; else every image is seen from everywhere.
     """
     places = places[torch.linspace(0, len(places) - 1, min(LOOKED_FROM, len(places))).long()]
-    words = _distinct(all_words(letters, order), transmitter, mirrors.planes)
+    sequences = [
+        word
+        for length in range(1, order + 1)
+        for word in all_words(letters[: affordable(len(letters), length)], length)
+        if len(word) == length
+    ]
+    words = _distinct(sequences, transmitter, mirrors.planes)
     if not words or most < 2:
         return ((),)
     scores = torch.cat(

@@ -19,7 +19,7 @@ from gsparc.multipath.clutter.refine import ReflectionPhasePrior
 from gsparc.multipath.ensemble import SEARCH_END, compact, left_out_error
 from gsparc.multipath.gp_likelihood import Scene, steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
-from gsparc.multipath.known.images import affordable_order, hiding, start_amplitudes, visible_words
+from gsparc.multipath.known.images import affordable, hiding, start_amplitudes, visible_words
 from gsparc.multipath.known.mirrors import MOST_PATCHES, Mirrors
 from gsparc.multipath.phased_gp import PhasedScene
 from gsparc.multipath.refine import refine
@@ -88,9 +88,10 @@ class KnownWallsGP(ImageSourceGP):
                 "the %d smallest of the walls are left out: more than %d", mirrors.left_out, MOST_PATCHES
             )
         letters = mirrors.mirroring(LEAST_SIDE * LIGHT / float(rows.frequency.mean()))
-        order = affordable_order(len(letters), settings.order)
-        if order < settings.order:
-            log.info("images of at most %d reflections: %d walls have too many of more", order, len(letters))
+        order = settings.order
+        if order > 1 and affordable(len(letters), order) < len(letters):
+            few = affordable(len(letters), order)
+            log.info("images of %d reflections: in the %d largest of %d walls", order, few, len(letters))
         hidden = clutter and compact(rows)
         words = visible_words(
             mirrors, letters, transmitter, rows.position, order, settings.max_sources, hidden

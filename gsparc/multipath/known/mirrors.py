@@ -58,12 +58,16 @@ class Mirrors:
         return Mirrors(planes, Clutter(boxes, found[kept].float(), plane), len(found) - len(kept))
 
     def mirroring(self, smallest: float) -> list[int]:
-        """Numbers of planes with a rectangle whose sides are at least so long [m]: others only block."""
-        sides = (self.clutter.patches[:, 2:] - self.clutter.patches[:, :2]).amin(1)
-        wide = {
-            plane for plane, side in zip(self.clutter.plane, sides.tolist(), strict=True) if side >= smallest
-        }
-        return sorted(wide)
+        """Numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
+
+        Others only block.
+        """
+        sides = self.clutter.patches[:, 2:] - self.clutter.patches[:, :2]
+        size: dict[int, float] = {}
+        for plane, (one, other) in zip(self.clutter.plane, sides.tolist(), strict=True):
+            if min(one, other) >= smallest:
+                size[plane] = size.get(plane, 0.0) + one * other
+        return sorted(size, key=lambda plane: -size[plane])
 
 
 def _by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.ndarray]]]:
