@@ -49,6 +49,7 @@ def initialiser(name: str) -> Any:
 
 FIELDS = {  # fields whose weights are in closed form: what makes them of measurements, and of a state
     "sources": ("gsparc.multipath.initialise.sources", "gsparc.multipath.source_field.restored_sources"),
+    "scene": ("gsparc.multipath.initialise.scene", "gsparc.multipath.source_field.restored_sources"),
     "rays": ("gsparc.multipath.initialise.rays", "gsparc.multipath.source_field.restored_rays"),
     "diffuse": ("gsparc.multipath.initialise.diffuse", "gsparc.multipath.waves.field.restored"),
     "powers": ("gsparc.multipath.initialise.powers", "gsparc.multipath.powers.field.restored"),

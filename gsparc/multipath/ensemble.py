@@ -138,27 +138,27 @@ def _search(
     phased = PhasedScene.of(rows, scene, QUADRATURE)
     phased = refine_phase.learn_visibility(rows, phased, 10, settings.visibility, noise_floor, over)
     phased = refine_phase.refine(rows, phased, 20, noise_floor, late=over)
-    error = _left_out(rows, phased, noise_floor)
-    if clutter and phased.quadrature < 1 and not at_noise_floor([error], noise_floor, 1) and _compact(rows):
+    error = left_out_error(rows, phased, noise_floor)
+    if clutter and phased.quadrature < 1 and not at_noise_floor([error], noise_floor, 1) and compact(rows):
         generator = torch.Generator().manual_seed(seed)
         phased = find_clutter(rows, phased, generator, late=over, noise_floor=noise_floor)
-        error = _left_out(rows, phased, noise_floor)
+        error = left_out_error(rows, phased, noise_floor)
     return Member(phased, error, number)
 
 
 def refined(rows: Rows, member: Member, noise_floor: float) -> Member:
     """A search's result on rows that have changed a little."""
     phased = refine_phase.refine(rows, member.phased, 20, noise_floor)
-    return Member(phased, _left_out(rows, phased, noise_floor), member.number)
+    return Member(phased, left_out_error(rows, phased, noise_floor), member.number)
 
 
-def _left_out(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:
+def left_out_error(rows: Rows, phased: PhasedScene, noise_floor: float) -> float:
     """NMSE of the rows, each receiver predicted from the others."""
     error = rows.target - PhasedPosterior(rows, phased, noise_floor).left_out()
     return float(error.abs().square().sum() / rows.target.abs().square().sum())
 
 
-def _compact(rows: Rows) -> bool:
+def compact(rows: Rows) -> bool:
     """Whether the static end's antennas are near enough to be occluded alike."""
     return rows.array is None or float((rows.array.amax(0) - rows.array.amin(0)).norm()) < COMPACT_M
 

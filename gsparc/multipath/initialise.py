@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import replace
 
@@ -10,17 +11,23 @@ import torch
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, residuals
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport
 from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.image_source_gp import ImageSourceGP
+from gsparc.multipath.known.method import KnownWallsGP
+from gsparc.multipath.known.panels import panels
 from gsparc.multipath.powers import field as power_field
 from gsparc.multipath.powers.field import PowerSettings
 from gsparc.multipath.source_field import RayField, SourceField
 from gsparc.multipath.waves import initial as waves
 from gsparc.multipath.waves.settings import ChannelSettings
 
+log = logging.getLogger(__name__)
+
+NO_BLOCKERS = PowerSettings(most=0)
 LEAST_GAIN = 0.03  # of the left-out residual's power, for a process on it
 
 
@@ -32,6 +39,24 @@ def sources(
         searches=init.searches, search_rows=init.search_rows, rows=init.rows, margin=init.margin,
         max_sources=init.max_sources, order=init.order, clutter=clutter, edges=init.edges,
         offsets=init.snapshot, seed=context.seed,
+    )  # fmt: skip
+    report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
+    return _completed(SourceField(method), data, report)
+
+
+def scene(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Images of the static end in the walls of `init.file`; of powers, walls in the way of paths.
+
+    Raises:
+        DataError: no such file, or walls that cannot be.
+    """
+    if data.site.kind == "rssi":
+        return powers(data, rows, init, clutter, context)
+    method = KnownWallsGP(
+        read_walls(init.file), search_rows=init.search_rows, rows=init.rows, max_sources=init.max_sources,
+        order=init.order, clutter=clutter, offsets=init.snapshot, seed=context.seed,
     )  # fmt: skip
     report = method.fit(data, Fold(rows, rows[:0], rows[:0]), context)
     return _completed(SourceField(method), data, report)
@@ -58,11 +83,22 @@ def diffuse(
 def powers(
     data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
 ) -> tuple[ConditionalField, FitReport]:
-    """What the path loses in Gaussians, or coherent waves, and a process of the rest."""
+    """What the path loses in Gaussians, or coherent waves, and a process of the rest.
+
+    Without `clutter` nothing stands in the paths' way. With `init=scene` walls of a file do.
+
+    Raises:
+        DataError: `init=scene` without a file, or walls that cannot be.
+    """
     budget = context.time_budget()
     none = init.name == "diffuse"
-    settings = PowerSettings(most=0, fringes=False) if none else PowerSettings()
-    field, notes = power_field.initialise(data, rows, settings, context.seed, budget)
+    settings = PowerSettings(most=0, fringes=False) if none else PowerSettings() if clutter else NO_BLOCKERS
+    known = None
+    if init.name == "scene":
+        known, leaning = panels(read_walls(init.file), data.site.origin)
+        if leaning:
+            log.info("%d walls that lean are left out: only floors and upright walls take power", leaning)
+    field, notes = power_field.initialise(data, rows, settings, context.seed, budget, known)
     field.condition(data, rows)
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 

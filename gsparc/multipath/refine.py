@@ -33,6 +33,7 @@ SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and
 
 Objective = Callable[[list[Tensor], Tensor], tuple[float, list[Tensor]]]
 Late = Callable[[], bool]
+Cost = Callable[[Tensor, Tensor], Tensor]  # of planes and log amplitudes
 
 
 def never() -> bool:
@@ -82,13 +83,33 @@ def descend(
     return found, best[4:]
 
 
-def refine(rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER, late: Late = never) -> Scene:
+def refine(
+    rows: Rows, scene: Scene, steps: int, noise_floor: float = JITTER, late: Late = never,
+    cost: Cost | None = None,
+) -> Scene:  # fmt: skip
     """The best scene of `steps` steps, or of those until `late`."""
 
     def objective(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
         return _likelihood(rows, scene, values, correlation, noise_floor)
 
-    return descend(rows, scene, steps, objective, late=late)[0]
+    return descend(rows, scene, steps, with_cost(objective, cost), late=late)[0]
+
+
+def with_cost(objective: Objective, cost: Cost | None) -> Objective:
+    """The objective plus a cost of planes (P, 4) and log amplitudes (K,), a negative log prior [nats]."""
+    if cost is None:
+        return objective
+
+    def both(values: list[Tensor], correlation: Tensor) -> tuple[float, list[Tensor]]:
+        value, gradient = objective(values, correlation)
+        with torch.enable_grad():
+            leaves = [v.detach().requires_grad_() for v in values[1:3]]
+            more = cost(*leaves)
+            slopes = torch.autograd.grad(more, leaves)
+        gradient[1:3] = [g + slope for g, slope in zip(gradient[1:3], slopes, strict=True)]
+        return value + more.item(), gradient
+
+    return both
 
 
 def _likelihood(

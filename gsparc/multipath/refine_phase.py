@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gsparc.multipath.gp_likelihood import JITTER, steering
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene, RealFactor, add_source, shares, stacked
-from gsparc.multipath.refine import SPREAD, Late, descend, never
+from gsparc.multipath.refine import SPREAD, Cost, Late, descend, never, with_cost
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
 from gsparc.physics.mirror_planes import images
@@ -23,6 +23,7 @@ def refine(
     noise_floor: float = JITTER,
     prior: Callable[[Tensor], Tensor] | None = None,
     late: Late = never,
+    cost: Cost | None = None,
 ) -> PhasedScene:
     """The best phased scene of `steps` steps, or until `late`; `prior`: negative log, of phases (K,)."""
 
@@ -36,7 +37,7 @@ def refine(
             nll += cost.item()
         return nll, gradient
 
-    scene, (phase,) = descend(rows, phased.scene, steps, objective, phased.phase, late=late)
+    scene, (phase,) = descend(rows, phased.scene, steps, with_cost(objective, cost), phased.phase, late=late)
     return replace(phased, scene=scene, phase=phase)
 
 

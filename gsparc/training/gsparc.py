@@ -21,6 +21,7 @@ from torch import Tensor
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
@@ -47,7 +48,8 @@ FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 LEAST_HELD = 4  # rows, for weights to mean anything
-OPEN_ENDED = ("sources", "bearings")  # initialisers that take what seconds they are given
+OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
+SEARCHES = ("sources", "bearings")  # of them, those that also give an answer of few sources
 
 
 class Gsparc(LearnedField):
@@ -89,6 +91,8 @@ class Gsparc(LearnedField):
         self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden, count)
         for reason in self.plan.reasons:
             log.info("%s", reason)
+        if self.init.name == "scene":
+            read_walls(self.init.file)  # its errors come before anything is computed
         if self.plan.rasterized:
             return self._fit_rasterized(data, fold, context)
         return self._fit_conditional(self.plan, data, fold, context)
@@ -180,7 +184,7 @@ class Gsparc(LearnedField):
         groups = self._groups(data, fold, context) if weighed else ()
         plans = [(part, self.init, None) for part in parts if part not in OPEN_ENDED]
         for part in (part for part in parts if part in OPEN_ENDED):
-            if weighed:
+            if weighed and part in SEARCHES:
                 plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))
             plans.append((part, self.init, 1.0))
         found: dict[str, ConditionalField] = {}

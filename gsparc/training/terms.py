@@ -23,7 +23,8 @@ class EffectSettings(Checked):
         moving_array: the same of a receiver that moves, in powers: sources seen through the array's lags.
         phase: carrier phase from places of sources, for channels.
         power: distance law and extinction along the path in decibels, for received powers.
-        visibility: who sees which source: occluding boxes and finite mirrors for channels.
+        visibility: what hides: occluding boxes and finite mirrors of sources, Gaussians in the way of powers;
+            rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 
@@ -89,9 +90,16 @@ def plan(
         if obstacle is None:
             said = "" if switch == "auto" else ": as configured"
             reasons.append(f"effects.{name} -> {'on' if on[name] else 'off'}{said}")
+    if init.name == "scene":
+        _refuse_scene(data, switches, obstacles, on, count)
     if on["power"]:
-        return Plan(False, parts=("powers",), reasons=tuple(reasons))
+        part = "scene" if init.name == "scene" else "powers"
+        return Plan(False, parts=(part,), reasons=tuple(reasons))
     if on["moving_array"]:
+        if switches.visibility is True:
+            raise ValueError(
+                "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"
+            )
         return Plan(False, parts=("bearings",), plain=plain, reasons=tuple(reasons))
     if on["phase"] and (count or not plain):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
@@ -105,7 +113,35 @@ def plan(
         why = obstacles["phase"] or ("no Gaussians are asked for" if on["phase"] else "no phase is asked for")
         reasons.append(f"the residual is all there is: {why}")
         return Plan(False, parts=("diffuse",), reasons=tuple(reasons))
+    if switches.visibility is False:
+        raise ValueError(
+            "model.effects.visibility=false is not possible: rasterized Gaussians always occlude each other"
+        )
     return Plan(True, array=on["array"], plain=plain, reasons=tuple(reasons))
+
+
+def _refuse_scene(
+    data: Measurements,
+    switches: EffectSettings,
+    obstacles: dict[str, str | None],
+    on: dict[str, bool],
+    count: int,
+) -> None:
+    """`ValueError` where known walls explain nothing."""
+    site, why = data.site, None
+    term = {"csi": "phase", "rssi": "power"}.get(site.kind)
+    if term is None:
+        why = f"the target is {site.kind}; walls mirror channels and stand in the way of received powers"
+    elif not on[term]:
+        why = obstacles[term] or f"model.effects.{term}=false"
+    elif not count:
+        why = "model.field.count=0 is the residual alone"
+    elif site.kind == "rssi" and site.static_end is not None and site.static_position is None:
+        why = "the dataset does not say where the static end is"
+    elif site.kind == "rssi" and switches.visibility is False:
+        why = "of received powers walls only hide, which model.effects.visibility=false turns off"
+    if why is not None:
+        raise ValueError(f"init=scene is not possible: {why}")
 
 
 def _no_static_array(site: Site) -> str | None:

@@ -59,3 +59,33 @@ def test_an_ablation_of_the_networks_is_not_answered_by_another_model():
 def test_a_switch_says_what_it_may_be():
     with pytest.raises(ValueError, match="one of true, false, auto"):
         EffectSettings(phase="splat")
+
+
+def test_known_walls_serve_channels_and_powers():
+    scene = InitSettings("scene", file="room.yaml")
+    assert plan(AUTO, scene, channels(), 0).parts == ("scene", "diffuse")
+    assert plan(AUTO, scene, invent("rssi", 20), 0).parts == ("scene",)
+
+
+@pytest.mark.parametrize(
+    ("kind", "site", "effects", "count", "said"),
+    [
+        ("spectrum", {}, {}, 1, "the target is spectrum; walls mirror channels"),
+        ("csi", {"static_position": None}, {}, 1, "the dataset does not say where the static end is"),
+        ("rssi", {"static_position": None}, {}, 1, "the dataset does not say where the static end is"),
+        ("csi", {}, {"phase": False}, 1, r"model\.effects\.phase=false"),
+        ("csi", {}, {}, 0, r"model\.field\.count=0 is the residual alone"),
+        ("rssi", {}, {"visibility": False}, 1, "of received powers walls only hide"),
+    ],
+)  # fmt: skip
+def test_what_known_walls_cannot_serve(kind, site, effects, count, said):
+    data = invent(kind, 20)
+    data = replace(data, site=replace(data.site, **site))
+    with pytest.raises(ValueError, match=f"init=scene is not possible: .*{said}"):
+        plan(EffectSettings(**effects), InitSettings("scene"), data, 0, count)
+
+
+def test_rasterized_gaussians_always_occlude_each_other():
+    with pytest.raises(ValueError, match=r"visibility=false is not possible: rasterized"):
+        plan(EffectSettings(visibility=False), ANY, invent("spectrum", 20), 0)
+    assert plan(EffectSettings(visibility=True), ANY, invent("spectrum", 20), 0).rasterized

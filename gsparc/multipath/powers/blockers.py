@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -42,6 +43,10 @@ class Blockers:
     def joined(self, other: Blockers) -> Blockers:
         """These and others."""
         return Blockers(*(torch.cat(pair) for pair in zip(self.parts(), other.parts(), strict=True)))
+
+    def relative_to(self, amplitude: float) -> Blockers:
+        """The same, when strengths are in decibels, in units of a process's amplitude [dB^2]."""
+        return replace(self, log_strengths=self.log_strengths - 0.5 * math.log(amplitude))
 
     def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The attributes."""

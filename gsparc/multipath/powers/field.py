@@ -51,6 +51,7 @@ SOUGHT_ON = 600  # rows: each look factors a matrix
 FOLDS = 5
 RIDGE_STEPS = 5  # of the variance of what is left
 LEAST = 40  # rows that were heard, for seeking Gaussians
+LEAST_KNOWN = 12  # the same, for asking whether known ones pay
 
 
 @dataclass(frozen=True)
@@ -298,11 +299,12 @@ def initialise(
     settings: PowerSettings,
     seed: int = 0,
     budget: TimeBudget | None = None,
+    known: Blockers | None = None,
 ) -> tuple[PowerField, tuple[str, ...]]:
     """A field of powers and what must be said of it; `condition` is to follow.
 
     Gaussians are sought by evidence, and kept where they predict groups of places that were left out better
-    than the plain process does, by more than one standard error.
+    than the plain process does, by more than one standard error; known ones unless they do so much worse.
 
     Args:
         data: powers, of one station where there are several.
@@ -310,6 +312,7 @@ def initialise(
         settings: see there.
         seed: of rows, candidates and groups that are drawn.
         budget: no Gaussians are sought beyond it.
+        known: Gaussians that stand for walls, with strengths in decibels; nothing else is sought then.
 
     Raises:
         ValueError: not powers, several stations, or no rows.
@@ -323,7 +326,12 @@ def initialise(
     seen = rows_of(data, rows)
     plain, notes = fit_powers(seen, data.site, settings.mean, seed)
     bare = PowerField(data.site, plain.trend, plain.kernel, Blockers.none(), None, seed)
-    if settings.fringes and not seen.silent.any() and sampled(seen.places, data.site.wavelength):
+    if (
+        settings.fringes
+        and known is None
+        and not seen.silent.any()
+        and sampled(seen.places, data.site.wavelength)
+    ):
         order = np.argsort(rows)
         assert data.site.wavelength is not None
         bare.fringes, said = find_fringes(
@@ -332,19 +340,21 @@ def initialise(
         return bare, (*notes, said)
     if not settings.most:
         return bare, notes
-    if int((~seen.silent).sum()) < LEAST:
+    if known is None and int((~seen.silent).sum()) < LEAST:
         return bare, (*notes, f"no Gaussians: fewer than {LEAST} rows were heard")
-    found = shadowed(seen, data.site, settings, seed, budget)
+    found = shadowed(seen, data.site, settings, seed, budget, known)
     if found is None:
         return bare, (*notes, "no Gaussians: no candidate in the paths' way explains enough of the powers")
-    gain = gain_of_groups(seen, data.site, settings, seed, budget)
-    if gain is None:
+    gain = gain_of_groups(seen, data.site, settings, seed, budget, known)
+    if gain is None and known is None:
         return bare, (*notes, "no Gaussians: no time to try them on groups of places that are left out")
-    before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
-    said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
-    said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
-    if not gain.exceeds(settings.sure):
-        return bare, (*notes, f"no Gaussians; {said}")
+    said = "too few rows or too little time for trying them on groups of places that are left out"
+    if gain is not None:
+        before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
+        said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"
+        said += f" (gain {gain.squares:.2g} +- {gain.error:.2g} dB^2)"
+        if not gain.exceeds(settings.sure if known is None else -settings.sure):
+            return bare, (*notes, f"no Gaussians; {said}")
     trend, kernel, more = found
     assert trend.blockers is not None
     law = Trend(trend.level, trend.law, trend.middle, trend.spread)
@@ -353,9 +363,17 @@ def initialise(
 
 
 def shadowed(
-    rows: Rows, site: Site, settings: PowerSettings, seed: int, budget: TimeBudget | None
+    rows: Rows,
+    site: Site,
+    settings: PowerSettings,
+    seed: int,
+    budget: TimeBudget | None,
+    known: Blockers | None = None,
 ) -> tuple[ShadowedTrend, PowerKernel, tuple[str, ...]] | None:
-    """A prior with Gaussians beside a distance law, and notes; None where no candidate is worth its place."""
+    """A prior with Gaussians beside a distance law, and notes; None where no candidate is worth its place.
+
+    Those that are known have theirs, with strengths in decibels.
+    """
     loud = rows.at(np.flatnonzero(~rows.silent))
     few = loud.at(draw(loud.silent, SOUGHT_ON, seed))
     if len(few.places) < max(LAW_NEEDS, 2) or len(np.unique(few.places[:, :3], axis=0)) < 2:
@@ -363,7 +381,10 @@ def shadowed(
     plain, _ = fit_powers(few, site, "distance", seed)
     assert plain.trend.law is not None
     still = plain.trend.law.place
-    blockers, _, _ = search(Seen.of(few, plain.trend, still), plain.kernel, settings.most, seed, budget)
+    if known is None:
+        blockers, _, _ = search(Seen.of(few, plain.trend, still), plain.kernel, settings.most, seed, budget)
+    else:
+        blockers = known.relative_to(plain.kernel.amplitude)
     if not len(blockers):
         return None
     trend = ShadowedTrend.over(plain.trend, blockers, still)
@@ -372,28 +393,33 @@ def shadowed(
 
 
 def gain_of_groups(
-    rows: Rows, site: Site, settings: PowerSettings, seed: int, budget: TimeBudget | None
+    rows: Rows,
+    site: Site,
+    settings: PowerSettings,
+    seed: int,
+    budget: TimeBudget | None,
+    known: Blockers | None = None,
 ) -> Gain | None:
     """What Gaussians gain over the plain process at groups of places left out; None where time is over.
 
     Both are found without the groups, on a part of many rows.
     """
-    group = groups(rows.places)
+    group, least = groups(rows.places), LEAST if known is None else LEAST_KNOWN
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
     for part in folds(group, FOLDS, seed):
         if budget and budget.over():
             return None
         rest = np.setdiff1d(np.arange(len(group)), part)
         asked = part[~rows.silent[part]]
-        known = rows.at(rest).at(draw(rows.silent[rest], SOUGHT_ON, seed))
-        if len(asked) == 0 or int((~known.silent).sum()) < LEAST:
+        learned = rows.at(rest).at(draw(rows.silent[rest], SOUGHT_ON, seed))
+        if len(asked) == 0 or int((~learned.silent).sum()) < least:
             continue
         queries, measured = rows.places[asked], rows.decibels[asked]
-        process, _ = fit_powers(known, site, settings.mean, seed)
+        process, _ = fit_powers(learned, site, settings.mean, seed)
         without = process.mean_and_variance(queries)[0] - measured
-        found = shadowed(known, site, settings, seed, budget)
+        found = shadowed(learned, site, settings, seed, budget, known)
         if found is not None:
-            process, _ = conditioned(known, found[0], found[1], seed)
+            process, _ = conditioned(learned, found[0], found[1], seed)
         error = process.mean_and_variance(queries)[0] - measured
         parts.append((error**2, without**2, group[asked]))
     if not parts:

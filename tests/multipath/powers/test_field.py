@@ -13,10 +13,12 @@ from gsparc.data.limits import SettingError
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.field.initial import InitSettings
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitContext
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import Trend
+from gsparc.methods.registry import field_initialiser
 from gsparc.multipath.powers import field as powers
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.field import PowerField, PowerSettings, initialise, restored
@@ -222,3 +224,30 @@ def test_time_ends_the_search(monkeypatch):
     budget = powers.TimeBudget(0.0)
     field, notes = initialise(data, np.arange(150), PowerSettings(), budget=budget)
     assert field.count == 0 and budget.limited and any("no Gaussians" in note for note in notes)
+
+
+TOWN_WALL = "walls: [{corners_m: [[25, 18, 0], [25, 45, 0], [25, 45, 12], [25, 18, 12]]}]"
+
+
+def powers_of(
+    data: Measurements, rows: np.ndarray, init: InitSettings, visibility: bool = True
+) -> PowerField:
+    field, _ = field_initialiser("powers")(data, rows, init, visibility, FitContext())
+    return field
+
+
+def test_without_visibility_nothing_stands_in_the_way(blocked):
+    data, _, _ = blocked
+    assert powers_of(data, np.arange(160), InitSettings(), visibility=False).count == 0
+
+
+@pytest.mark.parametrize("rows", [20, 60])
+def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
+    data, rows, test = town(260), np.arange(rows), np.arange(160, 260)
+    (tmp_path / "town.yaml").write_text(TOWN_WALL, encoding="utf-8")
+    batch = data.batch(test)
+    errors = []
+    for init in (InitSettings("scene", file=str(tmp_path / "town.yaml")), InitSettings()):
+        field = powers_of(data, rows, init)
+        errors.append(float(np.sqrt(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))))
+    assert errors[0] < 0.9 * errors[1], errors

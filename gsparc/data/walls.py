@@ -1,0 +1,197 @@
+"""Known walls and boxes of a scene out of a file: YAML (a simulated room too), or a mesh as Wavefront OBJ.
+
+The format of meshes: Wavefront Technologies, "Object files (.obj)", Advanced Visualizer manual, appendix B1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.errors import DataError, Problems, reason
+from gsparc.data.files import read_yaml
+from gsparc.data.instantiate import suggest
+
+EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`), or a mesh *.obj"
+SIMULATED = {  # of scenes that are simulated: known, and not needed here
+    "name", "transmitter_m", "area_m", "height_m", "num_receivers", "carrier_hz", "bandwidth_hz",
+    "subcarriers", "test_share", "builder", "builtin", "xml", "open_sky", "scattering", "seed",
+}  # fmt: skip
+FLAT_M = 0.01  # [m], of corners from their plane
+SMALLEST_M2 = 1e-6  # [m^2], of faces that are read
+
+
+@dataclass(frozen=True)
+class SceneWalls:
+    """What stands in a scene, in the coordinates of the measurements.
+
+    Attributes:
+        faces: flat polygons, each (C, 3) float64 [m] of at least 3 corners in order.
+        boxes: (B, 2, 3) float64 [m], lower and upper corners of solids that let nothing through.
+    """
+
+    faces: tuple[np.ndarray, ...]
+    boxes: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.faces) + len(self.boxes)
+
+
+def read_walls(path: str | Path | None) -> SceneWalls:
+    """Walls out of `*.yaml`, `*.yml` or `*.obj`; lengths are metres.
+
+    Raises:
+        DataError: none is named, no such file, of another kind, or with walls that cannot be.
+    """
+    if path is None:
+        raise DataError(f"init.file is missing; expected a file of {EXPECTED}")
+    path, problems = Path(path), Problems(path)
+    found = SceneWalls((), np.zeros((0, 2, 3)))
+    if path.suffix.lower() == ".obj":
+        found = _mesh(path, problems)
+    elif path.suffix.lower() in (".yaml", ".yml"):
+        found = _table(path, problems)
+    else:
+        problems.add(
+            path, "walls are read from *.yaml or *.obj; export meshes of other kinds as Wavefront OBJ"
+        )
+    if not problems and not len(found):
+        problems.add(path, f"no walls in it; expected {EXPECTED}")
+    problems.raise_if_any()
+    return found
+
+
+def _table(path: Path, problems: Problems) -> SceneWalls:
+    content = read_yaml(path, f"a table of {EXPECTED}", f"a table of {EXPECTED}")
+    for key in content:
+        if key not in SIMULATED | {"walls", "room"}:
+            problems.add(path, f"{key}: no such key{suggest(str(key), ['walls', 'room'])}")
+    room = content.get("room")
+    faces, boxes = ([], np.zeros((0, 2, 3))) if room is None else _room(path, room, problems)
+    walls = content.get("walls") or []
+    if not isinstance(walls, list):
+        problems.add(path, "walls: expected a list, each with corners_m: [[x, y, z], ...]")
+        walls = []
+    for number, wall in enumerate(walls):
+        where = f"{path}: walls[{number}]"
+        corners = _numbers(wall.get("corners_m") if isinstance(wall, dict) else wall)
+        if corners is None or corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3:
+            problems.add(where, "expected corners_m: [[x, y, z], ...] of at least 3 corners [m]")
+        elif area(corners) < SMALLEST_M2:
+            problems.add(where, "its corners lie on a line")
+        elif uneven(corners) > FLAT_M:
+            problems.add(where, f"its corners lie up to {uneven(corners):.2g} m off a plane; split it")
+        else:
+            faces.append(corners)
+    return SceneWalls(tuple(faces), boxes)
+
+
+def _room(path: Path, room: Any, problems: Problems) -> tuple[list[np.ndarray], np.ndarray]:
+    """Six faces from the origin to `size_m`, and `boxes_m`."""
+    faces: list[np.ndarray] = []
+    boxes = np.zeros((0, 2, 3))
+    if not isinstance(room, dict):
+        return problems.add(path, "room: expected size_m and boxes_m") or (faces, boxes)
+    for key in room:
+        if key not in ("size_m", "boxes_m", "reflection"):
+            problems.add(path, f"room.{key}: no such key{suggest(str(key), ['size_m', 'boxes_m'])}")
+    if room.get("size_m") is not None:
+        size = _numbers(room["size_m"])
+        if size is None or size.shape != (3,) or not (size > 0).all():
+            problems.add(path, f"room.size_m={room['size_m']}: expected three lengths above 0 [m]")
+        else:
+            faces = box_faces(np.zeros(3), size)
+    if room.get("boxes_m"):
+        found = _numbers(room["boxes_m"])
+        if found is None or found.shape[1:] != (2, 3) or not (found[:, 0] < found[:, 1]).all():
+            problems.add(
+                path, "room.boxes_m: expected [[x, y, z], [x, y, z]] of each, lower corner first [m]"
+            )
+        else:
+            boxes = found
+    return faces, boxes
+
+
+def _mesh(path: Path, problems: Problems) -> SceneWalls:
+    """Faces of all objects; texture, normals and materials are not read."""
+    nothing = SceneWalls((), np.zeros((0, 2, 3)))
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except FileNotFoundError:
+        return problems.add(path, "missing; expected a mesh *.obj") or nothing
+    except (UnicodeDecodeError, OSError) as error:
+        return problems.add(path, f"not readable as text ({reason(error)})") or nothing
+    corners: list[list[float]] = []
+    faces: list[np.ndarray] = []
+    for number, line in enumerate(lines, 1):
+        name, *values = line.split("#")[0].split() or [""]
+        try:
+            if name == "v":
+                x, y, z = (float(value) for value in values[:3])
+                corners.append([x, y, z])
+            elif name == "f":
+                faces += _triangles_or_flat(_corners(values, corners))
+        except (ValueError, IndexError):
+            problems.add_rows(path, [f"line {number}"], f"{line.strip()!r} is no vertex or face of an OBJ")
+        if len(problems) >= Problems.LIMIT:
+            break
+    if not all(np.isfinite(face).all() for face in faces):
+        problems.add(path, "a vertex is not finite")
+    return SceneWalls(tuple(face for face in faces if area(face) >= SMALLEST_M2), np.zeros((0, 2, 3)))
+
+
+def _corners(values: list[str], corners: list[list[float]]) -> np.ndarray:
+    """Corners (C, 3) of a face; numbers count from 1, or back from the last where negative."""
+    numbers = [int(value.partition("/")[0]) for value in values]
+    if len(numbers) < 3 or 0 in numbers or max(numbers) > len(corners) or -min(numbers) > len(corners):
+        raise IndexError
+    return np.array([corners[n - 1 if n > 0 else n] for n in numbers], dtype=np.float64)
+
+
+def _triangles_or_flat(face: np.ndarray) -> list[np.ndarray]:
+    """A face as it is where it is flat, else its fan of triangles."""
+    if len(face) == 3 or area(face) < SMALLEST_M2 or uneven(face) <= FLAT_M:
+        return [face]
+    return [face[[0, i, i + 1]] for i in range(1, len(face) - 1)]
+
+
+def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
+    """The six faces, each (4, 3), of a box between two corners (3,)."""
+    faces = []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        for end in (low, high):
+            face = np.tile(np.asarray(low, np.float64), (4, 1))
+            face[:, axis] = end[axis]
+            face[1:3, u], face[2:4, v] = high[u], high[v]
+            faces.append(face)
+    return faces
+
+
+def normal_of(corners: np.ndarray) -> np.ndarray:
+    """Normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
+    about = corners - corners.mean(0)
+    return np.asarray(np.cross(about, np.roll(about, -1, axis=0)).sum(0))
+
+
+def area(corners: np.ndarray) -> float:
+    """Area of a polygon (C, 3) [m^2]."""
+    return float(np.linalg.norm(normal_of(corners)) / 2)
+
+
+def uneven(corners: np.ndarray) -> float:
+    """Largest distance of corners (C, 3) from their plane [m]."""
+    normal = normal_of(corners)
+    return float(np.abs((corners - corners.mean(0)) @ (normal / np.linalg.norm(normal))).max())
+
+
+def _numbers(values: Any) -> np.ndarray | None:
+    """As finite float64, or None."""
+    try:
+        found = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return found if np.isfinite(found).all() else None

@@ -1,0 +1,1 @@
+"""Known walls: mirror images of the static end in them, and what they hide."""

@@ -1,0 +1,95 @@
+"""Walls out of files: simulated rooms, lists of corners, meshes, and what cannot be."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsparc.data.errors import DataError
+from gsparc.data.walls import SIMULATED, area, read_walls
+from gsparc.simulate.scenes.build import SceneSettings
+
+SCENES = Path(__file__).parents[2] / "conf" / "scene"
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_simulated_room_is_a_file_of_walls():
+    found = read_walls(SCENES / "shoebox.yaml")
+    assert len(found.faces) == 6 and found.boxes.shape == (1, 2, 3)
+    assert sum(map(area, found.faces)) == pytest.approx(2 * (6 * 5 + 6 * 3 + 5 * 3))
+    assert {tuple(face.min(0)) for face in found.faces} >= {(0, 0, 0), (6, 0, 0), (0, 5, 0), (0, 0, 3)}
+
+
+def test_other_keys_of_simulated_scenes_are_known():
+    assert {field.name for field in dataclasses.fields(SceneSettings)} - {"room"} == SIMULATED
+
+
+def test_walls_are_polygons(tmp_path):
+    text = "walls:\n- {corners_m: [[0, 0, 0], [4, 0, 0], [4, 0, 3], [0, 0, 3]]}\n"
+    text += "- [[0, 0, 0], [0, 2, 0], [0, 2, 2]]"
+    found = read_walls(written(tmp_path / "a.yaml", text))
+    assert [area(face) for face in found.faces] == [12.0, 2.0] and len(found.boxes) == 0
+
+
+MESH = """# a square as triangles, one as a polygon, texture and normals, numbers from the end
+o wall
+v 0 0 0
+v 2 0 0
+v 2 0 2
+v 0 0 2
+vn 0 1 0
+usemtl concrete
+f 1//1 2//1 3//1
+f 1 3/1/1 4
+v 0 1 0
+v 2 1 0
+v 2 3 0.5
+v 0 3 0
+f -4 -3 -2 -1
+"""
+
+
+def test_a_mesh_has_faces_that_are_flat(tmp_path):
+    found = read_walls(written(tmp_path / "a.obj", MESH))
+    assert [len(face) for face in found.faces] == [3, 3, 3, 3]  # the last polygon is not flat
+    assert sum(area(face) for face in found.faces[:2]) == pytest.approx(4.0)
+    assert np.array_equal(found.faces[2], [[0, 1, 0], [2, 1, 0], [2, 3, 0.5]])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("a.ply", "ply", r"a\.ply: walls are read from \*\.yaml or \*\.obj; export meshes of other kinds"),
+        ("a.yaml", "{}", r"a\.yaml: no walls in it; expected `walls`"),
+        ("a.yaml", "wals: []", r"wals: no such key; did you mean 'walls'\?"),
+        ("a.yaml", "room: {size_m: [4, 3]}", r"room\.size_m=\[4, 3\]: expected three lengths above 0"),
+        ("a.yaml", "room: {boxes_m: [[[1, 1, 1], [0, 2, 2]]]}", r"boxes_m: expected .*lower corner first"),
+        ("a.yaml", "room: {hight: 3}", r"room\.hight: no such key"),
+        ("a.yaml", "walls: [{corners_m: [[0, 0, 0], [1, 1]]}]", r"walls\[0\]: expected corners_m"),
+        ("a.yaml", "walls: [[[0, 0, 0], [1, 0, 0], [2, 0, 0]]]", r"walls\[0\]: its corners lie on a line"),
+        ("a.yaml", "walls: [[[0,0,0],[1,0,0],[1,1,1],[0,1,0]]]", r"walls\[0\]: .* off a plane; split it"),
+        ("a.obj", "v 0 0 0\nf 1 2 3\n", r"a\.obj, line 2: 'f 1 2 3' is no vertex or face of an OBJ"),
+        ("a.obj", "v 0 zero 0\n", r"a\.obj, line 1: .* is no vertex or face"),
+        ("a.obj", "v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "a vertex is not finite"),
+        ("a.obj", "v 0 0 0\n", r"a\.obj: no walls in it"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_in_one_line(name, text, said, tmp_path):
+    with pytest.raises(DataError, match=said) as refused:
+        read_walls(written(tmp_path / name, text))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("name", ["absent.yaml", "absent.obj"])
+def test_a_missing_file_is_named(name, tmp_path):
+    with pytest.raises(DataError, match=rf"{name}: missing; expected"):
+        read_walls(tmp_path / name)
+    with pytest.raises(DataError, match=r"init\.file is missing; expected a file of `walls`"):
+        read_walls(None)
