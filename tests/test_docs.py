@@ -20,7 +20,7 @@ PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also spe
 PER_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 TODAY = pytest.mark.parametrize("page", PRESENT, ids=lambda page: page.name)
 README_LINES = 150
-GONE = ("vsgp", "directed", "bearings", "committee", "trainer.budget_s", "trainer.val_every")
+GONE = ("vsgp", "directed", "model=bearings", "committee", "trainer.budget_s", "trainer.val_every")
 
 
 def test_every_package_is_on_the_map():
