@@ -77,8 +77,8 @@ class PackedSources:
 
         With what does not vary, a visibility's correlation is `constant + (1 - constant) varying`.
         """
-        apart = torch.cdist(queries, self.places).square().float()
-        scaled = torch.addcmul(self.by_angle, apart, self.by_length)
+        apart = torch.cdist(queries, self.places, compute_mode="donot_use_mm_for_euclid_dist")
+        scaled = torch.addcmul(self.by_angle, apart.square().float(), self.by_length)
         scaled = torch.baddbmm(scaled, directions(queries[:, :3], self.sources), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances
         decay = torch.exp(-root)

@@ -146,7 +146,7 @@ class Obstacles:
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [torch.lerp(each[..., :-1], each[..., 1:], share) for each in place]
         outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & mine)
-        passed = torch.where(ends_here, 1.0, outside).prod(0).prod(-1)
+        passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.letter]
         seen = passed * torch.where(bounded, reflected, 1.0).prod(-1)
