@@ -47,6 +47,11 @@ class Shape:
     reach: float
 
     @property
+    def is_real(self) -> bool:
+        """Whether all covariances are real."""
+        return not len(self.angles) and not self.direct and not self.sources
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Of all powers, in their order."""
         return (
