@@ -302,7 +302,7 @@ class ChannelField(ConditionalField):
         groups = [each.group for each in self._conditioned()]
         values = {name: value.detach() for name, value in self.named_parameters()}
         return {
-            "shape": dict(vars(self.shape)),
+            "shape": self.shape.state(),
             "values": values,
             "channel": list(self.channel),
             "rows": torch.from_numpy(self.rows),
