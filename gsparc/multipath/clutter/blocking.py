@@ -137,14 +137,14 @@ class Obstacles:
 
     def _past_patches(self, paths: Paths, soft: float) -> Tensor:
         mine = (self.patch_mask & paths.valid)[..., None]  # (Q, K, n, 1)
-        inside_axes = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0)
-        height, *place = inside_axes.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
+        turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
+        height, *place = turned.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
         height = height - self.offset
         away, (above, below) = height.abs() > NEAR_PLANE, (height[..., :-1], height[..., 1:])
         ends_here = paths.letter == self.letter
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
-        met = [torch.lerp(each[..., :-1], each[..., 1:], share) for each in place]
+        met = [each[..., :-1] + share * each.diff() for each in place]
         outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & mine)
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
@@ -158,13 +158,15 @@ def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
     """Share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
     along = paths.end - paths.start
     along = torch.where(along.abs() < 1e-6, 1e-6, along)
-    corners = boxes.view(-1, 2, 1, 1, 1, 3) - paths.start
-    low, high = (corners / along).unbind(1)  # (B, K, n, L, 3)
-    first, last = torch.minimum(low, high).unbind(-1), torch.maximum(low, high).unbind(-1)
-    enter = torch.maximum(torch.maximum(first[0], first[1]), first[2]).clamp_min(0)
-    leave = torch.minimum(torch.minimum(last[0], last[1]), last[2]).clamp_max(1)
-    # negative for legs that miss
-    chord = ((leave - enter) * torch.linalg.vector_norm(along, dim=-1)).amax(-1)
+    inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
+    enter, leave = torch.zeros(()), torch.ones(())
+    for axis in range(3):
+        low, high = boxes[:, axis::3].T.reshape(2, -1, 1, 1, 1)
+        one = (low - paths.start[..., axis]) * inverse[..., axis]
+        other = (high - paths.start[..., axis]) * inverse[..., axis]
+        enter = torch.maximum(enter, torch.minimum(one, other))
+        leave = torch.minimum(leave, torch.maximum(one, other))
+    chord = ((leave - enter) * length).amax(-1)  # negative for legs that miss
     passed = torch.sigmoid((MARGIN - chord) / soft)
     return torch.where(paths.valid, passed, 1.0)
 
