@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,8 @@ class GainKernel:
 
     def correlation(self, first: Tensor, second: Tensor) -> Tensor:
         """(n, m) float32 of places (n, 3) and (m, 3) float64 [m]."""
-        squared = (torch.cdist(first, second) / self.length).square()
+        apart = torch.cdist(first, second, compute_mode="donot_use_mm_for_euclid_dist")
+        squared = (apart / self.length).square()
         return (self.constant + (1 - self.constant) * matern32(squared)).float()
 
 
@@ -201,9 +202,9 @@ class DirectionalGP(FramedMethod):
         covariance = _covariance(self.waves, self.waves, self.power, self.uncertain, retained)
         self.factor = Factor.with_noise(covariance * correlation, self.kernel.noise, rows.target)
 
-        # (n, K, R), real and imaginary: what each row adds to each source's gain
+        # (n, K, R, 2), real and imaginary: what each row adds to each source's gain
         dual_weights = (self.power * self.waves.conj())[:, :, None] * self.factor.alpha[:, None]
-        self.dual_weights = [part.contiguous() for part in (dual_weights.real, dual_weights.imag)]
+        self.dual_weights = torch.view_as_real(dual_weights).contiguous()
 
     def _update_visibility(self) -> int:
         """Update visibility by the channels (see `flips`); returns how many entries changed.
@@ -261,8 +262,7 @@ class DirectionalGP(FramedMethod):
         """Predicted mean channels (B, A, K) of a query's receivers."""
         tones = torch.from_numpy(self._fitted().tones())
         gains = query.probability[:, :, None] * self._gains(query)
-        mean = torch.einsum("mkr,mkf->mrf", gains, wave_over_band(query.away, tones))
-        return self._stored(mean, tones)
+        return self._stored(gains.mT @ wave_over_band(query.away, tones), tones)
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """The paths that `predict` sums, one per source: see `ImageSourceGP.paths`."""
@@ -275,28 +275,27 @@ class DirectionalGP(FramedMethod):
     def _query(self, tx: Tensor, rx: Pose) -> QueryGeometry:
         """Query geometry of receivers, their antennas in the regression's frame."""
         flat, count = self._places(tx, rx)
-        phase_vectors = self.positions.only(self.uncertain).phase_vectors(
-            flat, torch.tensor(self.frame.carrier_hz)
-        )
+        retained = torch.zeros(0, len(flat), len(self.rows))
+        if len(self.uncertain):
+            unsure, carrier = self.positions.only(self.uncertain), torch.tensor(self.frame.carrier_hz)
+            retained = coherence(unsure.phase_vectors(flat, carrier), self.phase_vectors)
         return QueryGeometry(
             flat,
             count,
             ranges(flat, self.sources),
             self.visibility.probability(flat).float(),
             self.kernel.correlation(flat, self.rows.position),
-            coherence(phase_vectors, self.phase_vectors),
+            retained,
         )
 
     def _gains(self, query: QueryGeometry) -> Tensor:
         """Posterior mean gains (m, K, R) at a query's places."""
-        parts = []
-        for part in self.dual_weights:
-            gain = (query.correlation @ part.flatten(1)).unflatten(1, part.shape[1:])
-            if len(self.uncertain):
-                retained = query.retained * query.correlation
-                gain[:, self.uncertain] = torch.einsum("kmn,nkr->mkr", retained, part[:, self.uncertain])
-            parts.append(gain)
-        return torch.complex(*parts)
+        weights = self.dual_weights
+        gain = (query.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
+        if len(self.uncertain):
+            retained = query.retained * query.correlation
+            gain[:, self.uncertain] = torch.einsum("kmn,nkrc->mkrc", retained, weights[:, self.uncertain])
+        return torch.view_as_complex(gain)
 
     def _variance(self, query: QueryGeometry) -> tuple[Tensor, Tensor]:
         """Expected squared error and expected power (m,) at a query's places."""
@@ -338,7 +337,7 @@ class DirectionalGP(FramedMethod):
             "open": self.positions.covariance,
             "power": self.power,
             "law": [*vars(self.kernel).values()],
-            "sightings": [*vars(self.visibility).values()],
+            "sightings": [getattr(self.visibility, each.name) for each in fields(self.visibility)],
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -359,8 +358,7 @@ class DirectionalGP(FramedMethod):
 
 def _covariance(first: Tensor, second: Tensor, power: Tensor, uncertain: Tensor, retained: Tensor) -> Tensor:
     """Covariance (m, n) of waves (m, K) and (n, K); (K',) uncertain sources have coherence (K', m, n)."""
-    exact = power.clone()
-    exact[uncertain] = 0
+    exact = power.index_fill(0, uncertain, 0.0) if len(uncertain) else power
     total = (first * exact) @ second.mH
     for k, coherent in zip(uncertain.tolist(), retained, strict=True):
         total += (power[k] * first[:, k])[:, None] * second[:, k].conj() * coherent

@@ -42,7 +42,7 @@ from gsparc.multipath.frame import FramedMethod, frame_of, refuse, refuse_turnin
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phase_offsets import KINDS, Offsets, estimate
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
-from gsparc.multipath.query import MeanQuery, Query
+from gsparc.multipath.query import Query
 from gsparc.multipath.rows import Rows, gather, measured_places, ranges_at
 from gsparc.multipath.search import SearchSettings
 from gsparc.multipath.search_cache import Member, SearchCache
@@ -422,7 +422,7 @@ class ImageSourceGP(FramedMethod):
         if settings.get("confidence", True):
             twin.query = Query(twin.members)
             return twin
-        twin.query = MeanQuery(twin.members, variance_rows=1)
+        twin.query = Query(twin.members, variance_rows=0)
         return MeanOnly(twin)
 
     # ---- state ----

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -69,12 +70,20 @@ class VisibilityGP:
 
     def probability(self, places: Tensor) -> Tensor:
         """Probability (m, K) float64 that each source is seen from places (m, 3) [m]."""
-        apart = torch.cdist(places, self.places)
-        predicted = self.seen.mean(0).repeat(len(places), 1)
-        for length in self.length.unique():
-            of = self.length == length
-            predicted[:, of] += matern32((apart / length).square()) @ self.weights[:, of]
-        return predicted.clamp(0, 1)
+        apart = torch.cdist(places, self.places, compute_mode="donot_use_mm_for_euclid_dist")
+        lengths, weights = self._by_length
+        correlation = matern32((apart[:, None] / lengths).square()).flatten(1)
+        return torch.addmm(self._mean, correlation, weights).clamp(0, 1)
+
+    @cached_property
+    def _mean(self) -> Tensor:
+        return self.seen.mean(0)
+
+    @cached_property
+    def _by_length(self) -> tuple[Tensor, Tensor]:
+        """Lengths (L, 1) [m] that occur, and the weights (L n, K), zero but for those of a source's own."""
+        lengths = self.length.unique()[:, None]
+        return lengths, torch.where(lengths[:, None] == self.length, self.weights, 0.0).flatten(0, 1)
 
 
 @dataclass(frozen=True)

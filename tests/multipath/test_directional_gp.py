@@ -19,6 +19,7 @@ from gsparc.multipath.directional_gp import DirectionalGP
 from gsparc.multipath.gp_likelihood import steering
 from gsparc.multipath.image_source_gp import ImageSourceGP
 from gsparc.multipath.visibility_gp import RayErrorRates, VisibilityGP, flips
+from gsparc.multipath.visibility_kernel import matern32
 
 REAL = Path(__file__).parents[2] / ".." / "shared" / "data" / "newrf-conference.npz"
 
@@ -100,6 +101,19 @@ def test_visibility_is_predicted_without_the_receiver():
     query = torch.tensor([[0.5, 2.0, 2.0], [3.5, 2.0, 2.0]], dtype=torch.float64)
     probability = fitted.probability(query)[:, 0]
     assert float(probability[0]) > 0.8 and float(probability[1]) < 0.2
+
+
+def test_visibility_at_queries_is_the_sum_over_each_sources_kernel():
+    rng = torch.manual_seed(0)
+    places = torch.rand(20, 3, generator=rng, dtype=torch.float64)
+    seen = (torch.rand(20, 4, generator=rng) < 0.5).double()
+    length = torch.tensor([0.1, 0.8, 0.1, 3.2], dtype=torch.float64)
+    weights = torch.randn(20, 4, generator=rng, dtype=torch.float64) * 0.1
+    fitted = VisibilityGP(places, seen, length, weights, seen)
+    queries = torch.rand(3, 3, generator=rng, dtype=torch.float64)
+    apart = torch.cdist(queries, places)
+    each = [matern32((apart / length[k]) ** 2) @ weights[:, k] + seen[:, k].mean() for k in range(4)]
+    torch.testing.assert_close(fitted.probability(queries), torch.stack(each, 1).clamp(0, 1))
 
 
 def test_a_restored_model_and_its_paths_predict_the_same(pillar):

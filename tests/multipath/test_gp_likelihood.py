@@ -168,6 +168,28 @@ def test_variance_is_that_of_the_joint_gaussian():
     assert variance.item() == pytest.approx(torch.linalg.inv(block).trace().item(), rel=1e-3)
 
 
+def test_variances_of_many_queries_are_those_of_each_alone():
+    tones = torch.tensor([2.4e9], dtype=torch.float64)
+    queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
+    query = Query([PhasedPosterior(_rows(), _phased()), PhasedPosterior(_rows(), _phased(0.7))], 10)
+    _, variance, prior = query.means(queries, tones)
+    alone = [query.means(one[None], tones)[1:] for one in queries]
+    torch.testing.assert_close(
+        torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
+    )
+    whole = Query([PhasedPosterior(_rows(), _phased())]).means(queries, tones)[1]
+    assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
+    assert bool((variance <= prior).all())
+
+
+def test_without_variance_the_means_are_the_same():
+    members, tones = [PhasedPosterior(_rows(), _phased())], torch.tensor([2.4e9], dtype=torch.float64)
+    queries = torch.rand(3, 3, dtype=torch.float64) * 3
+    mean, variance, prior = Query(members, variance_rows=0).means(queries, tones)
+    assert torch.equal(mean, Query(members).means(queries, tones)[0])
+    assert variance.tolist() == [0, 0, 0] and prior.tolist() == [1, 1, 1]
+
+
 def test_visibility_is_one_at_the_same_place_and_falls():
     law, source = KernelVisibility(0.3, 0.4, 1.0), torch.zeros(3, dtype=torch.float64)
     places = torch.tensor([[1.0, 0, 0], [1.1, 0, 0], [0, 5.0, 0]], dtype=torch.float64)

@@ -199,6 +199,43 @@ def test_far_away_nothing_is_known():
     assert found.variance.item() == pytest.approx(known.scale * expected.item(), rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("noise", "plain", "dtype"),
+    [
+        (0.1, False, torch.complex64),
+        (1e-9, False, torch.complex128),
+        (0.1, True, torch.float32),
+        (1e-9, True, torch.float64),
+    ],
+)
+def test_variances_have_the_digits_they_need(noise, plain, dtype):
+    data = _sent(60)
+    field = _whole(data, sources=0, angles=0 if plain else 4)
+    if plain:
+        middle = field.shape.middle
+        shape = Shape(torch.zeros(0, 3).double(), 5.0, True, False, False, 0, middle, 20.0)
+        field = ChannelField(data.site, shape, _values(shape), tuple(data.target.shape[1:]))
+    with torch.no_grad():
+        field.log_power[field.shape.where("noise")] = np.log(noise)
+    field.condition(data, np.arange(40))
+    (known,) = field.weights
+    there, here = known.group.places, torch.from_numpy(data.moving[30:50]).double()
+    shape, values, slot = field.shape, field._held, known.group.slot
+    cross = diffuse(shape, values, slot.wavenumber, here, there) + told(shape, values, slot, here, there)
+    exact = torch.linalg.solve_triangular(known.lower, cross.mH, upper=False).abs().square().sum(0)
+    assert known.root.dtype == dtype
+    assert (known.learned(cross) - exact).abs().max() < 2e-3 * noise + 1e-10
+
+
+def test_directions_in_blocks_are_those_at_once(monkeypatch):
+    data = _sent(60)
+    field = _whole(data)
+    places = field.weights[0].group.places
+    whole = diffuse(field.shape, field._held, K, places, places)
+    monkeypatch.setattr("gsparc.multipath.waves.covariance.BLOCK", 1)
+    torch.testing.assert_close(diffuse(field.shape, field._held, K, places, places), whole)
+
+
 def test_slopes_over_places():
     data = _sent(60)
     field, place = _whole(data), torch.from_numpy(data.moving[45]).float()

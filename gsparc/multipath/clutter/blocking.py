@@ -77,9 +77,9 @@ class Obstacles:
         box_mask: (B, K, 1) bool, sources that a box applies to.
         patches: (Q, 4).
         patch_mask: (Q, K, 1) bool, sources that a patch applies to.
-        letter: (Q,) planes of the patches.
-        normal, offset: (Q, 3), (Q,) of these planes.
-        along: (Q, 2, 3), their tangents.
+        letter: (Q, 1, 1, 1) planes of the patches.
+        axes: (3, Q, 3), normals and both tangents of these planes.
+        offset: (Q, 1, 1, 1) of these planes.
         ends: (P + 1,) bool, which planes have patches; the last is no plane.
     """
 
@@ -88,9 +88,8 @@ class Obstacles:
     patches: Tensor
     patch_mask: Tensor
     letter: Tensor
-    normal: Tensor
+    axes: Tensor
     offset: Tensor
-    along: Tensor
     ends: Tensor
 
     @staticmethod
@@ -100,16 +99,15 @@ class Obstacles:
         ends = torch.zeros(len(planes) + 1, dtype=torch.bool)
         ends[letter] = True
         used = planes[letter]
-        along = [tangents(plane) for plane in used]
+        axes = [torch.cat([_units(plane[None]), tangents(plane)]) for plane in used]
         return Obstacles(
             clutter.boxes,
             torch.ones(len(clutter.boxes), sources, 1, dtype=torch.bool),
             clutter.patches,
             torch.ones(len(letter), sources, 1, dtype=torch.bool),
-            letter,
-            _units(used),
-            (used[:, 3]).float(),
-            torch.stack(along) if along else torch.zeros(0, 2, 3),
+            letter.view(-1, 1, 1, 1),
+            torch.stack(axes, 1) if axes else torch.zeros(3, 0, 3),
+            used[:, 3].float().view(-1, 1, 1, 1),
             ends,
         )
 
@@ -117,12 +115,13 @@ class Obstacles:
     def concatenate(many: list[Obstacles]) -> Obstacles:
         """Of several scenes, with consecutive indices of sources and planes."""
         planes = torch.tensor([0] + [len(s.ends) - 1 for s in many]).cumsum(0).tolist()
-        names = ("boxes", "patches", "normal", "offset", "along")
+        names = ("boxes", "patches", "offset")
         return Obstacles(
             **{name: torch.cat([getattr(s, name) for s in many]) for name in names},
             box_mask=_blocks([s.box_mask for s in many]),
             patch_mask=_blocks([s.patch_mask for s in many]),
             letter=torch.cat([s.letter + first for s, first in zip(many, planes, strict=False)]),
+            axes=torch.cat([s.axes for s in many], 1),
             ends=torch.cat([*(s.ends[:-1] for s in many), torch.zeros(1, dtype=torch.bool)]),
         )
 
@@ -137,20 +136,18 @@ class Obstacles:
         return seen
 
     def _past_patches(self, paths: Paths, soft: float) -> Tensor:
-        shape = (-1, 1, 1, 1)
         mine = (self.patch_mask & paths.valid)[..., None]  # (Q, K, n, 1)
-        offset = self.offset.view(shape)
-        above, below = ((p @ self.normal.T).movedim(-1, 0) - offset for p in (paths.start, paths.end))
-        ends_here = paths.letter == self.letter.view(shape)
-        crosses = (above * below < 0) & (above.abs() > NEAR_PLANE) & (below.abs() > NEAR_PLANE)
-        share = above / torch.where(crosses, above - below, torch.ones_like(above))
-        share = torch.where(ends_here, torch.ones_like(share), share)[..., None]
-        met = paths.start + share * (paths.end - paths.start)
-        place = [(met * self.along[:, i, None, None, None]).sum(-1) for i in range(2)]
-        inside = _inside(place, self.patches, soft, each=True)
-        inside = inside * ((crosses | ends_here) & mine)
-        passed = torch.where(ends_here, 1.0, 1 - inside).prod(0).prod(-1)
-        reflected = 1 - torch.where(ends_here, 1 - inside, 1.0).prod(0)
+        turned = (paths.points @ self.axes.flatten(0, 1).T).movedim(-1, 0).contiguous()
+        height, *place = turned.unflatten(0, (3, -1))  # each (Q, K, n, L + 1)
+        height = height - self.offset
+        away, (above, below) = height.abs() > NEAR_PLANE, (height[..., :-1], height[..., 1:])
+        ends_here = paths.letter == self.letter
+        crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
+        share = torch.where(crosses, above / (above - below), 1.0)
+        met = [each[..., :-1] + share * each.diff() for each in place]
+        outside = 1 - _inside(met, self.patches, soft) * ((crosses | ends_here) & mine)
+        passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
+        reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.letter]
         seen = passed * torch.where(bounded, reflected, 1.0).prod(-1)
         # the words of a finite mirror are invisible where their path is not valid
@@ -160,30 +157,29 @@ class Obstacles:
 def past_boxes(paths: Paths, boxes: Tensor, soft: float = SOFT) -> Tensor:
     """Share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
     along = paths.end - paths.start
-    along = torch.where(along.abs() < 1e-6, torch.full_like(along, 1e-6), along)
+    along = torch.where(along.abs() < 1e-6, 1e-6, along)
     inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
     enter, leave = torch.zeros(()), torch.ones(())
     for axis in range(3):
-        low, high = (boxes[:, i].view(-1, 1, 1, 1) for i in (axis, axis + 3))
+        low, high = boxes[:, axis::3].T.reshape(2, -1, 1, 1, 1)
         one = (low - paths.start[..., axis]) * inverse[..., axis]
         other = (high - paths.start[..., axis]) * inverse[..., axis]
         enter = torch.maximum(enter, torch.minimum(one, other))
         leave = torch.minimum(leave, torch.maximum(one, other))
     chord = ((leave - enter) * length).amax(-1)  # negative for legs that miss
     passed = torch.sigmoid((MARGIN - chord) / soft)
-    return torch.where(paths.valid, passed, torch.ones_like(passed))
+    return torch.where(paths.valid, passed, 1.0)
 
 
 def within(points: Tensor, patches: Tensor) -> Tensor:
     """Soft indicator (Q, ...) of points (..., 2) inside patches (Q, 4)."""
-    return _inside([points[..., 0], points[..., 1]], patches, SOFT)
+    return _inside([points[None, ..., 0], points[None, ..., 1]], patches, SOFT)
 
 
-def _inside(place: list[Tensor], patches: Tensor, soft: float, each: bool = False) -> Tensor:
-    """Patches (Q, 4) against coordinates (...); or, `each`, (Q, ...), against its own."""
+def _inside(place: list[Tensor], patches: Tensor, soft: float) -> Tensor:
+    """Patches (Q, 4) against coordinates (1, ...), or (Q, ...), each against its own."""
     u, v = place
-    shape = (-1, *[1] * (u.dim() - int(each)))
-    low_u, low_v, high_u, high_v = (patches[:, i].view(shape) for i in range(4))
+    low_u, low_v, high_u, high_v = patches.T.reshape(4, -1, *[1] * (u.dim() - 1))
     inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
     return torch.sigmoid(inner / soft)
 

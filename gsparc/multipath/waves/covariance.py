@@ -10,8 +10,9 @@ long that it only ends far outside. Noise, and what is correlated over the order
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +22,7 @@ from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth
 
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
 DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike
+BLOCK = 1_000_000  # correlations of directions that are computed at a time
 BEYOND = 10.0  # extents of the places after which nothing is known any more
 
 
@@ -47,6 +49,11 @@ class Shape:
     reach: float
 
     @property
+    def is_real(self) -> bool:
+        """Whether all covariances are real."""
+        return not len(self.angles) and not self.direct and not self.sources
+
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Of all powers, in their order."""
         return (
@@ -61,12 +68,20 @@ class Shape:
         )
 
     def where(self, name: str) -> list[int]:
-        """Numbers of the powers of this name."""
+        """Numbers of the powers of this name, which are consecutive."""
         return [i for i, each in enumerate(self.names) if each == name]
 
     def of(self, name: str, power: Tensor) -> Tensor:
         """Powers (m,) of this name; of one that there is not, none."""
-        return power[self.where(name)]
+        return power[self._parts.get(name, slice(0))]
+
+    @cached_property
+    def _parts(self) -> dict[str, slice]:
+        return {name: slice(self.names.index(name), max(self.where(name)) + 1) for name in self.names}
+
+    def state(self) -> dict[str, Any]:
+        """What it is made of."""
+        return {each.name: getattr(self, each.name) for each in fields(self)}
 
 
 @dataclass(frozen=True)
@@ -107,21 +122,24 @@ def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tenso
     """The diffuse field's covariance (n, m) complex128 of places a (n, 3) and b (m, 3) [m]."""
     distance = apart(a, b)
     found = shape.of("isotropic", values.power)[0] * isotropic(distance, wavenumber)
-    if len(shape.angles):
-        found = found.to(torch.complex128)
-        correlations = directions(shape, wavenumber, a, b, distance)
-        for power, correlation in zip(shape.of("direction", values.power), correlations, strict=True):
-            found = found + power * correlation
+    block = max(BLOCK // max(distance.numel(), 1), 1)
+    for angles, power in zip(
+        shape.angles.split(block), shape.of("direction", values.power).split(block), strict=False
+    ):
+        if len(angles):
+            correlations = directions(angles, shape.concentration, wavenumber, a, b, distance)
+            found = found + torch.tensordot(power.to(correlations.dtype), correlations, 1)
     return (found * envelope(distance, values.envelope)).to(torch.complex128)
 
 
-def directions(shape: Shape, wavenumber: float, a: Tensor, b: Tensor, distance: Tensor) -> Iterator[Tensor]:
-    """Correlations (n, m) complex128 of waves from each direction, over distances (n, m) [m]."""
-    squared = (wavenumber * distance).square()
+def directions(
+    angles: Tensor, concentration: float, wavenumber: float, a: Tensor, b: Tensor, distance: Tensor
+) -> Tensor:
+    """Correlations (M, n, m) complex128 of waves from each direction (M, 3), over distances (n, m) [m]."""
     middle = b[:1]  # differences of small numbers, wherever the origin is
-    before, after = (wavenumber * (places - middle) @ shape.angles.T for places in (a, b))
-    for first, second in zip(before.T, after.T, strict=True):
-        yield directed(squared, first[:, None] - second[None], shape.concentration)
+    before, after = (wavenumber * (angles @ (places - middle).T) for places in (a, b))
+    along = before[:, :, None] - after[:, None]
+    return directed((wavenumber * distance).square(), along, concentration)
 
 
 def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:

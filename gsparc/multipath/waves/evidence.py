@@ -160,7 +160,9 @@ def _field(group: Group, shape: Shape, values: Values, noise: float) -> tuple[Te
     whole = int(kept.sum()) > WORTH * len(group)
     basis = torch.eye(len(group), dtype=torch.float64) if whole else vectors[:, kept]
     room = [plain.to(torch.complex128)]
-    room += [each * bound for each in directions(shape, wavenumber, places, places, distance)]
+    for angle in shape.angles:
+        one = directions(angle[None], shape.concentration, wavenumber, places, places, distance)
+        room.append(one[0] * bound)
     if whole:
         return basis, torch.stack(room)
     # The basis is real: two real products take half the time of a complex one.

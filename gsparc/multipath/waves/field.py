@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,8 @@ from gsparc.multipath.waves.evidence import Kept
 from gsparc.ops import Pose
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
+ROUNDED = 1e-3  # of the noise, error of variances below which half the digits do
+CHECKED = 64  # rows that this is tried at
 
 
 @dataclass(frozen=True)
@@ -32,12 +34,35 @@ class Weights:
         lower: (n, n) complex128, Cholesky factor of the covariance.
         alpha: (n, D) complex128, its inverse times the targets.
         scale: power that the covariance is in units of.
+        noise: least variance of a prediction, in these units.
+        is_real: whether the covariance is.
     """
 
     group: Group
     lower: Tensor
     alpha: Tensor
     scale: float
+    noise: float
+    is_real: bool
+
+    @cached_property
+    def root(self) -> Tensor:
+        """(n, n), inverse of `lower`: real where that is, in single precision where variances allow it.
+
+        A row's covariances c with all rows, its noise included, have c^H C^-1 c = C_ii: that tells the error.
+        """
+        lower = self.lower.real if self.is_real else self.lower
+        root = torch.linalg.solve_triangular(lower, torch.eye(len(lower), dtype=lower.dtype), upper=False)
+        few = lower[torch.linspace(0, len(lower) - 1, min(CHECKED, len(lower))).long()]
+        short = root.to(torch.float32 if self.is_real else torch.complex64)
+        found = ((few @ lower.mH).to(short.dtype) @ short.mH).abs().square().sum(1)
+        error = (found - few.abs().square().sum(1)).abs().max()
+        return short if float(error) <= ROUNDED * self.noise else root
+
+    def learned(self, cross: Tensor) -> Tensor:
+        """Variance (m,) that the rows take away from places of covariances (m, n) with them."""
+        cross = (cross.real if self.is_real else cross).to(self.root.dtype)
+        return (cross.conj() @ self.root.T).abs().square().sum(1)
 
 
 class ChannelField(ConditionalField):
@@ -162,12 +187,12 @@ class ChannelField(ConditionalField):
             factors = torch.ones(len(self.runs), dtype=torch.complex128)
             if len(self.runs) > 1:
                 factors = _factors(groups, lowers, len(self.runs))
-        self.run_factors, found = factors, []
+        self.run_factors, found, noise = factors, [], float(shape.of("noise", values.power))
         for group, lower in zip(groups, lowers, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
             alpha = torch.cholesky_solve(aligned.target, lower)
             scale = float((aligned.target.conj() * alpha).real.mean())
-            found.append(Weights(aligned, lower, alpha, max(scale, 1e-300)))
+            found.append(Weights(aligned, lower, alpha, max(scale, 1e-300), noise, shape.is_real))
         self.weights = tuple(found)
 
     @staticmethod
@@ -228,10 +253,9 @@ class ChannelField(ConditionalField):
             slot.put(mean, here, cross @ known.alpha)
             if self.count:
                 slot.put(share, here, explained(shape, values, slot, places, group.places) @ known.alpha)
-            learned = torch.linalg.solve_triangular(known.lower, cross.mH, upper=False).abs().square().sum(0)
             weight = known.scale * known.alpha.shape[1] / size
             whole = prior(shape, values, slot, places) + disturbed
-            after.index_add_(0, here, weight * (whole - learned).clamp_min(0))
+            after.index_add_(0, here, weight * (whole - known.learned(cross)).clamp_min(0))
             before.index_add_(0, here, weight * whole)
         return mean, share, after, before
 
@@ -278,7 +302,7 @@ class ChannelField(ConditionalField):
         groups = [each.group for each in self._conditioned()]
         values = {name: value.detach() for name, value in self.named_parameters()}
         return {
-            "shape": dict(vars(self.shape)),
+            "shape": self.shape.state(),
             "values": values,
             "channel": list(self.channel),
             "rows": torch.from_numpy(self.rows),
