@@ -94,7 +94,11 @@ class PowerProcess:
         return _factored(_gram(self.kernel, self.places, self.trend), self.extra)
 
     def mean_and_variance(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean [dB], variance of a measurement [dB^2], and its share of the prior's, each (B,)."""
+        """Mean [dB], variance of a measurement [dB^2], and what is unknown, each (B,).
+
+        Unknown is the share of the variance about a known law, at most 1: the law's own prior variance grows
+        without end, and a share of that would call a place far from all data a known one.
+        """
         places = torch.from_numpy(queries)
         terms = self.trend.terms(places).numpy()
         cross = self.kernel.correlation(cdist(queries, self.places)) + terms @ self._terms.T
@@ -102,7 +106,7 @@ class PowerProcess:
         prior = 1 + self.kernel.noise + (terms**2).sum(1)
         known = (solve_triangular(self.factor, cross.T, lower=True, check_finite=False) ** 2).sum(0)
         left = np.clip(prior - known, 0.0, prior)
-        return mean, self.kernel.amplitude * left, left / prior
+        return mean, self.kernel.amplitude * left, np.minimum(left / (1 + self.kernel.noise), 1.0)
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""

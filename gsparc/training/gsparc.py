@@ -105,6 +105,7 @@ class Gsparc(LearnedField):
             known = np.sort(np.concatenate([fold.train, fold.val]))
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)
+        self._say_cost(report.seconds)
         return report
 
     def _watched(self, data: Measurements, fold: Fold) -> None:
@@ -145,10 +146,12 @@ class Gsparc(LearnedField):
         self.steps = self._take_steps(data, fold, context, budget)
         self.field.condition(data, known)
         seconds = budget.counted.wall
-        log.info(
-            "initialisers %.1f s, %d gradient steps kept, %.1f s in all", self.init_s, self.steps, seconds
-        )
+        self._say_cost(seconds)
         return FitReport(seconds, tuple(notes), limited)
+
+    def _say_cost(self, seconds: float) -> None:
+        said = "initialisers %.1f s, %d gradient steps kept, %.1f s in all"
+        log.info(said, self.init_s, self.steps, seconds)
 
     def _solutions(
         self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
