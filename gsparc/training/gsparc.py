@@ -179,6 +179,10 @@ class Gsparc(LearnedField):
                 within = replace(within, run_dir=Path(), resume=None)
             try:
                 found[name], report = self._initialise(name.split()[-1], init, data, rows, within)
+            except KeyboardInterrupt:
+                if not name.startswith("few "):
+                    raise
+                raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
             except ValueError as error:
                 if len(parts) == 1 or name == self.init.name:
                     raise

@@ -185,6 +185,5 @@ def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
     here = method.predict(batch.tx, batch.rx).confidence
     assert here.mean() > 0.8
     away = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
-    for metres, most in ((3000.0, 0.01), (700.0, 0.9)):
-        there = Pose(batch.rx.position[:5] + metres * away, batch.rx.rotation[:5])
-        assert method.predict(batch.tx[:5], there).confidence.max() < most
+    there = Pose(batch.rx.position[:5] + 3000.0 * away, batch.rx.rotation[:5])
+    assert method.predict(batch.tx[:5], there).confidence.max() < 0.01

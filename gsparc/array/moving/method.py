@@ -127,6 +127,10 @@ class MovingArrayField(Interpolator, PredictsVariance):
         self._budget, self._lags = context.time_budget(), None
         return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
 
+    def problem(self, data: Measurements) -> str | None:
+        """See `Method.problem`."""
+        return site_problem(data)
+
     def explains(self, data: Measurements, rows: np.ndarray, seed: int) -> tuple[bool, str]:
         """See `Explains`."""
         return explains(data, rows)

@@ -108,7 +108,8 @@ def find_sources(
         seconds: that are left [s]; sources are added for a part of them, and the schedule of the refinement
             ends with them.
     """
-    end = REFINED * seconds()
+    given = seconds()
+    end = REFINED * given if given < math.inf else 0.0
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
@@ -131,7 +132,7 @@ def find_sources(
         found = torch.cat([found, new[: settings.sources - len(found)]])
         residual = left(lags, receivers, found)
         before, energy = energy, float(residual.square().sum())
-        if energy > (1 - settings.least_gain) * before or seconds() < end:
+        if energy > (1 - settings.least_gain) * before or seconds() <= end:
             break
     if settings.steps == 0 or len(found) == len(known):
         return found
