@@ -144,6 +144,9 @@ class Auto(PredictsVariance):
         able = [n for n in self.candidates if site.static_end is not None or self._fresh(n).both_ends]
         quick = [name for name in able if not self._fresh(name).takes_budget]
         timed = [name for name in able if name not in quick]
+        problems = {name: self._fresh(name).problem(data) for name in timed}
+        refused = [Trial(name, refusal=why) for name, why in problems.items() if why is not None]
+        timed = [name for name in timed if problems[name] is None]  # seconds are shared by these alone
         seconds = self.budget_s if timed and context.budget_s is None else context.budget_s
         budget = context.time_budget(math.inf if seconds is None else seconds)
         count = self.folds or _folds(len(fold.train) + len(fold.val), FEW if timed else FOLDS[0][1])
@@ -153,6 +156,7 @@ class Auto(PredictsVariance):
             contest.try_out(name, partial(self._fresh, name))
         for number, name in enumerate(timed):
             contest.try_out(name, partial(self._fresh, name), len(timed) - number)
+        contest.trials += refused
         missing = [n for n in self.candidates if n not in able]
         missing += [trial.name for trial in contest.trials if trial.refusal is not None]
         if missing:
@@ -258,6 +262,19 @@ class Auto(PredictsVariance):
             method = self._fresh(str(stored["name"]))
             method.restore(site, stored["state"])
             self._fitted.append(method)
+
+    @property
+    def has_gaussians(self) -> bool:  # type: ignore[override]
+        """Whether anything that was chosen has."""
+        return any(method.has_gaussians for method in self._fitted)
+
+    def facts(self) -> dict[str, float | int | str | None]:
+        """See `Method.facts`: those of the heaviest that has Gaussians, and their number in all."""
+        for method in self._fitted:
+            if method.has_gaussians:
+                count = sum(one.size() for one in self._fitted if one.has_gaussians)
+                return {**method.facts(), "model/num_gaussians": count}
+        return super().facts()
 
     def size(self) -> int:
         """That of all that was chosen."""

@@ -59,6 +59,11 @@ class Contest:
             if self._too_long(trial, rest, seconds):
                 break
             began = self.budget.spent
+            if seconds is not None:
+                log.info(
+                    "auto: %s: fold %d of %d, about %.0f s; %.0f s are left in all", trial.name,
+                    len(trial.residual) + 1, folds, seconds, max(self.budget.seconds - began, 0.0),
+                )  # fmt: skip
             attempt(trial, make, self.way, replace(self.context, budget_s=seconds))
             trial.seconds.append(self.budget.spent - began)
             trial.over_s = max(trial.over_s, trial.seconds[-1] - (seconds or 0.0))

@@ -141,6 +141,9 @@ def attempt(trial: Trial, make: Callable[[], Method], course: Course, context: F
             )  # fmt: skip
             report = method.fit(course.data, course.inner.folds[number], own)
             predicted, variance = _predicted(method, course.data, asked.row)
+    except KeyboardInterrupt:  # its advice would name a file of the trial, which is gone
+        said = f"auto was interrupted while it tried {trial.name}; there is no checkpoint yet"
+        raise KeyboardInterrupt(said) from None
     except REFUSALS as refused:
         trial.refusal = str(refused).strip().partition("\n")[0] or type(refused).__name__
         return

@@ -17,6 +17,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
+from gsparc.commands import job_name  # noqa: F401  # configurations name folders by it
 from gsparc.commands.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, one_line
 

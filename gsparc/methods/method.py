@@ -156,6 +156,10 @@ class Method(ABC):
         """Number of Gaussians, sources or stored training samples."""
         return 0
 
+    def problem(self, data: Measurements) -> str | None:
+        """Why it cannot serve these measurements, as far as that is known before a fit; None where it may."""
+        return None
+
     def facts(self) -> dict[str, float | int | str | None]:
         """What `summary.json` says of a fitted model, None where it means nothing here."""
         return {

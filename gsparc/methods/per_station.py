@@ -74,7 +74,7 @@ class PerStation(Method):
     def __init__(self, make: Callable[[], Method]) -> None:
         self._make = make
         first = make()
-        self.name, self.effects, self.guesses = first.name, first.effects, first.guesses
+        self.name, self.guesses = first.name, first.guesses
         self.wrapped = first
         self._copies: dict[int, Method] = {}
 
@@ -82,6 +82,12 @@ class PerStation(Method):
     def label(self) -> str:
         """That of the copies."""
         return common_label(self.name, list(self._copies.values()))
+
+    @property
+    def effects(self) -> str | None:  # type: ignore[override]
+        """Those of the copies, each once."""
+        said = [copy.effects for copy in self._copies.values() if copy.effects is not None]
+        return ", ".join(dict.fromkeys(said)) if said else self.wrapped.effects
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit every station that is asked for, or all together as if both ends moved; seconds are shared.

@@ -33,6 +33,7 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 EVIDENCE_LOOKS = 30
 AMPLITUDES_DB2 = (1e-4, 1e5)
+REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 
 
 @dataclass(frozen=True)
@@ -94,15 +95,32 @@ class PowerProcess:
         return _factored(_gram(self.kernel, self.places, self.trend), self.extra)
 
     def mean_and_variance(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean [dB], variance of a measurement [dB^2], and its share of the prior's, each (B,)."""
+        """Mean [dB], variance of a measurement [dB^2], and what is unknown, in [0, 1], each (B,).
+
+        Unknown is the variance as a share of that of the known rows. What the mean law explains of them
+        counts as known near them only: its slope says nothing of places far from all data.
+        """
         places = torch.from_numpy(queries)
         terms = self.trend.terms(places).numpy()
-        cross = self.kernel.correlation(cdist(queries, self.places)) + terms @ self._terms.T
+        far = cdist(queries, self.places)
+        cross = self.kernel.correlation(far) + terms @ self._terms.T
         mean = self.trend.mean(places).numpy() + cross @ self.weights
         prior = 1 + self.kernel.noise + (terms**2).sum(1)
         known = (solve_triangular(self.factor, cross.T, lower=True, check_finite=False) ** 2).sum(0)
         left = np.clip(prior - known, 0.0, prior)
-        return mean, self.kernel.amplitude * left, left / prior
+        whole, reach = self._spread
+        by_law = 1 - (1 + self.kernel.noise) / whole  # share of that variance
+        unknown = left / whole + by_law * (1 - np.exp(-((far.min(1) / reach) ** 2)))
+        return mean, self.kernel.amplitude * left, np.minimum(unknown, 1.0)
+
+    @cached_property
+    def _spread(self) -> tuple[float, float]:
+        """Variance of the rows that were heard, of the amplitude, and how far a law of them reaches [m]."""
+        lower, heard = np.tril(self.factor), self.extra == 0
+        decibels = self.trend.mean(torch.from_numpy(self.places)).numpy() + lower @ (lower.T @ self.weights)
+        whole = float(decibels[heard].var()) / self.kernel.amplitude if heard.any() else 0.0
+        reach = float(np.linalg.norm(np.ptp(self.places, axis=0))) * REACH
+        return max(whole, 1 + self.kernel.noise), max(reach, 1e-9)
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""

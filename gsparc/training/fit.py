@@ -162,6 +162,7 @@ def run_stage(
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
     """
     folder, make, batches = module.run_dir, context.trainer or DEFAULTS, context.datamodule
+    before = budget.counted
     if module.conditional:  # a row is predicted from the others of its batch
         batches = Loaded(data, min(len(fold.train), CONDITIONAL_ROWS))
     elif batches is None or batches.measurements is not data:
@@ -216,9 +217,10 @@ def run_stage(
     finally:
         batches.trainer = None  # which holds the optimizer's state
     metrics = trainer.callback_metrics
+    learned = float(metrics[SECONDS]) or float(metrics[SPENT][0]) - before.wall  # where no ledger counts
     budget.charge(Spent(*metrics[SPENT].tolist()) - budget.counted)
     steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
-    return Ran(float(metrics[SECONDS]), trainer.global_step if steps is None else steps, position)
+    return Ran(learned, trainer.global_step if steps is None else steps, position)
 
 
 def _last_line(error: ProcessException) -> str:

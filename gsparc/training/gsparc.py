@@ -112,6 +112,8 @@ class Gsparc(LearnedField):
             known = np.sort(np.concatenate([fold.train, fold.val]))
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)
+        rest = report.seconds - self.init_s
+        _say_cost({f"init={self.started}": self.init_s, "gradient steps and the rest": rest}, report.seconds)
         return report
 
     def _watched(self, data: Measurements, fold: Fold) -> None:
@@ -160,9 +162,7 @@ class Gsparc(LearnedField):
         seconds = budget.counted.wall
         stages = {name: report.seconds for name, report in reports.items()}
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
-        log.info(
-            "cost: %s; %.1f s in all", ", ".join(f"{name} {s:.1f} s" for name, s in stages.items()), seconds
-        )
+        _say_cost(stages, seconds)
         notes = [note for name in self.started.split("+") for note in reports[name].notes]
         limited: Clock | None = None
         for report in reports.values():
@@ -202,6 +202,10 @@ class Gsparc(LearnedField):
                 else:
                     found[name], report = self._initialise(part, init, data, rows, within)
                     found[name].held = _held(found[name], data, rows, groups)
+            except KeyboardInterrupt:
+                if not name.startswith("few "):
+                    raise
+                raise KeyboardInterrupt("training was interrupted; there is no checkpoint yet") from None
             except ValueError as error:
                 if len(parts) == 1 or name == self.init.name:
                     raise
@@ -504,6 +508,12 @@ def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
         found = field_restored(str(state["kind"]))(site, state)
     found.site = site
     return found
+
+
+def _say_cost(stages: dict[str, float], seconds: float) -> None:
+    """The log's last line of a fit: seconds of each stage, and of all."""
+    said = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
+    log.info("cost: %s; %.1f s in all", said, seconds)
 
 
 def _held(

@@ -9,7 +9,9 @@ import pytest
 import torch
 from campaigns import compose, powers, spectra
 from clocks import wound
+from contexts import short
 from invented import invent
+from kinds import KINDS
 
 from gsparc.auto.auto_method import Auto
 from gsparc.commands.train import train
@@ -245,12 +247,39 @@ def test_the_seconds_are_those_of_all_stations(tmp_path):
     assert len(timed.fits) == 3 * 4 and all(0 < seconds < 20 for _, seconds in timed.fits)
 
 
+def test_seconds_are_shared_by_those_that_serve_the_data(tmp_path, caplog):
+    """`moving_array` and `image_source_gp` took two thirds of the seconds of powers, for nothing."""
+    caplog.set_level(logging.INFO, "gsparc.auto")
+    timed = Shared("timed", 1.0, 0, 1.0)
+    method = Auto([timed, "moving_array", "image_source_gp"], budget_s=60.0)
+    fitted(method, street(60), tmp_path)
+    assert timed.fits[0][1] > 60 / 3 / 2  # three folds, all rows, and as much in reserve
+    assert "not for these data: moving_array, image_source_gp" in caplog.text
+    assert "auto: timed: fold 1 of 3, about" in caplog.text and "are left in all" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["powers", "channels", "images"])
+def test_the_field_is_a_candidate_that_is_stored(kind, tmp_path):
+    data = KINDS[kind](tmp_path)
+    method = Auto(["mean", "gsparc"], budget_s=6.0)
+    fold = split_for(CUTS["random"], data).folds[0]
+    context = short(tmp_path, 20, validate_every=10, split=split_settings(CUTS["random"]))
+    report = method.fit(data, fold, context)
+    assert report.seconds < 12 and method.label.startswith("auto (") and "gsparc" in method.label
+    assert method.facts()["model/num_gaussians"] is not None and method.facts()["model/init"]
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    again, _ = checkpoint.load(tmp_path / "model.ckpt")
+    batch = data.batch(fold.test)
+    torch.testing.assert_close(again.answer(batch).mean, method.answer(batch).mean)
+    assert again.label == method.label and again.size() == method.size()
+
+
 def test_an_interrupt_is_not_swallowed(tmp_path):
     class Interrupted(Known):
         def fit(self, data, fold, context):
             raise KeyboardInterrupt
 
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(KeyboardInterrupt, match="interrupted while it tried one; there is no checkpoint"):
         fitted(Auto([Interrupted("one", 1.0, 0)]), street(60), tmp_path)
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from outdated import GONE
 
 import gsparc
 from gsparc.data.schema import Batch
@@ -21,13 +22,6 @@ HERE = Path(__file__).resolve().parent
 FIXTURES = HERE / "old_checkpoints"
 NAMES = sorted(path.stem for path in FIXTURES.glob("*.ckpt"))
 KINDS = ("learned", "expected", "distance", "gp_variance")  # of confidence
-PACKETS = ["array", "gsparc_array", "gsparc_array_beside", "traded_array"]  # made of wave packets
-COMPANIONS = ["gsparc_phase_rest", "gsparc_phase_told", "gsparc_phase_told_rest", "traded_phase_rest"]
-GONE = {
-    **dict.fromkeys(PACKETS, "it is made of wave packets, as earlier versions were; train"),
-    **dict.fromkeys(COMPANIONS, "it has a companion of an earlier version; train"),
-    "gsparc_splat_phase": "its carrier phase is of splatted Gaussians, as in earlier versions; train",
-}
 READ = [name for name in NAMES if name not in GONE]
 RTOL, ATOL = 2e-4, 1e-5  # the second in units of the largest value
 APPROXIMATE = 2e-3  # RTOL of what is answered from images of low rank since, and ten times that of variances

@@ -20,6 +20,7 @@ from gsparc.methods.kriging import Kriging
 from gsparc.methods.method import FitContext
 from gsparc.methods.power_kernel import PowerKernel, kernel_of, left_out
 from gsparc.methods.reduced import reduced
+from gsparc.ops import Pose
 
 KERNELS = (PowerKernel((0.3,), (1.0,), 0.1, 1.0), PowerKernel((0.1, 0.5), (0.3, 0.7), 0.1, 1.0))
 CITY = Path(__file__).parents[3] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
@@ -174,3 +175,15 @@ def test_a_measured_station():
     method = GaussianProcess()
     batch, _ = fit(method, data, 500)
     assert error_db(method, batch) < 5.0
+
+
+def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
+    """The share of the prior's variance was 0.03 a kilometre away: that of the law grows without end."""
+    data = town(160, shadowing_db=0.5)
+    method = GaussianProcess()
+    batch, _ = fit(method, data, 120)
+    here = method.predict(batch.tx, batch.rx).confidence
+    assert here.mean() > 0.8
+    away = torch.tensor([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
+    there = Pose(batch.rx.position[:5] + 3000.0 * away, batch.rx.rotation[:5])
+    assert method.predict(batch.tx[:5], there).confidence.max() < 0.01

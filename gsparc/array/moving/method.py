@@ -43,6 +43,7 @@ log = logging.getLogger(__name__)
 UNRESOLVED = 2e-4  # of the images' energy, that the basis of the residual leaves out per mode
 MIN_GAIN = 0.005  # of the leave-one-out error: searches end when the last one gained less
 BUDGET_SHARE = 0.8  # of the budget, by which the last search must end
+SEARCH_SHARE = 0.7  # the same without the kernel of its powers
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,10 @@ class MovingArrayField(Interpolator, PredictsVariance):
             raise ValueError(f"{self.name}: {problem}")
         self._budget, self._lags = context.time_budget(), None
         return replace(super().fit(data, fold, context), limited_by=self._budget.limited_by)
+
+    def problem(self, data: Measurements) -> str | None:
+        """See `Method.problem`."""
+        return site_problem(data)
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`; searches where there are several."""
@@ -227,8 +232,13 @@ class MovingArrayField(Interpolator, PredictsVariance):
         first = None if static is None else torch.from_numpy(np.asarray(static)).float()
         return find_sources(
             some.lags, some.receivers, first, self.rotation(), self.lags(), self.site.grid, self.search,
-            self.seed + len(self.trends),
+            self.seed + len(self.trends), self._seconds,
         )  # fmt: skip
+
+    def _seconds(self) -> float:
+        """Left for the search under way [s]; whoever has none of them ends what it does."""
+        self._budget.over(SEARCH_SHARE)
+        return SEARCH_SHARE * self._budget.seconds - self._budget.spent
 
     def _powers(self, held: Spectra, sources: Tensor) -> np.ndarray:
         """Powers (n, K) float64 that explain each row best."""

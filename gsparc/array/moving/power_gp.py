@@ -85,5 +85,7 @@ def fit_trend(
     """The trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
     level = power.mean(0)
     weights, spread = solved(kernel, places, power - level)
-    trend = Trend(sources, kernel, torch.from_numpy(level).float(), torch.from_numpy(weights).float())
+    # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more
+    stored = torch.from_numpy(np.ascontiguousarray(weights)).float()
+    trend = Trend(sources, kernel, torch.from_numpy(level).float(), stored)
     return trend, power - weights * spread[:, None]

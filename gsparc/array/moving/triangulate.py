@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +14,12 @@ from gsparc.ops import SphereGrid
 from gsparc.physics.lags import Lags
 
 SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
+REFINED = 0.6  # of a search's seconds are for the refinement
+
+
+def unlimited() -> float:
+    """Seconds that are left where nobody counts them."""
+    return math.inf
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,7 @@ def find_sources(
     grid: SphereGrid,
     settings: SearchSettings,
     seed: int,
+    seconds: Callable[[], float] = unlimited,
 ) -> Tensor:
     """Positions (K, 3) float32 [m] of sources.
 
@@ -96,7 +105,11 @@ def find_sources(
         grid: of the spectra; candidates are scored at their nearest pixel.
         settings: how.
         seed: of the candidates.
+        seconds: that are left [s]; sources are added for a part of them, and the schedule of the refinement
+            ends with them.
     """
+    given = seconds()
+    end = REFINED * given if given < math.inf else 0.0
     generator = torch.Generator().manual_seed(seed)
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
@@ -119,22 +132,25 @@ def find_sources(
         found = torch.cat([found, new[: settings.sources - len(found)]])
         residual = left(lags, receivers, found)
         before, energy = energy, float(residual.square().sum())
-        if energy > (1 - settings.least_gain) * before:
+        if energy > (1 - settings.least_gain) * before or seconds() <= end:
             break
     if settings.steps == 0 or len(found) == len(known):
         return found
     # Powers are optimal at every step, so that their derivative does not enter the gradient.
     free = found[len(known) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.steps)
-    for _ in range(settings.steps):
+    whole = seconds()
+    for step in range(settings.steps):
+        done = max(step / settings.steps, 1 - seconds() / whole if 0 < whole < math.inf else 0.0)
+        if done >= 1 or whole <= 0:
+            break
+        optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * done)) / 2
         some = torch.randperm(len(receivers), generator=generator)[:64]
         residual = left(lags[some], receivers[some], torch.cat([known, free]))
         loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        schedule.step()
     return torch.cat([known, free.detach()])
 
 

@@ -309,7 +309,7 @@ class ChannelField(ConditionalField):
             "runs": torch.from_numpy(self.runs),
             "run_factors": self.run_factors,
             "groups": [
-                {**vars(group), "slot": {**vars(group.slot)}, "target": group.target * self._turn(group)}
+                {**vars(group), "slot": _stored(group.slot), "target": group.target * self._turn(group)}
                 for group in groups
             ],
         }
@@ -331,12 +331,22 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     field.rows, field.runs = state["rows"].numpy(), state["runs"].numpy()
     groups = []
     for each in state["groups"]:
-        slot = {**each["slot"]}
-        slot = {**slot, "antennas": tuple(slot["antennas"]), "tones": tuple(slot["tones"])}
-        groups.append(Group(**{**each, "slot": Slot(**slot)}))
+        groups.append(Group(**{**each, "slot": _read(each["slot"])}))
     with torch.no_grad():
         field._solve(tuple(groups), state["run_factors"])
     return field
+
+
+def _stored(slot: Slot) -> dict[str, Any]:
+    """What `_read` reads; a checkpoint holds finite numbers alone, so that an unknown place is none."""
+    unknown = bool(slot.end.isnan().any())
+    return {**vars(slot), "end": slot.end[:0] if unknown else slot.end}
+
+
+def _read(state: dict[str, Any]) -> Slot:
+    end = state["end"] if len(state["end"]) else torch.full((3,), torch.nan, dtype=torch.float64)
+    entries = {name: tuple(int(n) for n in state[name]) for name in ("antennas", "tones")}
+    return Slot(**{**state, **entries, "end": end})
 
 
 def _entries(whole: Tensor, rows: Tensor, slot: Slot) -> Tensor:

@@ -51,6 +51,25 @@ def test_the_strong_images_are_found(data):
     assert distance[0] < 0.1 and (distance < 0.25).sum() >= 3
 
 
+def test_a_search_ends_with_its_seconds():
+    """One of 60 sources took 13 s of 4: sources are then fewer, and the refinement's schedule shorter."""
+    rng = np.random.default_rng(0)
+    grid = SphereGrid.hemisphere(15, 60)
+    array = np.c_[np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4), np.zeros(16)] * 0.06
+    space = Lags(array, grid, 0.125)
+    power = torch.from_numpy(rng.uniform(size=(20, 15, 60)).astype(np.float32))
+    receivers = torch.from_numpy(rng.uniform(size=(20, 3)).astype(np.float32))
+    settings = dataclasses.replace(SEARCH, sources=40, per_round=4, least_gain=0.0)
+    looks = iter(np.linspace(1.0, -1.0, 20))
+
+    def search(seconds):
+        return find_sources(space.of(power), receivers, None, torch.eye(3), space, grid, settings, 0, seconds)
+
+    few = search(lambda: float(next(looks)))
+    assert 4 <= len(few) < 40 and next(looks) < 0  # the last look said that there are none left
+    assert torch.isfinite(search(lambda: 0.0)).all() and len(search(lambda: 0.0)) == 4
+
+
 def test_it_beats_the_process_on_images(data, fold, fitted, tmp_path):
     rival = GaussianProcess()
     rival.fit(data, fold, FitContext(tmp_path))
