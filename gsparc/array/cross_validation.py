@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.array.vector_gp import Kernel, align, refine_alignment
 from gsparc.field.confidence import fit_errors
-from gsparc.methods.gp import choose_kernel
+from gsparc.methods.left_out_images import LeftOut, mean_log_error, predict_left_out
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
 PIXELS = 600  # drawn from the grid: the score needs no more
@@ -24,72 +24,6 @@ CENTRES = 160  # of them predicted
 STEPS = 36  # evaluations of Nelder-Mead
 WEIGHTS = np.linspace(0, 1, 21)  # candidates of the ensemble weight of a process on images
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """Training spectra predicted without their neighbours.
-
-    Attributes:
-        positions: (n, 3) [m].
-        images: (n, P) float64, some pixels of the spectra.
-        centres: (c,) rows that were held out.
-        gaps: (g,) [m] within which their neighbours were held out, too.
-        predicted: (g, c, P); NaN where no sample was left.
-    """
-
-    positions: np.ndarray
-    images: np.ndarray
-    centres: np.ndarray
-    gaps: np.ndarray
-    predicted: np.ndarray
-
-    def mismatch_db(self, predicted: np.ndarray) -> float:
-        """Minus the PSNR [dB] of predictions (g, c, P), averaged over samples and gaps."""
-        return 10 / np.log(10) * _mean_log_error(((predicted - self.images[self.centres]) ** 2).mean(-1))
-
-
-def predict_left_out(
-    inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of each sample given all others outside a gap around it.
-
-    Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
-    `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
-
-    Args:
-        inverse: (n, n) of the Gram matrix with noise.
-        values: (n, M) real or complex.
-        distance: (n, n) [m].
-        centres: (c,) rows.
-        gaps: (g,) [m].
-
-    Returns:
-        Means (g, c, M), and variances (g, c) with noise; NaN where nothing is left.
-    """
-    weighted = inverse @ values
-    mean = np.full((len(gaps), len(centres), values.shape[1]), np.nan, dtype=values.dtype)
-    variance = np.full(mean.shape[:2], np.nan)
-    for g, gap in enumerate(gaps):
-        for c, i in enumerate(centres):
-            near = distance[i] <= gap
-            near[i] = True
-            if near.all():
-                continue
-            rows = np.flatnonzero(near)
-            own = int(np.searchsorted(rows, i))
-            unit = np.zeros(len(rows))
-            unit[own] = 1.0
-            share = np.linalg.solve(inverse[np.ix_(rows, rows)], unit)
-            mean[g, c] = values[i] - share @ weighted[rows]
-            variance[g, c] = share[own]
-    return mean, variance
-
-
-def _mean_log_error(error: np.ndarray) -> float:
-    """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
-    usable = ~np.isnan(error).all(1)
-    return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
 
 
 @dataclass(frozen=True)
@@ -161,7 +95,7 @@ def tune(
         kernel = kernel_at(parameters)
         inverse = np.linalg.inv(kernel.gram(positions))
         found = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
-        return _mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
+        return mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
 
     if len(positions) < 4:
         return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
@@ -211,11 +145,6 @@ def compared(left: LeftOut) -> tuple[float, float]:
 
     On the same samples, gaps and pixels; the kernel is chosen on all samples.
     """
-    mean = left.images.mean(0)
-    vectors, lengths, _ = np.linalg.svd(left.images - mean, full_matrices=False)
-    kernel = choose_kernel(left.positions, vectors * lengths, len(mean))
-    inverse = np.linalg.inv(kernel.gram(left.positions))
-    distance = np.linalg.norm(left.positions[:, None] - left.positions[None], axis=-1)
-    predicted = mean + predict_left_out(inverse, left.images - mean, distance, left.centres, left.gaps)[0]
+    predicted = left.by_process()
     error = [left.mismatch_db((1 - w) * left.predicted + w * predicted) for w in WEIGHTS]
     return error[-1] - error[0], float(WEIGHTS[int(np.argmin(error))])
