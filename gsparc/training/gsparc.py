@@ -128,7 +128,7 @@ class Gsparc(LearnedField):
         if self.plan is None or not self.plan.plain:
             return
         spectra = data.site.kind == "spectrum"
-        left = self._left_out if spectra and (self.steps == 0 or len(fold.val) < LEAST_HELD) else None
+        left = self._left_out if spectra else None  # as the start predicts them, before any step
         if left is None and len(fold.val) < LEAST_HELD:
             log.info("no Gaussian process beside the field: too few rows are held out to weigh it")
             return

@@ -55,3 +55,9 @@ def test_only_on_schedule(module, step):
     OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, step), module)
     assert torch.equal(module.model.gaussians.opacity_logits, before)
     assert int(module.model.gaussians.version) == 0
+
+
+def test_no_reset_of_opacities_that_emissions_were_solved_for(module):
+    module.solved = True
+    OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, 30), module)
+    assert int(module.model.gaussians.version) == 0
