@@ -7,10 +7,13 @@ left as queries will be.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from scipy.spatial.distance import cdist
+from torch import Tensor
 
 from gsparc.methods.gp import choose_kernel
 
@@ -32,6 +35,15 @@ class LeftOut:
     centres: np.ndarray
     gaps: np.ndarray
     predicted: np.ndarray
+
+    def state(self) -> dict[str, Tensor]:
+        """For the checkpoint of a training that may be interrupted."""
+        return {key: torch.from_numpy(np.ascontiguousarray(value)) for key, value in vars(self).items()}
+
+    @classmethod
+    def of(cls, state: Mapping[str, Tensor] | None) -> LeftOut | None:
+        """From `state()`; None from None."""
+        return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
 
     def mismatch_db(self, predicted: np.ndarray) -> float:
         """Minus the PSNR [dB] of predictions (g, c, P), averaged over samples and gaps."""

@@ -132,6 +132,9 @@ class LearnedField(Method):
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
         self.spent, self._apart = {}, _apart(data, fold)
+        self._left_out = LeftOut.of(
+            marks.get("left_out")
+        )  # the initialiser of an interrupted run is not repeated
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
         if self._solved(fold):
             if self.refit:
@@ -218,7 +221,8 @@ class LearnedField(Method):
         module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
         marks = {
             "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
-            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s, **origin.marks(),
+            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
+            "left_out": None if self._left_out is None else self._left_out.state(), **origin.marks(),
         }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         if stage == "refit" and self._paying == 0:

@@ -39,3 +39,9 @@ def test_the_gap_is_as_wide_as_held_out_rows_are_far(left):
     np.fill_diagonal(apart, np.inf)
     assert left.as_far_as(float(np.median(apart[left.centres].min(1)))) == 0
     assert left.as_far_as(0.25) == 1 and left.as_far_as(None) == 0
+
+
+def test_it_goes_through_a_checkpoint(left):
+    again = LeftOut.of(left.state())
+    assert again is not None and LeftOut.of(None) is None
+    assert all(np.array_equal(value, vars(again)[key]) for key, value in vars(left).items())
