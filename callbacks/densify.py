@@ -11,9 +11,11 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
+from gsparc.callbacks.events import noted
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
+from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
 
 log = logging.getLogger(__name__)
 
@@ -23,7 +25,7 @@ class Densify(Checked, L.Callback):
     """Clone, split and prune on a schedule of steps.
 
     Args:
-        start, stop, interval: first step, last step and spacing of the edits.
+        start, stop, interval: first step, last step and spacing of the edits; below 1 a share of all steps.
         grad_threshold: mean screen-space gradient norm [loss per px] above which a Gaussian is
             under-reconstructed; read per sample before summing.
         size_share: Gaussians up to this share of the scene radius are cloned, larger ones split.
@@ -34,9 +36,9 @@ class Densify(Checked, L.Callback):
         min_gaussians: pruning stops at this many, the most opaque stay.
     """
 
-    start: int = setting(500, whole(0))
-    stop: int = setting(15_000, whole(0))
-    interval: int = setting(100, whole(1))
+    start: int | float = setting(500, STEPS)
+    stop: int | float = setting(15_000, STEPS)
+    interval: int | float = setting(100, INTERVAL)
     grad_threshold: float = setting(2e-4, number(0))
     size_share: float = setting(0.01, number(0))
     children: int = setting(2, whole(2))
@@ -53,7 +55,9 @@ class Densify(Checked, L.Callback):
 
     def on_after_backward(self, trainer: L.Trainer, module: Any) -> None:
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
-        if module.rendered is None or module.rendered.raster is None or trainer.global_step >= self.stop:
+        if module.rendered is None or module.rendered.raster is None:
+            return
+        if trainer.global_step >= in_steps(self.stop, module.total_steps):
             return
         raster = module.rendered.raster
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -71,7 +75,8 @@ class Densify(Checked, L.Callback):
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Edit the field when the schedule says so."""
         step = trainer.global_step
-        if not (self.start <= step <= self.stop and step % self.interval == 0) or not self.statistics:
+        when = (self.start, self.stop, self.interval, module.total_steps)
+        if not due(step, module.global_step, *when) or not self.statistics:
             return
         model: GaussianModel = module.model
         with torch.no_grad():
@@ -81,7 +86,7 @@ class Densify(Checked, L.Callback):
             before = len(model.gaussians)
             edit.apply(planned, model, model.gaussians, trainer.optimizers[0])
             self.statistics = self._blank(model)
-        log.debug("step %d: %d -> %d Gaussians", step, before, len(model.gaussians))
+        _tell(trainer, module, planned, before)
 
     def plan(self, model: GaussianModel, generator: torch.Generator) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far."""
@@ -135,6 +140,17 @@ class Densify(Checked, L.Callback):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue in the middle of an interval."""
         self.statistics = dict(state["statistics"])
+
+
+def _tell(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int) -> None:
+    """A line in the log and figures for the trackers, where anything was changed."""
+    after, gone = len(module.model.gaussians), int((~planned.keep).sum())
+    if gone or len(planned.parents):
+        log.info(
+            "step %d: %d Gaussians removed or split, %d added: %d -> %d",
+            trainer.global_step, gone, len(planned.parents), before, after,
+        )  # fmt: skip
+        noted(trainer, module, {"densify/removed": gone, "densify/added": len(planned.parents)})
 
 
 def _sample_inside(scales: Tensor, quats: Tensor, generator: torch.Generator) -> Tensor:

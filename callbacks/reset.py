@@ -10,7 +10,9 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 
-from gsparc.data.limits import SHARE, Checked, setting, whole
+from gsparc.callbacks.events import noted
+from gsparc.data.limits import SHARE, Checked, setting
+from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
 
 log = logging.getLogger(__name__)
 
@@ -20,24 +22,27 @@ class OpacityReset(Checked, L.Callback):
     """sigma_i <- min(sigma_i, ceiling) every `interval` steps until `stop`; Adam's moments follow.
 
     Validation falls by several decibels and takes about an interval to recover: where fewer steps are left,
-    there is no reset.
+    there is no reset, nor is there where emissions were solved for the opacities as they are.
 
     Args:
-        interval: steps between resets.
-        stop: last step at which one may happen.
+        interval: steps between resets; below 1 a share of all steps.
+        stop: last step at which one may happen, or its share.
         ceiling: opacity after the reset.
     """
 
-    interval: int = setting(3000, whole(1))
-    stop: int = setting(15_000, whole(0))
+    interval: int | float = setting(3000, INTERVAL)
+    stop: int | float = setting(15_000, STEPS)
     ceiling: float = setting(0.01, SHARE)
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Reset when the schedule says so."""
         step = trainer.global_step
-        if module.conditional or step == 0 or step > self.stop or step % self.interval:
+        if module.conditional or module.solved:
             return
-        if step + self.interval > module.total_steps:
+        interval = in_steps(self.interval, module.total_steps)
+        if not due(step, module.global_step, 1, self.stop, self.interval, module.total_steps):
+            return
+        if step + interval > module.total_steps:
             left = module.total_steps - step
             log.info("no opacity reset at step %d: %d steps are too few to recover in", step, left)
             return
@@ -50,3 +55,6 @@ class OpacityReset(Checked, L.Callback):
                 if key in state:
                     state[key][lowered] = 0
             field.version += 1
+        count = int(lowered.sum())
+        log.info("step %d: opacities of %d Gaussians lowered to %g", step, count, self.ceiling)
+        noted(trainer, module, {"reset/lowered": count})

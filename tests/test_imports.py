@@ -31,7 +31,7 @@ ARROWS = {
     "peers": "data field methods ops physics training",
     "auto": "data methods ops",
     "evaluation": "data methods",
-    "callbacks": "data evaluation field",
+    "callbacks": "data evaluation field training",
     "commands": "data evaluation field methods multipath ops simulate training",
     "conf": "",
 }

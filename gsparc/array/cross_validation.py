@@ -15,6 +15,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.array.vector_gp import Kernel, align, refine_alignment
 from gsparc.field.confidence import fit_errors
+from gsparc.methods.left_out_images import LeftOut, mean_log_error, predict_left_out
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
 PIXELS = 600  # drawn from the grid: the score needs no more
@@ -22,49 +23,6 @@ ROWS = 384  # neighbouring samples used: the inverse costs their cube
 CENTRES = 160  # of them predicted
 STEPS = 36  # evaluations of Nelder-Mead
 STARTS = ((0.25, 0.005), (0.5, 0.005))  # length [wavelengths], noise
-
-
-def predict_left_out(
-    inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and variance of each sample given all others outside a gap around it.
-
-    Without the set S the residual of its members is `(K^-1_SS)^-1 (K^-1 X)_S`, their covariance
-    `(K^-1_SS)^-1`: small systems instead of one of n - |S| for each.
-
-    Args:
-        inverse: (n, n) of the Gram matrix with noise.
-        values: (n, M) real or complex.
-        distance: (n, n) [m].
-        centres: (c,) rows.
-        gaps: (g,) [m].
-
-    Returns:
-        Means (g, c, M), and variances (g, c) with noise; NaN where nothing is left.
-    """
-    weighted = inverse @ values
-    mean = np.full((len(gaps), len(centres), values.shape[1]), np.nan, dtype=values.dtype)
-    variance = np.full(mean.shape[:2], np.nan)
-    for g, gap in enumerate(gaps):
-        for c, i in enumerate(centres):
-            near = distance[i] <= gap
-            near[i] = True
-            if near.all():
-                continue
-            rows = np.flatnonzero(near)
-            own = int(np.searchsorted(rows, i))
-            unit = np.zeros(len(rows))
-            unit[own] = 1.0
-            share = np.linalg.solve(inverse[np.ix_(rows, rows)], unit)
-            mean[g, c] = values[i] - share @ weighted[rows]
-            variance[g, c] = share[own]
-    return mean, variance
-
-
-def _mean_log_error(error: np.ndarray) -> float:
-    """Mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
-    usable = ~np.isnan(error).all(1)
-    return float(np.nanmean(np.log(error[usable] + 1e-9), axis=1).mean()) if usable.any() else 0.0
 
 
 @dataclass(frozen=True)
@@ -75,11 +33,13 @@ class Tuned:
         kernel: length and noise.
         unknown: (k,) posterior variance of each held-out prediction, as a share of the prior's.
         error: (k,) mean squared error of its spectrum.
+        left_out: the held-out predictions; None for too few samples.
     """
 
     kernel: Kernel
     unknown: np.ndarray
     error: np.ndarray
+    left_out: LeftOut | None = None
 
     def error_model(self) -> tuple[float, float]:
         """(a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
@@ -134,7 +94,7 @@ def tune(
         kernel = kernel_at(parameters)
         inverse = np.linalg.inv(kernel.gram(positions))
         found = samples.predictions(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
-        return _mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
+        return mean_log_error(samples.error(found))  # up to a factor, minus the PSNR
 
     if len(positions) < 4:
         return Tuned(kernel_at(np.log(STARTS[0])), np.array([0.0, 1.0]), np.array([0.0, 1e-2]))
@@ -152,7 +112,8 @@ def tune(
     unknown, predicted = samples.predictions(kernel, inverse, refine_alignment(refined, inverse, partner))
     error = samples.error(predicted)
     seen = ~np.isnan(error)
-    return Tuned(kernel, unknown[seen], error[seen])
+    left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
+    return Tuned(kernel, unknown[seen], error[seen], left_out)
 
 
 @dataclass(frozen=True)

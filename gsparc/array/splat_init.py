@@ -27,6 +27,7 @@ from gsparc.field.initial import InitTask, Start
 from gsparc.field.kernels import whitened
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
+from gsparc.methods.left_out_images import LeftOut
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.methods.time_budget import Spent, TimeBudget
 from gsparc.ops import Pose
@@ -47,6 +48,7 @@ class Learned:
         weights: (E, M) complex128, features to array vectors.
         background: (H, W) float32, the mean spectrum.
         error: level and power of the field's `ErrorModel`.
+        left_out: training spectra predicted without their neighbours; None for too few.
         elapsed, training: time of phase retrieval in this run, and when it was computed.
         time_limited: whether seconds ended it.
     """
@@ -55,6 +57,7 @@ class Learned:
     weights: Tensor
     background: Tensor
     error: tuple[float, float]
+    left_out: LeftOut | None
     elapsed: Spent
     training: Spent
     time_limited: bool
@@ -78,7 +81,7 @@ class ThroughArray:
         found = learn(task.data, task.rows, task.anchors, task.seed, task.run_dir)
         return Start(
             found.prior, partial(start, found=found, receiver=task.receiver), astuple(found.training),
-            astuple(found.elapsed), found.time_limited,
+            astuple(found.elapsed), found.time_limited, found.left_out,
         )  # fmt: skip
 
 
@@ -127,6 +130,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(site.grid.height, site.grid.width),
         tuned.error_model(),
+        tuned.left_out,
         elapsed,
         training,
         bool(found.time_limited.any()),

@@ -98,7 +98,7 @@ class Start:
 
     Attributes:
         prior: features of the encodings, or None.
-        solve: sets the parameters of a fresh model.
+        solve: sets the parameters of a fresh model; may return what `left_out` holds.
         billed_s, waited_s: reusable work: as it was first measured, and this time; seconds of the wall and of
             the processor [s].
         time_limited: whether seconds ended that work.
@@ -106,7 +106,7 @@ class Start:
     """
 
     prior: Prior | None
-    solve: Callable[[GaussianModel], None] = unchanged
+    solve: Callable[[GaussianModel], Any] = unchanged
     billed_s: tuple[float, float] = (0.0, 0.0)
     waited_s: tuple[float, float] = (0.0, 0.0)
     time_limited: bool = False

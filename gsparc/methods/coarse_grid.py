@@ -36,6 +36,7 @@ class Filled(View):
 
     def __init__(self, inner: Method, grid: SphereGrid, stride: int) -> None:
         super().__init__(inner)
+        self.grid, self.stride = grid, stride
         height, width = (grid.height - 1) // stride + 1, grid.width // stride
         self._height = grid.height
         self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it

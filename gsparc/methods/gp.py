@@ -252,7 +252,11 @@ class GaussianProcess(Interpolator, PredictsVariance):
             return PowerMean(self)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
-        kept = self.weights.square().sum(0).topk(min(count, len(self.axes))).indices
+        kept: Tensor | slice = slice(
+            None
+        )  # a view: the axes of thousands of images are hundreds of megabytes
+        if count < len(self.axes):
+            kept = self.weights.square().sum(0).topk(count).indices
         mean, axes, shape = self.mean, self.axes[kept], self.shape
         if stride > 1:
             assert grid is not None

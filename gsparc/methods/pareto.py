@@ -19,6 +19,7 @@ WORDS = {
     "frozen": lambda value: "frozen plan" if value else "live plan",
     "confidence": lambda value: "" if value else "no confidence",
     "hybrid": lambda value: "" if value else "no rest",
+    "beside": lambda value: f"{value:.0%} of the process beside" if value else "no process beside",
     "searches": lambda value: f"{value} search{'es' if value > 1 else ''}",
 }
 

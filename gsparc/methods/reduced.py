@@ -19,6 +19,7 @@ log = logging.getLogger(__name__)
 
 AS_TRAINED = {  # else: None
     "keep": 1.0, "anchors": 1.0, "stride": 1, "cutoff": 1, "confidence": True, "frozen": True, "hybrid": True,
+    "beside": 1.0,
 }  # fmt: skip
 Measured = dict[str, Tensor]
 

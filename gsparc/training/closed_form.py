@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
@@ -20,6 +21,7 @@ from gsparc.field.encoding import Prior
 from gsparc.field.kernels import Whitened, whitened
 from gsparc.field.model import GaussianModel
 from gsparc.methods.gp import Kernel, choose_kernel, principal_components
+from gsparc.methods.left_out_images import LeftOut, predict_left_out
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.ops import Pose
 
@@ -27,6 +29,9 @@ IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap,
 CHUNK = 256  # images held as floats at a time
 KERNEL_ROWS = 1024  # leave-one-out factors a matrix of this size at every look
 COMPONENTS = 128
+LEAST_ROWS = 4  # for predictions without their neighbours to say anything
+GAPS = (0.0, 2.0, 5.0, 10.0)  # between a row and what is left, in spacings of rows
+PIXELS, CENTRES = 600, 160  # of the images, and rows, that are predicted so
 LEAST_NOISE = 1e-6  # of the kernel's variance
 
 
@@ -85,6 +90,11 @@ class Seen:
     outputs: Tensor
     attenuation: Tensor | None
 
+    def at(self, rows: np.ndarray) -> Seen:
+        """Of some rows (m,) alone."""
+        attenuation = None if self.attenuation is None else self.attenuation[rows]
+        return Seen(self.weights, self.images[rows], self.outputs[rows], attenuation)
+
     def rendered(self, outputs: Tensor) -> Tensor:
         """Images (n, P) of other outputs (n, N) at the same places."""
         emission = outputs.float()
@@ -95,7 +105,7 @@ class Seen:
 @torch.autocast("cpu", enabled=False)  # a Gram matrix rounded to half precision has no Cholesky factor
 def warm_start(
     model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, process: Process
-) -> None:
+) -> LeftOut | None:
     """Set the emission's last layer so that the model reproduces the training spectra as well as it can.
 
     What the process leaves unknown becomes the model's error model.
@@ -106,6 +116,9 @@ def warm_start(
         rows: (n,) training rows.
         receiver: the static pose.
         process: of these rows.
+
+    Returns:
+        Rows predicted without their neighbours; None where there are too few.
 
     Raises:
         ValueError: the emission has hidden units.
@@ -120,8 +133,14 @@ def warm_start(
     readout = process.features.weigh @ (outputs - mean)
     model.emission.weight2.copy_(readout.mT.unsqueeze(-1).float())
     model.emission.bias2.copy_(mean.unsqueeze(-1).float())
+    first = parts[0]
+    own = rows[: len(first.outputs)]
+    places = torch.from_numpy(data.moving[own]).float().double()
+    alone = whitened(places, process.prior.length, process.prior.noise, "matern32", len(own))
+    inverse = alone.weigh.mT @ alone.weigh
     if model.error is not None:
-        model.error.set(*_errors(parts[0], process, rows[: len(parts[0].outputs)], data, mean))
+        model.error.set(*_errors(first, inverse, process.prior.noise, mean))
+    return _left_out(first, inverse, data.moving[own], mean)
 
 
 def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> Seen:
@@ -138,19 +157,33 @@ def _seen(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: T
     return Seen(weights, images, outputs.double(), attenuation)
 
 
-def _errors(
-    seen: Seen, process: Process, rows: np.ndarray, data: Measurements, mean: Tensor
-) -> tuple[float, float]:
-    """Level and power of the `ErrorModel`: errors of rows (n,) left out one by one, and of the mean alone.
+def _errors(seen: Seen, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
+    """Level and power of the `ErrorModel`: errors of rows left out one by one, and of the mean alone.
 
     Rasmussen and Williams (2006), eq. 5.12.
     """
-    places = torch.from_numpy(data.moving[rows]).float().double()
-    alone = whitened(places, process.prior.length, process.prior.noise, "matern32", len(rows))
-    inverse = alone.weigh.mT @ alone.weigh
     diagonal = inverse.diagonal()
     left_out = seen.outputs - inverse @ (seen.outputs - mean) / diagonal[:, None]
-    unknown = (1 / diagonal - process.prior.noise).clamp(0, 1)
+    unknown = (1 / diagonal - noise).clamp(0, 1)
     shown = [seen.rendered(left_out), seen.rendered(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in shown])
     return fit_errors(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
+
+
+def _left_out(seen: Seen, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
+    """Rows at places (n, 3) [m] predicted without their neighbours, at gaps of some spacings."""
+    count = len(places)
+    if count < LEAST_ROWS:
+        return None
+    draws = np.random.default_rng(0)
+    pixels = torch.from_numpy(np.sort(draws.permutation(seen.images.shape[1])[:PIXELS]))
+    centres = np.sort(draws.permutation(count)[:CENTRES])
+    distance = cdist(places, places)
+    spacing = np.median(np.where(np.eye(count, dtype=bool), np.inf, distance).min(1))
+    gaps = np.array(GAPS) * spacing
+    about = (seen.outputs - mean).numpy()
+    means, _ = predict_left_out(inverse.numpy(), about, distance, centres, gaps)
+    some = Seen(seen.weights[pixels], seen.images[:, pixels], seen.outputs, seen.attenuation).at(centres)
+    predicted = [some.rendered(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
+    images = seen.images[:, pixels].double().numpy()
+    return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())

@@ -31,6 +31,8 @@ from gsparc.methods.registry import field_initialiser, field_restored, method_cl
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
 from gsparc.ops import Pose
 from gsparc.training import weighing
+from gsparc.training.auto_settings import resolve
+from gsparc.training.beside import averaged, mean_alone
 from gsparc.training.checkpoint_io import GsparcCheckpointIO
 from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.keep_best import SHORT, KeepBest
@@ -68,6 +70,7 @@ class Gsparc(LearnedField):
         self.explained: float | None = None
         self.started = ""  # initialisers of what was fitted
         self._beside: tuple[Method, float] | None = None
+        self._lean: Method | None = None  # the process beside, made when it is first asked
 
     @property
     def takes_budget(self) -> bool:  # type: ignore[override]
@@ -86,7 +89,7 @@ class Gsparc(LearnedField):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Choose the terms, initialise, weigh, take the steps that pay."""
-        self.site, self.field, self._beside = data.site, None, None
+        self.site, self.field, self._beside, self._lean = data.site, None, None, None
         count = self.settings.field.count
         self.plan = plan(self.switches, self.init, data, self.settings.emission.hidden, count)
         for reason in self.plan.reasons:
@@ -101,38 +104,60 @@ class Gsparc(LearnedField):
         assert self.plan is not None
         response = replace(self.settings.response, array=self.plan.array)
         self.settings = replace(self.settings, response=response)
+        choices, _ = resolve(self.settings, self.init.name, data.site)
+        steps = total_steps(context) if self.most_steps is None else self.most_steps
         log.info(
-            "training a rasterized Gaussian field: %d Gaussians, terms %s, init=%s, at most %d steps",
-            self.settings.field.count, self.effects, self.init.name, total_steps(context),
+            "training %s by rendering: %d Gaussians, terms %s, init=%s, at most %d steps; callbacks %s",
+            GaussianModule.__name__, self.settings.field.count, self.effects, choices.init, steps,
+            ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
         )  # fmt: skip
         report = super().fit(data, fold, context)
         self.started = self.choices.init if self.choices is not None else ""
+        spent = dict(self.spent)
         if self._beside is not None:
             method = self._beside[0]
             known = np.sort(np.concatenate([fold.train, fold.val]))
             more = method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
             report = replace(report, seconds=report.seconds + more.seconds)
-        rest = report.seconds - self.init_s
-        _say_cost({f"init={self.started}": self.init_s, "gradient steps and the rest": rest}, report.seconds)
+            spent["process beside"] = more.seconds
+        log.info("%d Gaussians, %d gradient steps kept", self.size(), self.steps)
+        _say_cost(spent, report.seconds)
         return report
 
     def _watched(self, data: Measurements, fold: Fold) -> None:
-        """What a plain process on whole targets is worth beside the field, on validation rows."""
-        if self.plan is None or not self.plan.plain or len(fold.val) < LEAST_HELD:
+        """What a plain process on whole targets is worth beside the field, on rows that neither learned from.
+
+        Those are validation rows and, of spectra, training rows that both predict without their neighbours:
+        a dozen rows alone decide by chance.
+        """
+        if self.plan is None or not self.plan.plain:
+            return
+        spectra = data.site.kind == "spectrum"
+        left = self._left_out if spectra else None  # as the start predicts them, before any step
+        if left is None and len(fold.val) < LEAST_HELD:
+            log.info("no Gaussian process beside the field: too few rows are held out to weigh it")
             return
         process = method_class("gp")()
         process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
-        batch = data.batch(fold.val)
-        target = _comparable(batch.target, data.site)
-        own, plain = (
-            _comparable(found.mean, data.site)
-            for found in (super().predict(batch.tx, batch.rx), process.predict(batch.tx, batch.rx))
-        )
-        ours, theirs = weighing.weights([own, plain], target)
-        self.explained = weighing.explained(own, target, data.site.kind != "csi")
+        held = []
+        if len(fold.val):
+            batch = data.batch(fold.val)
+            target = _comparable(batch.target, data.site)
+            own, plain = (
+                _comparable(found.mean, data.site)
+                for found in (super().predict(batch.tx, batch.rx), process.predict(batch.tx, batch.rx))
+            )
+            held.append((own, plain, target))
+            self.explained = weighing.explained(own, target, data.site.kind != "csi")
+        if spectra:
+            rows = [weighing.Rows(*(_flat(values) for values in triple)) for triple in held]
+            rows += [] if left is None else [_left_out(left, self._apart)]
+            theirs = weighing.share_of_second(rows)
+        else:
+            theirs = weighing.weights(list(held[0][:2]), held[0][2])[1]
         log.info(
-            "held out: the field misses %.3f of the energy, a Gaussian process %.3f: weights %.2f and %.2f",
-            weighing.error(own, target), weighing.error(plain, target), ours, theirs,
+            "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
+            len(fold.val), 0 if left is None else len(left.centres), theirs,
         )  # fmt: skip
         self._beside = (process, theirs) if theirs > 0 else None
 
@@ -319,9 +344,10 @@ class Gsparc(LearnedField):
         own = super().predict(tx, rx)
         if self._beside is None:
             return own
-        process, weight = self._beside
-        other = process.predict(tx, rx)
-        return replace(own, mean=torch.lerp(own.mean, other.mean, weight))
+        if self._lean is None:
+            self._lean = mean_alone(self._beside[0])
+        mean = self._lean.predict(tx, rx).mean
+        return replace(own, mean=own.mean.lerp_(mean, self._beside[1]))
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `Differentiable`; of rasterized Gaussians, without a process beside them."""
@@ -352,10 +378,10 @@ class Gsparc(LearnedField):
     # -- reductions --------------------------------------------------------------------------------
 
     def knobs(self) -> tuple[str, ...]:
-        """See `Reducible`; `hybrid=false` is the Gaussians alone."""
+        """See `Reducible`; `hybrid=false` and `beside=0` are the Gaussians alone."""
         if self.field is None:
             own = super().knobs()
-            return own if self._beside is None else (*own, "hybrid")
+            return own if self._beside is None else (*own, "beside")
         method = self._method()
         own = () if method is None or isinstance(self.field, StackedField) else knobs(method)
         return (*own, "hybrid") if isinstance(self.field, CompletedField) else own
@@ -369,13 +395,14 @@ class Gsparc(LearnedField):
 
     def reduced(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
         """See `Reducible`."""
-        own = {knob: value for knob, value in settings.items() if knob != "hybrid"}
+        own = {knob: value for knob, value in settings.items() if knob not in ("hybrid", "beside")}
         keep, method = settings.get("hybrid", True), self._method()
         if self.field is None:
             twin = copy.copy(self)
             twin._beside = None
             found = LearnedField.reduced(twin, own, measured)
-            return Averaged(found, *self._beside) if keep and self._beside is not None else found
+            share = float(settings.get("beside", 1.0)) if keep else 0.0  # earlier fronts say hybrid=false
+            return averaged(found, *self._beside, share) if share and self._beside is not None else found
         if method is None or isinstance(self.field, StackedField):
             return self
         found = reduced(method, own, measured)
@@ -405,7 +432,7 @@ class Gsparc(LearnedField):
             ValueError: an earlier version's, in which another method had been chosen.
         """
         state = _as_today(state)
-        self.site, self.field, self._beside = site, None, None
+        self.site, self.field, self._beside, self._lean = site, None, None, None
         response = replace(
             self.settings.response, array=bool(state.get("array", self.switches.array is True))
         )
@@ -435,19 +462,6 @@ class Gsparc(LearnedField):
             "model/variance_explained": self.explained,
             "time/init_s": self.init_s,
         }
-
-
-class Averaged(View):
-    """A reduced field averaged with the process beside the whole one."""
-
-    def __init__(self, inner: Method, process: Method, weight: float) -> None:
-        super().__init__(inner)
-        self.process, self.weight = process, weight
-
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
-        found = self.inner.predict(tx, rx)
-        return replace(found, mean=torch.lerp(found.mean, self.process.predict(tx, rx).mean, self.weight))
 
 
 class Summed(View):
@@ -530,6 +544,17 @@ def _held(
     field.condition(data, rows)
     mean, variance = (torch.cat([getattr(one, name) for one in found]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
+
+
+def _flat(values: Tensor) -> np.ndarray:
+    return values.detach().double().flatten(1).numpy()
+
+
+def _left_out(left: Any, distance: float | None) -> weighing.Rows:
+    """Training rows as far from what is left as held-out rows are, as field and process predict them."""
+    gap = left.as_far_as(distance)
+    own, target = left.at(gap, left.predicted)
+    return weighing.Rows(own, left.at(gap, left.by_process())[0], target)
 
 
 def _comparable(values: Tensor, site: Site) -> Tensor:

@@ -79,6 +79,7 @@ class GaussianModule(L.LightningModule):
         self.total_steps, self.run_dir, self.pace = total_steps, run_dir, pace
         self.prepared_seconds = 0.0  # before the first step; the learning curve starts there
         self.train_seconds = 0.0  # written by the cost ledger
+        self.solved = False  # whether training starts from emissions in closed form
         self.log_every = 1  # steps; a figure costs as much as a kernel to log
         self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
         self.rendered: Rendered | None = None  # of the current step; densification reads its gradients

@@ -11,6 +11,7 @@ from typing import Any
 import lightning.pytorch as L
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.limits import check_arguments, or_null, switch, whole
@@ -26,6 +27,7 @@ from gsparc.field.initial import InitSettings, InitTask
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.methods import checkpoint
+from gsparc.methods.left_out_images import LeftOut
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
 from gsparc.methods.origin import Origin
 from gsparc.methods.time_budget import Clock, Spent, TimeBudget, less_repeatable
@@ -101,7 +103,9 @@ class LearnedField(Method):
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._billed = Spent()  # for reusable work, by the stages so far
         self.frozen: FrozenView | FrozenArray | None = None
-        self._left_out: Any = None  # of the initialiser; not stored
+        self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
+        self._left_out: LeftOut | None = None  # of the initialiser; not stored
+        self._apart: float | None = None  # validation rows from the nearest training row, median [m]
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -127,11 +131,16 @@ class LearnedField(Method):
         budget.pause()
         now = None if context.budget_s is None else context.budget_clock
         self._paying, self.init_s = marks.get("paying"), float(marks.get("init_s", 0.0))
+        self.spent, self._apart = {}, _apart(data, fold)
+        self._left_out = LeftOut.of(
+            marks.get("left_out")
+        )  # the initialiser of an interrupted run is not repeated
         self._billed, self._limited_by = Spent(), less_repeatable(now, marks.get("limited_by"))
         if self._solved(fold):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             seconds = self._stage("train", origin, data, fold, context, budget, seconds)
+            self._watched(data, fold)
             self.frozen = None
             return FitReport(seconds, limited_by=self._limited_by)
         if stage == "train":
@@ -178,9 +187,10 @@ class LearnedField(Method):
                     context.seed, folder,
                 )
             )  # fmt: skip
-            self._prior, self._left_out = start.prior, start.left_out
+            self._prior = start.prior
             self.model = self._new_model(data.site)
-            start.solve(self.model)
+            solved = start.solve(self.model)
+            self._left_out = solved or start.left_out
             # What an earlier run has paid for is billed; what an earlier stage has, is not again.
             budget.charge(Spent(*start.billed_s) - Spent(*start.waited_s) - self._billed)
             self._billed = Spent(*start.billed_s)
@@ -192,6 +202,8 @@ class LearnedField(Method):
         budget.pause()
         prepared = (budget.counted - started).wall
         self.init_s = (self.init_s or 0.0) + prepared
+        again = "" if stage == "train" else " again, on all rows"
+        self.spent["initialiser" + again] = prepared
         if stage == "train" and self._solved(fold):
             return prepared
         steps, pace = total_steps(context) if self.most_steps is None else self.most_steps, None
@@ -206,10 +218,11 @@ class LearnedField(Method):
                     context.budget_s, budget.spent, end, stage,
                 )  # fmt: skip
         module = self.module(steps, folder, pace)
-        module.prepared_seconds = earlier_s + prepared
+        module.prepared_seconds, module.solved = earlier_s + prepared, self.choices.closed_form
         marks = {
             "stage": stage, "earlier_s": earlier_s + prepared, "spent": astuple(budget.counted),
-            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s, **origin.marks(),
+            "limited_by": self._limited_by, "paying": self._paying, "init_s": self.init_s,
+            "left_out": None if self._left_out is None else self._left_out.state(), **origin.marks(),
         }  # fmt: skip
         files = GsparcCheckpointIO(self, context.config_yaml, marks)
         if stage == "refit" and self._paying == 0:
@@ -225,6 +238,7 @@ class LearnedField(Method):
             watch.append(StopAt(self._paying))
         ran = run_stage(module, data, fold, context, files, budget, watch, every)
         self.steps = ran.steps
+        self.spent["gradient steps" + again] = ran.seconds
         if stage == "train":
             self._paying = ran.position
         return prepared + ran.seconds
@@ -378,6 +392,13 @@ def joined(parts: Sequence[Prediction]) -> Prediction:
 
     mean = torch.cat([part.mean for part in parts])
     return Prediction(mean, both([p.confidence for p in parts]), both([p.variance for p in parts]))
+
+
+def _apart(data: Measurements, fold: Fold) -> float | None:
+    """How far validation rows are from the nearest training row, median [m]; None where there are none."""
+    if not len(fold.val):
+        return None
+    return float(np.median(cKDTree(data.moving[fold.train]).query(data.moving[fold.val])[0]))
 
 
 def _static_end(data: Measurements, row: int) -> dict[str, Tensor]:

@@ -13,6 +13,7 @@ import lightning.pytorch as L
 import torch
 
 from gsparc.methods.time_budget import Spent, TimeBudget
+from gsparc.training.schedule import in_steps
 
 SPENT = "time/spent_s"  # metric of both clocks
 
@@ -124,7 +125,7 @@ class Stretched(L.Callback):
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *rest: Any) -> None:
         """As the inner callback, when a multiple of its interval was passed."""
-        multiple = self.pace.passed(self.inner.interval)
+        multiple = self.pace.passed(in_steps(self.inner.interval, self.pace.total))
         if multiple is not None:
             self.inner.on_train_batch_end(_At(trainer, multiple), module, *rest)
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from scipy.optimize import nnls
 from torch import Tensor
 
 ALONE, UNUSED = 0.9, 0.05  # weight above which one predicts alone, and below which it is left out
+SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
+LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 SUM_ONE = 1e3  # weight of the row that says that weights add up to one
 
 
@@ -32,6 +37,35 @@ def weights(predicted: list[Tensor], target: Tensor) -> tuple[float, ...]:
         found = (found == found.max()).astype(float)
     found[found < UNUSED] = 0.0
     return tuple(float(weight) for weight in found / found.sum())
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows that two predictors did not learn from.
+
+    Attributes:
+        own, plain: (n, P) predictions of the first and the second.
+        target: (n, P), the same entries as measured.
+    """
+
+    own: np.ndarray
+    plain: np.ndarray
+    target: np.ndarray
+
+    def log_errors(self, weight: float) -> np.ndarray:
+        """Logarithm (n,) of the mean squared error of each row, the second weighed by `weight`."""
+        mixed = (1 - weight) * self.own + weight * self.plain
+        return np.log(((mixed - self.target) ** 2).mean(1) + LEAST_ERROR)
+
+
+def share_of_second(parts: Sequence[Rows]) -> float:
+    """Weight in [0, 1] of the second of two predictors with which the mean PSNR over all rows is largest.
+
+    0 or 1 where it is within `UNUSED` of them.
+    """
+    means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
+    best = float(SHARES[int(np.argmin(means))])
+    return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
 
 
 def error(predicted: Tensor, target: Tensor) -> float:

@@ -86,7 +86,7 @@ def test_gradients_are_read_per_sample_before_summing(model):
         radii=torch.full((2, 10), 2.0),
     )
     densify = Densify()
-    module = SimpleNamespace(model=model, rendered=Rendered(torch.zeros(1), raster))
+    module = SimpleNamespace(model=model, total_steps=100, rendered=Rendered(torch.zeros(1), raster))
     for _ in range(2):
         densify.on_after_backward(SimpleNamespace(global_step=0), module)
     assert densify.statistics["gradient"][5] == 12 and densify.statistics["seen"][5] == 4
@@ -98,14 +98,14 @@ def test_who_was_not_seen_asks_for_nothing(model):
         means2d=SimpleNamespace(grad=torch.ones(1, 10, 2)), visible=hidden, radii=torch.ones(1, 10)
     )
     densify = Densify()
-    module = SimpleNamespace(model=model, rendered=Rendered(torch.zeros(1), raster))
+    module = SimpleNamespace(model=model, total_steps=100, rendered=Rendered(torch.zeros(1), raster))
     densify.on_after_backward(SimpleNamespace(global_step=0), module)
     assert not densify.statistics["gradient"].any() and not densify.statistics["radius"].any()
 
 
 def test_edits_happen_on_the_schedule_only(model):
-    trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())])
-    module, edited = SimpleNamespace(model=model), []
+    trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[])
+    module, edited = SimpleNamespace(model=model, total_steps=100, global_step=0), []
     for step in range(0, 60, 5):
         densify = with_gradient(
             Densify(start=20, stop=40, interval=10, grad_threshold=0.5), [0], len(model.gaussians)
@@ -134,7 +134,7 @@ def test_a_moving_receiver_gives_gradients_per_pose(campaign):
     rendered.mean.sum().backward()
     densify = Densify()
     densify.on_after_backward(
-        SimpleNamespace(global_step=0), SimpleNamespace(model=moving, rendered=rendered)
+        SimpleNamespace(global_step=0), SimpleNamespace(model=moving, total_steps=100, rendered=rendered)
     )
     assert rendered.raster.means2d.grad.shape == (4, 30, 2)
     assert densify.statistics["seen"].max() > 1 and densify.statistics["gradient"].any()
@@ -146,3 +146,27 @@ def test_children_lie_as_their_parent_does():
     quats = torch.tensor([[half, 0.0, 0.0, half]]).expand(20_000, 4)  # x becomes y
     spread = _sample_inside(scales, quats, draws()).std(0)
     assert torch.allclose(spread, torch.tensor([0.1, 2.0, 0.1]), rtol=0.03)
+
+
+def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
+    caplog.set_level("INFO")
+    seen = []
+    tracker = SimpleNamespace(log_metrics=lambda figures, step: seen.append((figures, step)))
+    optimizer = optimizer_for(model, OptimizerSettings())
+    trainer = SimpleNamespace(optimizers=[optimizer], loggers=[tracker], global_step=200)
+    module = SimpleNamespace(model=model, total_steps=400, global_step=80)
+    densify = with_gradient(Densify(0.25, 0.75, 0.125, grad_threshold=0.5, size_share=1.0), [2, 7])
+    densify.on_train_batch_end(trainer, module)
+    assert seen == [({"densify/removed": 0, "densify/added": 2}, 80)]
+    assert "step 200: 0 Gaussians removed or split, 2 added: 10 -> 12" in caplog.text
+
+
+def test_a_short_training_with_a_schedule_of_shares_keeps_its_gaussians(model):
+    trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[])
+    densify = Densify(0.1, 0.6, 0.05, grad_threshold=0.5, size_share=1.0)
+    for step in range(1, 21):
+        with_gradient(densify, [2, 7])
+        trainer.global_step = step
+        module = SimpleNamespace(model=model, total_steps=20, global_step=step)
+        densify.on_train_batch_end(trainer, module)
+    assert len(model.gaussians) == 10

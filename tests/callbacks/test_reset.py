@@ -14,7 +14,8 @@ def module():
     field = GaussianField(torch.zeros(4, 3), torch.ones(4, 3), 0.5)
     with torch.no_grad():
         field.opacity_logits.copy_(torch.tensor([3.0, 0.0, -9.0, 5.0]))
-    return SimpleNamespace(model=SimpleNamespace(gaussians=field), total_steps=60, conditional=False)
+    model = SimpleNamespace(gaussians=field)
+    return SimpleNamespace(model=model, total_steps=60, global_step=0, conditional=False, solved=False)
 
 
 def trainer(module, step: int) -> SimpleNamespace:
@@ -25,7 +26,7 @@ def trainer(module, step: int) -> SimpleNamespace:
     optimizer.step()
     with torch.no_grad():
         logits.copy_(kept)
-    return SimpleNamespace(optimizers=[optimizer], global_step=step)
+    return SimpleNamespace(optimizers=[optimizer], global_step=step, loggers=[])
 
 
 def test_opaque_ones_are_lowered_and_forget_their_momentum(module):
@@ -53,4 +54,10 @@ def test_only_on_schedule(module, step):
     before = module.model.gaussians.opacity_logits.detach().clone()
     OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, step), module)
     assert torch.equal(module.model.gaussians.opacity_logits, before)
+    assert int(module.model.gaussians.version) == 0
+
+
+def test_no_reset_of_opacities_that_emissions_were_solved_for(module):
+    module.solved = True
+    OpacityReset(interval=30, stop=100).on_train_batch_end(trainer(module, 30), module)
     assert int(module.model.gaussians.version) == 0

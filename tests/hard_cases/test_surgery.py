@@ -54,7 +54,7 @@ def fresh(count: int) -> tuple[GaussianModel, SimpleNamespace]:
         ModelSettings(field=FieldSettings(count=count, placement="sphere"), emission=emission), SITE, RECEIVER
     )
     optimizer = optimizer_for(model, OptimizerSettings())
-    return model, SimpleNamespace(optimizers=[optimizer], global_step=0)
+    return model, SimpleNamespace(optimizers=[optimizer], global_step=0, loggers=[])
 
 
 def learn(model: GaussianModel, optimizer: torch.optim.Optimizer) -> None:
@@ -90,7 +90,7 @@ EDIT = st.fixed_dictionaries(
 def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
     model, trainer = fresh(count)
     optimizer = trainer.optimizers[0]
-    module = SimpleNamespace(model=model, total_steps=99, conditional=False)
+    module = SimpleNamespace(model=model, total_steps=99, global_step=0, conditional=False, solved=False)
     draw = torch.Generator().manual_seed(seed)
     ever = set(model.gaussians.ids.tolist())
     for number, edit in enumerate(edits, start=1):
@@ -153,7 +153,7 @@ def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
         0, 99, 1, 0.5, draws.draw(st.sampled_from([0.0, 1e9])), max_radius=5.0, max_gaussians=20
     )
     densify.statistics, trainer.global_step = nasty, 1
-    densify.on_train_batch_end(trainer, SimpleNamespace(model=model))
+    densify.on_train_batch_end(trainer, SimpleNamespace(model=model, total_steps=99, global_step=0))
     assert 1 <= len(model.gaussians) <= 20
     assert all(p.isfinite().all() for p in model.parameters())
     assert all(t.isfinite().all() for t in densify.statistics.values())

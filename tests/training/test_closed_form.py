@@ -107,3 +107,22 @@ def test_what_is_unknown_far_away_and_near_the_rows(smooth):
     assert (far == 1).all() and (unsure == 0).all() and (sure > 0.3).float().mean() > 0.9
     assert float(variance.mean()) < 0.5 * float(most.mean())
     assert 0.3 * spread(smooth) < float(most.mean()) < 3 * spread(smooth)
+
+
+def test_rows_without_their_neighbours_are_as_a_fit_without_them(smooth):
+    """The kernel stays: what is left out is the rows alone."""
+    process = learn_process(smooth, ROWS, 1024, 0)
+    settings = ModelSettings(
+        field=FieldSettings(count=150, placement="sphere"), emission=KERNEL,
+        attenuation=AttenuationSettings(inverse_distance=False),
+    )  # fmt: skip
+    model = GaussianModel(settings, smooth.site, RECEIVER, prior=process.prior)
+    left = warm_start(model, smooth, ROWS, RECEIVER, process)
+    assert left is not None and len(left.centres) == len(ROWS)
+    errors = ((left.predicted - left.images[left.centres]) ** 2).mean(-1)
+    nearest = np.nanmean(errors[0])
+    shown = error(model, smooth, ROWS)
+    assert (
+        shown < nearest < spread(smooth)
+    )  # harder than rows it has seen, easier than knowing the mean alone
+    assert nearest <= np.nanmean(errors[1:])

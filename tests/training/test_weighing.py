@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.training.weighing import error, explained, weights
+from gsparc.training.weighing import Rows, error, explained, share_of_second, weights
 
 TARGET = torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3)))
 
@@ -38,3 +38,21 @@ def test_what_is_explained_is_about_the_mean_of_powers_and_about_zero_of_channel
     assert explained(torch.zeros_like(TARGET) + TARGET.mean(0), TARGET, True) == pytest.approx(0)
     assert explained(TARGET, TARGET, False) == 1
     assert explained(torch.zeros_like(TARGET), TARGET, False) == 0
+
+
+def rows(own: float, plain: float, count: int, seed: int = 0) -> Rows:
+    draws = np.random.default_rng(seed)
+    target = draws.uniform(0, 1, (count, 40))
+    noise = draws.standard_normal((2, count, 40))
+    return Rows(target + own * noise[0], target + plain * noise[1], target)
+
+
+def test_the_second_has_the_weight_of_largest_psnr():
+    assert share_of_second([rows(0.1, 0.1, 200)]) == pytest.approx(0.5, abs=0.05)
+    assert share_of_second([rows(0.01, 0.3, 200)]) == 0.0
+    assert share_of_second([rows(0.3, 0.01, 200)]) == 1.0
+
+
+def test_every_row_counts_once_whichever_part_it_is_of():
+    few, many = rows(0.3, 0.05, 3, 1), rows(0.05, 0.3, 300, 2)
+    assert share_of_second([few, many]) < 0.1 < share_of_second([few])

@@ -224,13 +224,34 @@ def test_what_a_process_beside_adds_stays_unless_it_is_spared(field):
     data, fold = field.data, field.split.folds[0]
     method = copy.copy(field.methods[0])
     measured = reduced.contributions(method, data, fold.train)
-    assert "hybrid" not in reduced.knobs(method)
+    assert "beside" not in reduced.knobs(method)
     mean = answer(method, data, fold.test).mean
     beside = SimpleNamespace(predict=lambda tx, rx: SimpleNamespace(mean=torch.ones_like(mean)))
     method._beside = (beside, 0.25)
-    assert "hybrid" in reduced.knobs(method)
-    plain, added = (
-        answer(reduced.reduced(method, {"stride": 2, "hybrid": on}, measured), data, fold.test).mean
-        for on in (False, True)
+    assert "beside" in reduced.knobs(method)
+    plain, added, earlier = (
+        answer(reduced.reduced(method, {"stride": 2, **spared}, measured), data, fold.test).mean
+        for spared in ({"beside": 0}, {}, {"hybrid": False})  # the last as in fronts stored before
     )
-    assert torch.allclose(0.75 * plain + 0.25, added)
+    assert torch.allclose(0.75 * plain + 0.25, added) and torch.equal(plain, earlier)
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_a_process_beside_spares_components_and_pixels_with_the_field(field, stride):
+    data, fold = field.data, field.split.folds[0]
+    method = copy.copy(field.methods[0])
+    measured = reduced.contributions(method, data, fold.train)
+    process = GaussianProcess()
+    process.fit(data, fold, FitContext())
+    method._beside, method._lean = (process, 0.5), None
+    alone = reduced.reduced(field.methods[0], {"stride": stride}, measured)
+    spared = {"confidence": False, "keep": 0.5, "stride": stride}
+    wanted = 0.5 * answer(alone, data, fold.test).mean
+    wanted += 0.5 * answer(process.reduced(spared, {}), data, fold.test).mean
+    lean = reduced.reduced(method, {"stride": stride, "beside": 0.5}, measured)
+    assert torch.allclose(answer(lean, data, fold.test).mean, wanted, atol=1e-4)
+    whole = answer(process, data, fold.test).mean
+    own = answer(field.methods[0], data, fold.test)
+    both = answer(method, data, fold.test)
+    assert torch.allclose(both.mean, 0.5 * own.mean + 0.5 * whole, atol=1e-4)  # its variance is not computed
+    assert torch.equal(both.confidence, own.confidence)
