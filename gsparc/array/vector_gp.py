@@ -29,7 +29,7 @@ class Kernel(gp.Kernel):
 
     def cross(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """See the base class."""
-        return correlation(*map(torch.from_numpy, (a, b)), self.length, "smooth_rough").numpy()
+        return correlation(torch.from_numpy(a), torch.from_numpy(b), self.length, "smooth_rough").numpy()
 
 
 def twin(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:

@@ -21,8 +21,8 @@ def job_name(overrides: Sequence[str], unnamed: Sequence[str] = ()) -> str:
         overrides: of one job, as `key=value`.
         unnamed: keys that are left out.
     """
-    pairs = [one.partition("=") for one in sorted(overrides)]
-    pairs = [(key, value) for key, _, value in pairs if key not in unnamed]
+    split = [one.partition("=") for one in sorted(overrides)]
+    pairs = [(key, value) for key, _, value in split if key not in unnamed]
     whole = "_".join(f"{key}-{value}" for key, value in pairs)
     if len(whole.encode()) <= MOST:
         return whole

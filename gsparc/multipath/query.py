@@ -52,7 +52,8 @@ class PackedSources:
         kernels = torch.cat([_kernel_parameters(scene) for scene in scenes])[:, :, None, None]
         turned = torch.cat([orientations(scene.planes, scene.words) for scene in scenes])
         towards = (directions(places[:, :3], sources) * -kernels[:, 1]).mT.contiguous()
-        packed = PackedSources(sources, *kernels.unbind(1), places, turned, towards, None, None)
+        one, two, three = kernels.unbind(1)
+        packed = PackedSources(sources, one, two, three, places, turned, towards, None, None)
         if not any(len(scene.clutter) for scene in scenes):
             return packed
         first = torch.tensor([0] + [len(scene.planes) for scene in scenes]).cumsum(0).tolist()

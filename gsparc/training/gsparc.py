@@ -207,7 +207,9 @@ class Gsparc(LearnedField):
         weighed = len(parts) > 1
         rows = fold.train if weighed else np.sort(np.concatenate([fold.train, fold.val]))
         groups = self._groups(data, fold, context) if weighed else ()
-        plans = [(part, self.init, None) for part in parts if part not in OPEN_ENDED]
+        plans: list[tuple[str, InitSettings, float | None]] = [
+            (part, self.init, None) for part in parts if part not in OPEN_ENDED
+        ]
         for part in (part for part in parts if part in OPEN_ENDED):
             if weighed and part in SEARCHES:
                 plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))

@@ -42,10 +42,9 @@ class KeepBest(L.Callback):
         """What the initialiser has reached."""
         if self._kept is None:
             self._measure(trainer, module)
-            for logger in (
-                trainer.loggers if self._kept is not None else ()
-            ):  # where the learning curve begins
-                logger.log_metrics({"val/error": self.error}, step=0)
+            if self._kept is not None:
+                for logger in trainer.loggers:  # where the learning curve begins
+                    logger.log_metrics({"val/error": self.error}, step=0)
 
     def _measure(self, trainer: L.Trainer, module: GaussianModule) -> None:
         data = trainer.datamodule  # type: ignore[attr-defined]
