@@ -181,9 +181,10 @@ class Gsparc(LearnedField):
             "%s of %d Gaussians from init=%s, terms %s", type(self.field).__name__, self.field.count,
             self.started, ", ".join(self.field.terms) or "none",
         )  # fmt: skip
-        self.steps = self._take_steps(data, fold, context, budget)
+        self.steps, moved = self._take_steps(data, fold, context, budget)
         stepped = budget.counted.wall
-        self.field.condition(data, known)
+        if moved or len(chosen.parts) > 1:  # else it is of these rows already
+            self.field.condition(data, known)
         seconds = budget.counted.wall
         stages = {name: report.seconds for name, report in reports.items()}
         stages |= {"gradient steps": stepped - self.init_s, "final weights": seconds - stepped}
@@ -296,13 +297,19 @@ class Gsparc(LearnedField):
         fields = [solutions[name] for name in kept]
         return fields[0] if len(fields) == 1 else StackedField(fields, list(kept.values()))
 
-    def _take_steps(self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget) -> int:
-        """Gradient steps under Lightning, as many as validation gains by; their number."""
+    def _take_steps(
+        self, data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
+    ) -> tuple[int, bool]:
+        """Gradient steps under Lightning, as many as validation gains by.
+
+        Returns:
+            Their number, and whether the field is conditioned on other rows than before, or has moved.
+        """
         field = self.field
         assert field is not None
         if not len(fold.val):
             log.info("gradient steps: none, there are no validation rows to say whether they pay")
-            return 0
+            return 0, False
         if field.count:
             field.condition(data, fold.train)
             batch = data.batch(fold.val)
@@ -314,7 +321,7 @@ class Gsparc(LearnedField):
             log.info(
                 "gradient steps: none, %s", "no seconds are left" if learns(field) else "nothing to move"
             )
-            return 0
+            return 0, field.count > 0
         folder = context.run_dir / "steps"
         steps = self._most_steps(context)
         pace = Pace(steps, budget.seconds - budget.spent)
@@ -324,7 +331,7 @@ class Gsparc(LearnedField):
         budget.pause()
         ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
         budget.go()
-        return ran.steps
+        return ran.steps, True
 
     def _most_steps(self, context: FitContext) -> int:
         return total_steps(context) if self.most_steps is None else self.most_steps

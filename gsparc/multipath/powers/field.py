@@ -342,6 +342,8 @@ def initialise(
         return bare, notes
     if known is None and int((~seen.silent).sum()) < LEAST:
         return bare, (*notes, f"no Gaussians: fewer than {LEAST} rows were heard")
+    if known is None and budget and budget.over():
+        return bare, (*notes, "no Gaussians: no time to seek them")
     found = shadowed(seen, data.site, settings, seed, budget, known)
     if found is None:
         return bare, (*notes, "no Gaussians: no candidate in the paths' way explains enough of the powers")
