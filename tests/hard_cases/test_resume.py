@@ -130,6 +130,7 @@ def killed(whole, tmp_path_factory):
     return cut
 
 
+@pytest.mark.slow
 def test_killed_between_two_densifications(whole, killed, tmp_path):
     folder, file = whole
     finish(start(file, tmp_path, f"ckpt_path={killed / 'last.ckpt'}"))
