@@ -137,6 +137,7 @@ def test_killed_between_two_densifications(whole, killed, tmp_path):
     assert_same(folder, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forgetful", [False, True])
 def test_a_checkpoint_of_parameters_and_moments_alone_breaks(whole, killed, tmp_path, forgetful):
     """Naive: what was gathered since the last densification is forgotten."""
