@@ -104,6 +104,8 @@ class Gsparc(LearnedField):
         assert self.plan is not None
         response = replace(self.settings.response, array=self.plan.array)
         self.settings = replace(self.settings, response=response)
+        if not self.settings.field.count:
+            self.most_steps = 0
         choices, _ = resolve(self.settings, self.init.name, data.site)
         steps = total_steps(context) if self.most_steps is None else self.most_steps
         log.info(
@@ -134,11 +136,15 @@ class Gsparc(LearnedField):
             return
         spectra = data.site.kind == "spectrum"
         left = self._left_out if spectra else None  # as the start predicts them, before any step
-        if left is None and len(fold.val) < LEAST_HELD:
+        if self.size() and left is None and len(fold.val) < LEAST_HELD:
             log.info("no Gaussian process beside the field: too few rows are held out to weigh it")
             return
         process = method_class("gp")()
         process.fit(data, Fold(fold.train, fold.val[:0], fold.val[:0]), FitContext())
+        if not self.size():
+            log.info("no Gaussians: a Gaussian process alone")
+            self._beside = process, 1.0
+            return
         held = []
         if len(fold.val):
             batch = data.batch(fold.val)
@@ -350,6 +356,8 @@ class Gsparc(LearnedField):
                 torch.cat([getattr(part, name) for part in parts]) for name in ("mean", "variance", "unknown")
             )
             return Prediction(mean, (1 - unknown).clamp(0, 1), variance)
+        if self._beside is not None and not self.size():
+            return self._beside[0].predict(tx, rx)
         own = super().predict(tx, rx)
         if self._beside is None:
             return own

@@ -95,7 +95,7 @@ def plan(
     if on["power"]:
         part = "scene" if init.name == "scene" else "powers"
         return Plan(False, parts=(part,), reasons=tuple(reasons))
-    if on["moving_array"]:
+    if on["moving_array"] and (count or not plain):
         if switches.visibility is True:
             raise ValueError(
                 "model.effects.visibility=true is not possible: spectra of a moving array hide nothing"

@@ -199,7 +199,13 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
     torch.testing.assert_close(one, two, rtol=1e-3, atol=1e-3 * float(one.abs().max()))
 
 
-@pytest.mark.parametrize("name,plain", [("powers", "gp"), ("channels", None), ("channels of an array", None)])
+@pytest.mark.parametrize(
+    "name,plain",
+    [
+        ("powers", "gp"), ("images", "gp"), ("static array", "gp"), ("moving array", "gp"), ("channels", None),
+        ("channels of an array", None),
+    ],
+)  # fmt: skip
 def test_without_gaussians_it_is_the_plain_process(name, plain):
     fitted = fit(name, "model.field.count=0", "model.steps=0")
     assert fitted.method.size() == 0 and "phase" not in fitted.method.effects
