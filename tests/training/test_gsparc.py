@@ -202,8 +202,8 @@ def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypat
 @pytest.mark.parametrize(
     "name,plain",
     [
-        ("powers", "gp"), ("images", "gp"), ("static array", "gp"), ("moving array", "gp"), ("channels", None),
-        ("channels of an array", None),
+        ("powers", "gp"), ("images", "gp"), ("static array", "gp"), ("moving array", "gp"),
+        ("channels", None), ("channels of an array", None),
     ],
 )  # fmt: skip
 def test_without_gaussians_it_is_the_plain_process(name, plain):
