@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from gsparc.auto import stacking
 from gsparc.auto.contest import LEAST_S, Contest, figure_of
 from gsparc.auto.mixture import mixed
 from gsparc.auto.trials import Course, Trial, course, products, variances
@@ -23,6 +22,7 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, or_null, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.methods import stacking
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
 from gsparc.methods.registry import METHODS, method_class
 from gsparc.methods.time_budget import less_repeatable

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.auto import stacking
 from gsparc.auto.trials import Course, Trial, attempt, products
 from gsparc.data.schema import Kind
+from gsparc.methods import stacking
 from gsparc.methods.method import FitContext, Method
 from gsparc.methods.time_budget import TimeBudget
 

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.inner_folds import cut_inside
+from gsparc.data.inner_folds import NOT_TESTED, InnerFolds, cut_inside
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
@@ -160,7 +160,7 @@ class Gsparc(LearnedField):
             rows += [] if left is None else [_left_out(left, self._apart)]
             theirs = weighing.share_of_second(rows)
         else:
-            theirs = weighing.weights(list(held[0][:2]), held[0][2])[1]
+            theirs = weighing.weights(list(held[0][:2]), held[0][2], np.arange(len(fold.val)))[1]
         log.info(
             "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
             len(fold.val), 0 if left is None else len(left.centres), theirs,
@@ -179,8 +179,10 @@ class Gsparc(LearnedField):
             context.budget_s, KeepBest.__name__,
         )  # fmt: skip
         known = np.sort(np.concatenate([fold.train, fold.val]))
-        solutions, reports = self._solutions(chosen.parts, data, fold, context, budget)
-        self.field = self._stacked(solutions, data, fold)
+        several = len(chosen.parts) > 1
+        held = cut_inside(data, fold, context.split, GROUPS, context.seed) if several else None
+        solutions, reports = self._solutions(chosen.parts, data, fold, context, budget, held)
+        self.field = self._stacked(solutions, data, fold, held)
         self.field.site = data.site
         self.init_s = budget.counted.wall
         log.info(
@@ -189,7 +191,7 @@ class Gsparc(LearnedField):
         )  # fmt: skip
         self.steps, moved = self._take_steps(data, fold, context, budget)
         stepped = budget.counted.wall
-        if moved or len(chosen.parts) > 1:  # else it is of these rows already
+        if moved or several:  # else it is of these rows already
             self.field.condition(data, known)
         seconds = budget.counted.wall
         stages = {name: report.seconds for name, report in reports.items()}
@@ -202,8 +204,9 @@ class Gsparc(LearnedField):
         return FitReport(seconds, tuple(notes), limited)
 
     def _solutions(
-        self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget
-    ) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:
+        self, parts: tuple[str, ...], data: Measurements, fold: Fold, context: FitContext, budget: TimeBudget,
+        held: InnerFolds | None,
+    ) -> tuple[dict[str, ConditionalField], dict[str, FitReport]]:  # fmt: skip
         """What initialisers find, and what each cost.
 
         Where they are several, training rows are cut into groups as the test was cut, and each solution
@@ -211,9 +214,9 @@ class Gsparc(LearnedField):
         few sources is a solution of its own beside the one that takes what seconds are left: many sources fit
         rows near others better, few of them what is far.
         """
-        weighed = len(parts) > 1
+        weighed = held is not None
         rows = fold.train if weighed else np.sort(np.concatenate([fold.train, fold.val]))
-        groups = self._groups(data, fold, context) if weighed else ()
+        groups = () if held is None else _groups(held, fold.train)
         plans: list[tuple[str, InitSettings, float | None]] = [
             (part, self.init, None) for part in parts if part not in OPEN_ENDED
         ]
@@ -249,12 +252,6 @@ class Gsparc(LearnedField):
             reports[name] = report
         return found, reports
 
-    def _groups(self, data: Measurements, fold: Fold, context: FitContext) -> tuple[np.ndarray, ...]:
-        """Training rows (n,) of a few groups, cut as the test was."""
-        inner = cut_inside(data, fold, context.split, GROUPS, context.seed)
-        cut = [np.intersect1d(one.test, fold.train) for one in inner.folds]
-        return tuple(group for group in cut if 0 < len(group) < len(fold.train))
-
     def _initialise(
         self, part: str, init: InitSettings, data: Measurements, rows: np.ndarray, context: FitContext
     ) -> tuple[ConditionalField, FitReport]:
@@ -266,7 +263,7 @@ class Gsparc(LearnedField):
         return field, report
 
     def _stacked(
-        self, solutions: dict[str, ConditionalField], data: Measurements, fold: Fold
+        self, solutions: dict[str, ConditionalField], data: Measurements, fold: Fold, cut: InnerFolds | None
     ) -> ConditionalField:
         """The solutions by the weights that rows give them which they were not conditioned on."""
         self.started = "+".join(solutions)
@@ -292,7 +289,10 @@ class Gsparc(LearnedField):
             self.started = name
             return solutions[name]
         target = _comparable(data.batch(rows).target, data.site)
-        found = weighing.weights(predicted, target)
+        assert cut is not None
+        alone = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
+        unit = np.where(cut.unit == NOT_TESTED, alone, cut.unit)[rows]
+        found = weighing.weights(predicted, target, unit)
         for name, one, weight in zip(solutions, predicted, found, strict=True):
             log.info(
                 "%d held-out rows: %s misses %.3f of the energy, weight %.2f", len(rows), name,
@@ -545,6 +545,12 @@ def _say_cost(stages: dict[str, float], seconds: float) -> None:
     """The log's last line of a fit: seconds of each stage, and of all."""
     said = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
     log.info("cost: %s; %.1f s in all", said, seconds)
+
+
+def _groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Training rows (n,) of each group."""
+    found = [np.intersect1d(one.test, train) for one in cut.folds]
+    return tuple(group for group in found if 0 < len(group) < len(train))
 
 
 def _held(

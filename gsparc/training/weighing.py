@@ -7,36 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import nnls
 from torch import Tensor
 
-ALONE, UNUSED = 0.9, 0.05  # weight above which one predicts alone, and below which it is left out
+from gsparc.methods.stacking import choose
+
+UNUSED = 0.05  # weight below which a predictor is left out
 SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
 LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
-SUM_ONE = 1e3  # weight of the row that says that weights add up to one
 
 
-def weights(predicted: list[Tensor], target: Tensor) -> tuple[float, ...]:
-    """Weights in [0, 1] of sum one.
-
-    Least squares over convex combinations, by non-negative least squares with a heavy row for the sum
-    (L. Breiman, "Stacked regressions", Machine Learning 24, 1996).
+def weights(predicted: list[Tensor], target: Tensor, unit: np.ndarray) -> tuple[float, ...]:
+    """Weights in [0, 1] of sum one: of one alone, unless a mixture is surely better; see `stacking.choose`.
 
     Args:
         predicted: M of (n, ...), real or complex, in the unit that errors are counted in.
         target: (n, ...).
+        unit: (n,), rows of one unit are not independent.
     """
-    flat = [_real(one) for one in predicted]
-    wanted = _real(target)
-    scale = float(np.sqrt((wanted**2).sum())) or 1.0
-    design = np.stack(flat, 1) / scale
-    design = np.concatenate([design, np.full((1, len(flat)), SUM_ONE)])
-    found = nnls(design, np.append(wanted / scale, SUM_ONE))[0]
-    found /= found.sum()
-    if found.max() > ALONE:
-        found = (found == found.max()).astype(float)
-    found[found < UNUSED] = 0.0
-    return tuple(float(weight) for weight in found / found.sum())
+    missed = torch.stack([_real(one - target) for one in predicted], 1)  # (n, M, P)
+    chosen = choose((missed @ missed.mT).numpy(), unit)
+    return tuple(float(weight) for weight in chosen)
 
 
 @dataclass(frozen=True)
@@ -81,6 +71,6 @@ def explained(predicted: Tensor, target: Tensor, about_mean: bool) -> float:
     return 1 - float((predicted - target).abs().square().sum() / whole)
 
 
-def _real(values: Tensor) -> np.ndarray:
+def _real(values: Tensor) -> Tensor:
     values = torch.view_as_real(values.resolve_conj()) if values.is_complex() else values
-    return values.detach().double().flatten().numpy()
+    return values.detach().double().flatten(1)

@@ -180,7 +180,7 @@ def test_more_seconds_are_kept_to_with_many_steps(name):
 
 
 def test_channels_are_a_stack_of_completed_fields_that_is_stored_whole(monkeypatch, tmp_path):
-    monkeypatch.setattr(weighing, "weights", lambda found, _: (1 / len(found),) * len(found))
+    monkeypatch.setattr(weighing, "weights", lambda found, _, unit: (1 / len(found),) * len(found))
     monkeypatch.setattr(initialise, "LEAST_GAIN", -math.inf)
     fitted = fit("channels")
     field = fitted.method.field

@@ -4,6 +4,7 @@ import torch
 
 from gsparc.training.weighing import Rows, error, explained, share_of_second, weights
 
+EACH = np.arange(50)  # every row is a unit
 TARGET = torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3)))
 
 
@@ -12,26 +13,31 @@ def noisy(share: float, seed: int) -> torch.Tensor:
 
 
 def test_equal_errors_share_and_large_ones_have_nothing():
-    found = weights([noisy(0.3, 1), noisy(0.3, 2), noisy(5.0, 3)], TARGET)
+    found = weights([noisy(0.3, 1), noisy(0.3, 2), noisy(5.0, 3)], TARGET, EACH)
     assert sum(found) == pytest.approx(1) and found[2] == 0
     assert found[0] == pytest.approx(0.5, abs=0.1)
 
 
 def test_one_far_ahead_predicts_alone():
-    assert weights([noisy(0.01, 1), noisy(0.3, 2)], TARGET) == (1.0, 0.0)
+    assert weights([noisy(0.01, 1), noisy(0.3, 2)], TARGET, EACH) == (1.0, 0.0)
+
+
+def test_rows_of_one_unit_do_not_make_a_mixture():
+    """Two squares of floor: whichever mixture fits one of them says little about the other."""
+    assert max(weights([noisy(0.3, 1), noisy(0.31, 2)], TARGET, EACH // 25)) == 1.0
 
 
 def test_complex_predictions_are_weighed_as_they_are_summed():
     turned = torch.complex(noisy(0.3, 1), noisy(0.3, 2))
     other = torch.complex(noisy(0.3, 3), noisy(0.3, 4))
     target = torch.complex(TARGET, TARGET)
-    found = weights([turned, other], target)
+    found = weights([turned, other], target, EACH)
     mixed = found[0] * turned + found[1] * other
     assert error(mixed, target) < min(error(turned, target), error(other, target))
 
 
 def test_silent_targets_still_give_weights():
-    assert sum(weights([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET))) == pytest.approx(1)
+    assert sum(weights([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)) == pytest.approx(1)
 
 
 def test_what_is_explained_is_about_the_mean_of_powers_and_about_zero_of_channels():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.auto.stacking import best_weights, choose, hopeless, paired, squared, variance_scale
+from gsparc.methods.stacking import best_weights, choose, hopeless, paired, squared, variance_scale
 
 
 def gram_of(errors: np.ndarray) -> np.ndarray:
