@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsparc.methods.stacking import choose
 
+LEAST_GAIN_DB = 0.2  # for which a query may take several times as long
 UNUSED = 0.05  # weight below which a predictor is left out
 SHARES = np.linspace(0, 1, 21)  # candidates of a weight of two
 LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
@@ -51,9 +52,11 @@ class Rows:
 def share_of_second(parts: Sequence[Rows]) -> float:
     """Weight in [0, 1] of the second of two predictors with which the mean PSNR over all rows is largest.
 
-    0 or 1 where it is within `UNUSED` of them.
+    0 or 1 where it is within `UNUSED` of them; 0 where less than `LEAST_GAIN_DB` is gained.
     """
     means = [np.concatenate([part.log_errors(share) for part in parts]).mean() for share in SHARES]
+    if 10 / np.log(10) * (means[0] - min(means)) < LEAST_GAIN_DB:
+        return 0.0
     best = float(SHARES[int(np.argmin(means))])
     return round(best) if min(best, 1 - best) <= UNUSED + LEAST_ERROR else best
 
