@@ -127,7 +127,7 @@ class Gsparc(LearnedField):
         _say_cost(spent, report.seconds)
         return report
 
-    def _watched(self, data: Measurements, fold: Fold) -> None:
+    def _weigh_beside(self, data: Measurements, fold: Fold) -> None:
         """What a plain process on whole targets is worth beside the field, on rows that neither learned from.
 
         Those are validation rows and, of spectra, training rows that both predict without their neighbours:
