@@ -93,6 +93,7 @@ class ChannelField(ConditionalField):
     """
 
     kind = "diffuse"
+    reads_rows = True
 
     def __init__(self, site: Site, shape: Shape, values: Values, channel: tuple[int, int]) -> None:
         super().__init__()
@@ -239,6 +240,17 @@ class ChannelField(ConditionalField):
             share.to(device) if self.count else None,
             (after / before.clamp_min(1e-300)).clamp(0, 1).float().to(device),
         )
+
+    def answer(self, batch: Batch) -> Posterior:
+        """Answer rows of known stations, in the phase and level of their runs."""
+        found = self(batch.tx, batch.rx, batch.station)
+        if len(self.runs) == 1:
+            return found
+        factor = self.run_factor(batch.run).to(found.mean.device)
+        turned = factor[:, None, None].to(found.mean.dtype)
+        explained = None if found.explained is None else found.explained * turned
+        variance = found.variance * factor.abs().square().float()
+        return replace(found, mean=found.mean * turned, variance=variance, explained=explained)
 
     def _answer(
         self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor
