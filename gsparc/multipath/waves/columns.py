@@ -209,6 +209,19 @@ def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Ten
     return moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY)
 
 
+def ends_of(groups: tuple[Group, ...]) -> int:
+    """How many static ends there are."""
+    return len({group.slot.station for group in groups})
+
+
+def of_runs(factors: Tensor, groups: tuple[Group, ...]) -> Tensor:
+    """Factors of runs (runs,) as they may be: of several ends that share them, phases alone.
+
+    What a run has changed beside its phase is each end's own, and would be taken for a level of all.
+    """
+    return factors / factors.abs() if ends_of(groups) > 1 else factors
+
+
 def thinned(groups: tuple[Group, ...], columns: int, rows: int) -> tuple[Group, ...]:
     """At most `columns` groups, spread over all, of at most `rows` rows each, drawn evenly.
 

@@ -15,7 +15,7 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
-from gsparc.multipath.waves.columns import Group, Slot, asked, gather, static_place
+from gsparc.multipath.waves.columns import Group, Slot, asked, gather, of_runs, static_place
 from gsparc.multipath.waves.common import Common
 from gsparc.multipath.waves.covariance import (
     Shape,
@@ -201,7 +201,7 @@ class ChannelField(ConditionalField):
         if factors is None:
             factors = torch.ones(len(self.runs), dtype=torch.complex128)
             if len(self.runs) > 1:
-                factors = _factors(groups, lowers, len(self.runs))
+                factors = of_runs(_factors(groups, lowers, len(self.runs)), groups)
         self.run_factors, found, noise = factors, [], float(shape.of("noise", values.power))
         for group, lower in zip(groups, lowers, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])

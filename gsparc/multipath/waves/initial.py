@@ -21,7 +21,7 @@ from gsparc.multipath.complex_gp import CHOSEN_ON, LENGTHS, NOISES
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
 from gsparc.multipath.waves import drift
-from gsparc.multipath.waves.columns import Group, gather, thinned
+from gsparc.multipath.waves.columns import Group, ends_of, gather, of_runs, thinned
 from gsparc.multipath.waves.covariance import BEYOND, Shape, Values, disturbance
 from gsparc.multipath.waves.evidence import (
     Compressed,
@@ -110,7 +110,7 @@ def initialise(
     field = ChannelField(data.site, best.shape, best.values, channel)
     field.condition(data, rows)
     # Steps on a few rows of each end would find less than the likelihood of all of them has.
-    field.requires_grad_(_ends(search.every) == 1)
+    field.requires_grad_(ends_of(search.every) == 1)
     return field, (*notes, *more)
 
 
@@ -166,7 +166,7 @@ def _grid_point(
     heard = size > 0
     if runs > 1:
         factors[heard] = aligning(total[np.ix_(heard, heard)], size[heard])
-    turn, nll = torch.from_numpy(factors), 0.0
+    turn, nll = of_runs(torch.from_numpy(factors), groups), 0.0
     for group, lower in zip(groups, solved, strict=True):
         target = group.target * turn[group.run][:, None]
         white = torch.cat([target.real, target.imag], 1)
@@ -194,11 +194,6 @@ def _left_out(part: Compressed, power: Tensor) -> np.ndarray:
     places = part.group.places.numpy()
     grouping = [np.arange(len(places)), *(cells(places, depth) for depth in DEPTHS)]
     return np.stack([left_out_cells(part, power, cell).abs().square().mean(1).numpy() for cell in grouping])
-
-
-def _ends(groups: tuple[Group, ...]) -> int:
-    """How many static ends there are."""
-    return len({group.slot.station for group in groups})
 
 
 @dataclass(frozen=True)
@@ -245,7 +240,7 @@ class _Search:
             best = self._step(best, self._with_sources(best), "auto", "sources", notes)
         if wanted.directions is not False and not budget.over():
             best = self._step(best, self._with_directions(best), wanted.directions, "directions", notes)
-        if _ends(self.every) > 1 and not budget.over():
+        if ends_of(self.every) > 1 and not budget.over():
             best = self._of_all_ends(best, known, notes)
         if wanted.correlated is not False and not budget.over():
             best = self._with_drift(best, notes)
