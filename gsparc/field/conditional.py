@@ -67,6 +67,7 @@ class ConditionalField(nn.Module, ABC):
     kind: ClassVar[str] = ""
     site: Site
     held: LeftOutRows | None = None
+    reads_rows: ClassVar[bool] = False  # whether `answer` knows more than `forward`
     RATE: ClassVar[float] = 0.01  # of logarithms of lengths and variances
     rates: ClassVar[dict[str, float]] = {}
 
@@ -95,6 +96,11 @@ class ConditionalField(nn.Module, ABC):
     @abstractmethod
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates."""
+
+    def answer(self, batch: Batch) -> Posterior:
+        """Answer rows, whose stations and runs may matter."""
+        found: Posterior = self(batch.tx, batch.rx)
+        return found
 
     @abstractmethod
     def left_out(self) -> LeftOutRows:
@@ -223,7 +229,7 @@ class CompletedField(ConditionalField):
 
 def learns(field: nn.Module) -> bool:
     """Whether there is anything that gradient steps move."""
-    return next(field.parameters(), None) is not None
+    return any(parameter.requires_grad for parameter in field.parameters())
 
 
 def residuals(field: ConditionalField, data: Measurements) -> Measurements:

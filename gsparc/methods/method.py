@@ -156,6 +156,10 @@ class Method(ABC):
         """Number of Gaussians, sources or stored training samples."""
         return 0
 
+    def shares(self, site: Site) -> bool:
+        """Whether it learns several stations of this site at once, told which by `Batch.station`."""
+        return False
+
     def problem(self, data: Measurements) -> str | None:
         """Why it cannot serve these measurements, as far as that is known before a fit; None where it may."""
         return None

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds, cut_inside
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
@@ -343,6 +343,18 @@ class Gsparc(LearnedField):
         return total_steps(context) if self.most_steps is None else self.most_steps
 
     # -- answering ---------------------------------------------------------------------------------
+
+    def shares(self, site: Site) -> bool:
+        """Channels of a known carrier: see `gsparc.multipath.waves`."""
+        return site.kind == "csi" and site.wavelength is not None and site.static_end is not None
+
+    @torch.no_grad()
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`."""
+        if self.field is None or not self.field.reads_rows:
+            return super().answer(batch)
+        found = self.field.answer(batch)
+        return Prediction(found.mean, (1 - found.unknown).clamp(0, 1), found.variance)
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:

@@ -170,6 +170,8 @@ def _no_phase(data: Measurements) -> str | None:
     site = data.site
     if site.kind != "csi":
         return f"the target is {site.kind}, which carries no phase"
+    if site.stations is not None and len(site.stations) > 1:
+        return "several stations are learned together, for which sources are not searched"
     if site.static_position is None:
         return "the dataset does not say where the static end is"
     if site.carrier_hz is None and site.subcarriers_hz is None:
