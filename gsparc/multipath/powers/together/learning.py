@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -15,17 +15,21 @@ from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.together.law import SiteLaw
 from gsparc.multipath.powers.together.posterior import End, Factored, left_out_of, weights_of
-from gsparc.multipath.powers.together.prior import Prior, grid
+from gsparc.multipath.powers.together.prior import LENGTHS, OWN, Prior, grid
 from gsparc.multipath.powers.together.rows import Heard
 
 INDUCING = 200  # places that the shared process is known at while settings are learned
 CELLS = 256  # Gaussians of the grid
 LOOKS = 40
 STARTS = (0.1, 1.0)  # lengths, of the median distance between places
+PARTS = (0.35, 0.35, 0.2)  # of the variance, at first: of these lengths, and of the noise
 SHARED = 0.1  # of the process's variance, at first
 SPANS = (1e-3, 3.0)  # bounds of a length, of that distance
 SCALES = 0.5  # deviation of the logarithm of an end's variances
+DEPARTS = 0.7  # deviation of the logarithm of each of an end's settings
 VARIANCES_DB2 = (1e-4, 1e4)
+FLAT = 1e-6  # a step that gains less, per row [nats], is the last
+LEFT = (-2.0, 0.5)  # bounds of the logarithm of what shared terms leave to the ends
 BAD = 1e12  # in place of a likelihood where no Cholesky factor exists
 
 
@@ -45,12 +49,12 @@ def start(rows: Heard, law: SiteLaw, stations: int, seed: int) -> Prior:
     whole = max(float(values.square().mean()), 1e-2)
     ends = torch.from_numpy(np.concatenate([rows.moving, rows.still]))
     log = torch.tensor
+    own = [math.log(max(share * middle, 1e-3)) for share in STARTS]
+    own += [math.log(share * whole) for share in PARTS]
     return Prior(
         law,
-        torch.tensor([math.log(max(share * middle, 1e-3)) for share in STARTS], dtype=torch.float64),
-        torch.full((2,), math.log(0.35 * whole), dtype=torch.float64),
-        log(math.log(0.2 * whole), dtype=torch.float64),
-        torch.zeros(stations, dtype=torch.float64),
+        torch.tensor(own, dtype=torch.float64),
+        torch.zeros(stations, OWN, dtype=torch.float64),
         log(math.log(max(0.3 * middle, 1e-3)), dtype=torch.float64),
         log(math.log(SHARED * whole), dtype=torch.float64),
         log(math.log(SHARED * whole / 4), dtype=torch.float64),
@@ -68,27 +72,86 @@ def with_inducing(prior: Prior, rows: Heard, most: int, seed: int) -> Prior:
     return replace(prior, inducing=torch.from_numpy(places[np.sort(drawn)]))
 
 
-def learn(
+def learn_shared(
     prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget | None = None
 ) -> tuple[Prior, float]:
-    """The prior with settings of largest leave-one-out likelihood, and that per row [nats].
+    """Settings that all ends have alike, but for a scale of each one's variances; the density per row [nats].
 
-    Rows where nothing was heard are left aside. Prices: a row's worth for an end's own scale.
+    Rows where nothing was heard are left aside.
     """
-    loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
-    ends = [End.of(loud, number, prior) for number in loud.stations]
-    names = learned_names(prior)
-    begin = prior.settings()
-    shapes = {name: begin[name].shape for name in names}
-    first = np.concatenate([begin[name].reshape(-1).numpy() for name in names])
-    bounds = _bounds(prior, names, loud)
+    ends = _ends(prior, rows)
     count = sum(len(end.values) for end in ends)
+    by_end = torch.tensor([0.0] * LENGTHS + [1.0] * (OWN - LENGTHS), dtype=torch.float64)
+    first = {"own": prior.own, "scales": prior.departures[:, -1], **_of_site(prior)}
+
+    def at(values: dict[str, Tensor]) -> Prior:
+        scales = values["scales"][:, None] * by_end
+        return replace(prior, departures=scales, **{k: v for k, v in values.items() if k != "scales"})
+
+    def loss(values: dict[str, Tensor]) -> Tensor:
+        price = 0.5 * (values["scales"] / SCALES).square().sum()
+        return (left_out_loss(at(values), ends) + price) / count
+
+    best, value = _walk(loss, first, _bounds(first, rows), looks, budget)
+    return at(best), -value
+
+
+def learn_ends(prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget | None = None) -> Prior:
+    """Settings of each end by itself, as its own rows want them away from all ends'."""
+    departures = prior.departures.clone()
+    low, high = np.array(_bounds({"own": prior.own}, rows)["own"]).T
+    for end in _ends(prior, rows):
+        number = end.station
+
+        def loss(values: dict[str, Tensor], end: End = end, number: int = number) -> Tensor:
+            apart = values["own"] - prior.own
+            now = replace(bare(prior), departures=departures.index_put((torch.tensor([number]),), apart))
+            price = 0.5 * (apart / DEPARTS).square().sum()
+            return (left_out_loss(now, [end]) + price) / len(end.values)
+
+        first = {"own": prior.settings_of(number)}
+        best, _ = _walk(loss, first, {"own": list(zip(low, high, strict=True))}, looks, budget)
+        departures[number] = best["own"] - prior.own
+    return replace(prior, departures=departures)
+
+
+def learn_site(
+    prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget | None = None
+) -> tuple[Prior, float]:
+    """Settings of the shared terms, and how much they leave to all ends; the density per row [nats]."""
+    ends = _ends(prior, rows)
+    count = sum(len(end.values) for end in ends)
+    parts = slice(LENGTHS, OWN)
+    first = {"left": torch.zeros(OWN - LENGTHS, dtype=torch.float64), **_of_site(prior)}
+
+    def at(values: dict[str, Tensor]) -> Prior:
+        own = torch.cat([prior.own[:LENGTHS], prior.own[parts] + values["left"]])
+        return replace(prior, own=own, **{k: v for k, v in values.items() if k != "left"})
+
+    best, value = _walk(
+        lambda values: left_out_loss(at(values), ends) / count, first, _bounds(first, rows), looks, budget
+    )
+    return at(best), -value
+
+
+def _walk(
+    loss: Callable[[dict[str, Tensor]], Tensor],
+    first: dict[str, Tensor],
+    bounds: dict[str, list[tuple[float, float]]],
+    looks: int,
+    budget: TimeBudget | None,
+) -> tuple[dict[str, Tensor], float]:
+    """Where `loss` is least, walked to from `first`, and its value there."""
+    sizes = [value.numel() for value in first.values()]
+
+    def named(values: Tensor) -> dict[str, Tensor]:
+        parts = zip(first.items(), values.split(sizes), strict=True)
+        return {name: part.reshape(value.shape) for (name, value), part in parts}
 
     def objective(at: np.ndarray) -> tuple[float, np.ndarray]:
         x = torch.from_numpy(at).requires_grad_()
         try:
-            now = replace(prior, **_split(x, shapes))
-            value = (left_out_loss(now, ends) + 0.5 * (now.log_scales / SCALES).square().sum()) / count
+            value = loss(named(x))
         except torch.linalg.LinAlgError:  # in float64: as bad as it gets
             return BAD, np.zeros_like(at)
         (slope,) = torch.autograd.grad(value, x)
@@ -98,50 +161,52 @@ def learn(
         if budget is not None and budget.over():
             raise StopIteration
 
-    low, high = np.array(bounds).T
+    limits = [limit for name in first for limit in bounds[name]]
+    low, high = np.array(limits).T
+    begin = np.clip(torch.cat([value.reshape(-1) for value in first.values()]).numpy(), low, high)
     found = minimize(
-        objective, np.clip(first, low, high), jac=True, method="L-BFGS-B", bounds=bounds,
-        options={"maxfun": looks, "ftol": 1e-5}, callback=stop,
+        objective, begin, jac=True, method="L-BFGS-B", bounds=limits, callback=stop,
+        options={"maxfun": looks, "ftol": FLAT},
     )  # fmt: skip
-    best = {name: value.detach() for name, value in _split(torch.from_numpy(found.x), shapes).items()}
-    return replace(prior, **best), -float(found.fun)
+    return named(torch.from_numpy(found.x)), float(found.fun)
+
+
+def _ends(prior: Prior, rows: Heard) -> list[End]:
+    loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
+    return [End.of(loud, number, prior) for number in loud.stations]
+
+
+def _of_site(prior: Prior) -> dict[str, Tensor]:
+    """Settings of the shared terms that there are."""
+    place = {"log_length": prior.log_length, "log_shared": prior.log_shared}
+    cloud = {"log_cloud": prior.log_cloud}
+    return (place if len(prior.inducing) else {}) | (cloud if len(prior.blockers) else {})
 
 
 def left_out_loss(prior: Prior, ends: list[End]) -> Tensor:
     """Negative log density () [nats] of all rows, each given all others, with autograd."""
     factored = [Factored.of(end, prior) for end in ends]
     lower, mean = weights_of(factored)
-    total = prior.log_noise.new_zeros(())
+    total = prior.own.new_zeros(())
     for one in factored:
         error, variance = left_out_of(one, lower, mean)
         total = total + 0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi)).sum()
     return total
 
 
-def learned_names(prior: Prior) -> list[str]:
-    """Settings that mean something in this prior."""
-    names = ["log_lengths", "log_own", "log_noise", "log_scales"]
-    return names + ["log_length", "log_shared"] * bool(len(prior.inducing)) + ["log_cloud"] * bool(
-        len(prior.blockers)
-    )
-
-
-def _split(values: Tensor, shapes: dict[str, torch.Size]) -> dict[str, Tensor]:
-    sizes = [int(np.prod(shape)) for shape in shapes.values()]
-    parts = values.split(sizes)
-    return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
-
-
-def _bounds(prior: Prior, names: Iterable[str], rows: Heard) -> list[tuple[float, float]]:
-    few = torch.from_numpy(np.unique(rows.moving, axis=0)[:: max(1, len(rows.rows) // 400)])
+def _bounds(first: dict[str, Tensor], rows: Heard) -> dict[str, list[tuple[float, float]]]:
+    """Of settings by their names."""
+    few = torch.from_numpy(np.unique(rows.moving, axis=0)[:: max(1, len(rows.rows) // 4_000)])
     apart = torch.pdist(few)
     middle = max(float(apart.median()), 1e-3) if len(apart) else 1.0
     length = (math.log(SPANS[0] * middle), math.log(SPANS[1] * middle))
     variance = (math.log(VARIANCES_DB2[0]), math.log(VARIANCES_DB2[1]))
-    found = []
-    for name in names:
-        one = length if "length" in name else (-2.0, 2.0) if name == "log_scales" else variance
-        found += [one] * int(np.prod(getattr(prior, name).shape))
+    found: dict[str, list[tuple[float, float]]] = {}
+    for name, value in first.items():
+        one = {"log_length": length, "scales": (-2.0, 2.0), "left": LEFT}.get(name, variance)
+        found[name] = [one] * value.numel()
+    if "own" in found:
+        found["own"][:LENGTHS] = [length] * LENGTHS
     return found
 
 

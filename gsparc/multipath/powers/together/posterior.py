@@ -19,6 +19,9 @@ from gsparc.multipath.powers.together.prior import Prior, restored_prior
 from gsparc.multipath.powers.together.rows import Heard
 
 
+NEVER = -1  # in place of a station's number: one that was never heard
+
+
 @dataclass(frozen=True)
 class End:
     """Rows of one station before anything is concluded.
@@ -52,9 +55,9 @@ class End:
 
     def gram(self, prior: Prior, lacks: Tensor) -> Tensor:
         """Covariance (n, n) without the shared columns [dB^2]."""
-        terms, scale = prior.law.terms(self.decades), prior.scale(self.station)
-        total = scale * prior.own(self.moving, self.moving) + terms @ terms.T
-        return total + torch.diag_embed(scale * prior.log_noise.exp() + lacks + self.extra)
+        terms = prior.law.terms(self.decades)
+        total = prior.process(self.station, self.moving, self.moving) + terms @ terms.T
+        return total + torch.diag_embed(prior.noise(self.station) + lacks + self.extra)
 
 
 @dataclass(frozen=True)
@@ -144,19 +147,16 @@ class Posterior:
         prior = self.prior
         decades = prior.law.decades(moving, still)
         columns, lacks = prior.shared(moving, prior.shadows(moving, still))
-        law, end = prior.law.mean(decades), self.ends.get(station)
-        explained = law + columns @ self.mean
-        if end is None:
-            terms = prior.law.terms(decades).square().sum(1)
-            left = prior.log_own.exp().sum() + prior.log_noise.exp() + terms + lacks
-            left = left + self._weights_variance(columns)
-            return explained, left, left / self._whole, explained
-        one, scale = self._factor(station), prior.scale(station)
+        explained, end = prior.law.mean(decades) + columns @ self.mean, self.ends.get(station)
         terms = prior.law.terms(decades)
-        cross = scale * prior.own(moving, end.moving) + terms @ prior.law.terms(end.decades).T
+        own = terms.square().sum(1) + lacks + prior.variance(station if end is not None else NEVER)
+        if end is None:
+            left = own + self._weights_variance(columns)
+            return explained, left, (left / self._whole).clamp_max(1.0), explained
+        one = self._factor(station)
+        cross = prior.process(station, moving, end.moving) + terms @ prior.law.terms(end.decades).T
         mean = explained + cross @ self.weights[station]
         white = torch.linalg.solve_triangular(one.lower, cross.T, upper=False)
-        own = scale * (prior.log_own.exp().sum() + prior.log_noise.exp()) + terms.square().sum(1) + lacks
         left = (own - white.square().sum(0)).clamp_min(0.0)
         left = left + self._weights_variance(columns - white.T @ one.whitened)
         return mean, left, (left / self._whole).clamp_max(1.0), explained
@@ -170,7 +170,7 @@ class Posterior:
         mean, end = prior.law.mean(decades) + columns @ self.mean, self.ends.get(station)
         if end is None:
             return mean
-        cross = prior.scale(station) * prior.own(moving, end.moving)
+        cross = prior.process(station, moving, end.moving)
         return mean + (cross + prior.law.terms(decades) @ prior.law.terms(end.decades).T) @ self.weights[station]
 
     @torch.no_grad()
@@ -204,7 +204,7 @@ class Posterior:
     def _whole(self) -> Tensor:
         """Variance () of what was measured, of all ends [dB^2]."""
         every = torch.cat([end.values + self.prior.law.mean(end.decades) for end in self.ends.values()])
-        return every.var(correction=0).clamp_min(float(self.prior.log_own.exp().sum() + self.prior.log_noise.exp()))
+        return every.var(correction=0).clamp_min(float(self.prior.variance(NEVER)))
 
 
 def restored_posterior(state: dict[str, Any]) -> Posterior:

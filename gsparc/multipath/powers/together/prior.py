@@ -22,7 +22,9 @@ from gsparc.multipath.powers.together.law import SiteLaw
 
 JITTER = 1e-6  # of a correlation's diagonal
 TALL = 1e4  # of a Gaussian of the grid, in its widths: places' heights hardly differ against it
-NAMES = ("log_lengths", "log_own", "log_noise", "log_scales", "log_length", "log_shared", "log_cloud")
+LENGTHS = 2  # of an end's own process
+OWN = 2 * LENGTHS + 1  # settings of an end: logarithms of lengths [m], variances and the noise's [dB^2]
+NAMES = ("own", "departures", "log_length", "log_shared", "log_cloud")
 
 
 @dataclass(frozen=True)
@@ -31,10 +33,9 @@ class Prior:
 
     Attributes:
         law: of distance.
-        log_lengths: (2,) of an end's own process [m].
-        log_own: (2,) variances of its parts.
-        log_noise: () variance of the noise.
-        log_scales: (T,) of an end's own process and noise, relative to these; an unheard end's is 0.
+        own: (OWN,) of an end that was never heard: logarithms of its process's lengths [m], of the variances of
+            its parts, and of the noise's.
+        departures: (T, OWN) of each end from these.
         log_length, log_shared: () length [m] and variance of g.
         log_cloud: () variance of what one Gaussian takes straight through it.
         inducing: (M, 3) places that g is known at [m]; M = 0: there is no g.
@@ -42,10 +43,8 @@ class Prior:
     """
 
     law: SiteLaw
-    log_lengths: Tensor
-    log_own: Tensor
-    log_noise: Tensor
-    log_scales: Tensor
+    own: Tensor
+    departures: Tensor
     log_length: Tensor
     log_shared: Tensor
     log_cloud: Tensor
@@ -66,17 +65,26 @@ class Prior:
         inducing = self.inducing[:0] if place else self.inducing
         return replace(self, inducing=inducing, blockers=Blockers.none() if cloud else self.blockers)
 
-    def scale(self, station: int) -> Tensor:
-        """() of one end's own variances; 1 where it was never heard."""
-        return self.log_scales[station].exp() if station >= 0 else torch.ones_like(self.log_noise)
+    def settings_of(self, station: int) -> Tensor:
+        """(OWN,) of one end; negative: of one that was never heard."""
+        return self.own + self.departures[station] if station >= 0 else self.own
 
-    def own(self, one: Tensor, other: Tensor) -> Tensor:
-        """Covariance (a, b) of an end's own process between places (a, 3) and (b, 3), of scale 1."""
+    def process(self, station: int, one: Tensor, other: Tensor) -> Tensor:
+        """Covariance (a, b) of an end's own process between places (a, 3) and (b, 3)."""
+        settings = self.settings_of(station)
         distance = torch.cdist(one, other, compute_mode="donot_use_mm_for_euclid_dist")
         total = torch.zeros_like(distance)
-        for log_length, log_own in zip(self.log_lengths, self.log_own, strict=True):
-            total = total + log_own.exp() * matern(distance, log_length)
+        for log_length, log_variance in zip(settings[:LENGTHS], settings[LENGTHS:-1], strict=True):
+            total = total + log_variance.exp() * matern(distance, log_length)
         return total
+
+    def noise(self, station: int) -> Tensor:
+        """Variance () of an end's noise."""
+        return self.settings_of(station)[-1].exp()
+
+    def variance(self, station: int) -> Tensor:
+        """Variance () of an end's own process and noise."""
+        return self.settings_of(station)[LENGTHS:].exp().sum()
 
     def shared(self, moving: Tensor, shadows: Tensor) -> tuple[Tensor, Tensor]:
         """Columns (n, P) of the shared terms for unit normal weights, and the variance (n,) that g lacks there.
@@ -101,11 +109,6 @@ class Prior:
             return moving.new_zeros(len(moving), 0)
         means, scales, turns, _ = self.blockers.parts()
         return extinctions(moving, still, means, scales, turns)
-
-    def unheard(self, decades: Tensor, columns: Tensor, lacks: Tensor) -> Tensor:
-        """Variance (n,) of a measurement before anything was heard, of an end of scale 1."""
-        own = self.log_own.exp().sum() + self.log_noise.exp()
-        return own + self.law.terms(decades).square().sum(1) + columns.square().sum(1) + lacks
 
     def _place(self, one: Tensor, other: Tensor) -> Tensor:
         distance = torch.cdist(one, other, compute_mode="donot_use_mm_for_euclid_dist")
