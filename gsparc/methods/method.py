@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, runtime_chec
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.schema import Batch, Kind, Measurements, Site
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
 from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget
 from gsparc.ops import Pose
@@ -121,6 +121,7 @@ class Method(ABC):
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
+    many_ends: tuple[Kind, ...] = ()  # kinds of targets of which it learns several stations as one
     uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_gaussians = False  # whether what it learns are Gaussians, which `size` then counts

@@ -98,7 +98,8 @@ class PerStation(Method):
         """
         assert data.station is not None and data.site.stations is not None
         together = context.stations == "together"
-        if together and not self.wrapped.both_ends:
+        joint = data.site.kind in self.wrapped.many_ends
+        if together and not self.wrapped.both_ends and not joint:
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
         self._shape = tuple(data.target.shape[1:])
@@ -107,7 +108,7 @@ class PerStation(Method):
         if together:
             numbers = [UNHEARD]
         elif unheard.any():
-            if not self.wrapped.both_ends:
+            if not self.wrapped.both_ends and not joint:
                 names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
@@ -117,7 +118,7 @@ class PerStation(Method):
         limited: Clock | None = None
         for number in numbers:
             rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
-            copy, part = self._make(), data.subset(rows, of_station(data.site, number))
+            copy, part = self._make(), data.subset(rows, self._seen(data.site, number))
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             where = context.run_dir / f"station{number}" if number != UNHEARD else context.run_dir / "unheard"
             report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
@@ -127,6 +128,11 @@ class PerStation(Method):
             name = all_or_new if number == UNHEARD else data.site.stations.name[number]
             notes += [f"{name}: {note}" for note in report.notes]
         return FitReport(seconds, tuple(notes), limited)
+
+    def _seen(self, site: Site, number: int) -> Site:
+        """The site as a copy sees it: whole, where one learns all stations as such."""
+        whole = number == UNHEARD and site.kind in self.wrapped.many_ends
+        return site if whole else of_station(site, number)
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row by its station's copy."""
@@ -196,7 +202,7 @@ class PerStation(Method):
         self.site = site
         for number, part in state["per_station"].items():
             self._copies[int(number)] = copy = self._make()
-            copy.restore(of_station(site, int(number)), part)
+            copy.restore(self._seen(site, int(number)), part)
 
     def size(self) -> int:
         """That of all copies."""
@@ -228,7 +234,7 @@ def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
     assert site is not None
     if not rx.batched:
         return rx
-    if site.static_end == "rx":
+    if site.static_end == "rx" and site.stations is None:
         return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
     return Pose(rx.position[chosen], rx.rotation[chosen])
 
@@ -238,4 +244,6 @@ def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
         name: value if value is None or name in ("rx", "station") else value[chosen]
         for name, value in vars(batch).items()
     }
-    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": None})
+    known = batch.station is not None and site is not None and site.stations is not None
+    station = batch.station[chosen] if known else None
+    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": station})

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.inner_folds import cut_inside
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
@@ -61,6 +61,8 @@ class Gsparc(LearnedField):
         effects: switches of terms.
         **field: see `LearnedField`.
     """
+
+    many_ends = ("rssi",)
 
     def __init__(self, effects: EffectSettings | None = None, **field: Any) -> None:
         super().__init__(**field)
@@ -338,14 +340,21 @@ class Gsparc(LearnedField):
 
     # -- answering ---------------------------------------------------------------------------------
 
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`; stations by their numbers where all are learned as one."""
+        if self.field is None or batch.station is None:
+            return super().answer(batch)
+        return self.predict(batch.tx, batch.rx, batch.station)
+
     @torch.no_grad()
-    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
-        """See `Method.predict`."""
+    def predict(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Prediction:
+        """See `Method.predict`; `station` (B,) says which ones, where all are learned as one."""
         if self.field is not None:
-            parts = [
-                self.field(tx[i : i + QUERY_CHUNK], rx[i : i + QUERY_CHUNK] if rx.batched else rx)
-                for i in range(0, len(tx), QUERY_CHUNK)
-            ]
+            parts = []
+            for i in range(0, len(tx), QUERY_CHUNK):
+                at = slice(i, i + QUERY_CHUNK)
+                which = () if station is None else (station[at],)
+                parts.append(self.field(tx[at], rx[at] if rx.batched else rx, *which))
             mean, variance, unknown = (
                 torch.cat([getattr(part, name) for part in parts]) for name in ("mean", "variance", "unknown")
             )

@@ -65,7 +65,9 @@ def fit_site_law(rows: Heard) -> SiteLaw:
     Args:
         rows: at least one.
     """
-    parts = [rows.at(np.flatnonzero(rows.station == number)[:: _step(rows, number)]) for number in rows.stations]
+    parts = [
+        rows.at(np.flatnonzero(rows.station == number)[:: _step(rows, number)]) for number in rows.stations
+    ]
     far = [np.linalg.norm(part.moving - part.still, axis=1) for part in parts]
     every = np.concatenate(far)
     low, high = np.maximum(np.quantile(every, [0.0, 0.5]), TINY_M)

@@ -15,26 +15,22 @@ from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.together.law import SiteLaw
 from gsparc.multipath.powers.together.posterior import End, Factored, left_out_of, weights_of
-from gsparc.multipath.powers.together.prior import LENGTHS, OWN, Prior, grid
+from gsparc.multipath.powers.together.prior import LENGTHS, OWN, Prior
 from gsparc.multipath.powers.together.rows import Heard
 
-INDUCING = 200  # places that the shared process is known at while settings are learned
-CELLS = 256  # Gaussians of the grid
 LOOKS = 40
 STARTS = (0.1, 1.0)  # lengths, of the median distance between places
 PARTS = (0.35, 0.35, 0.2)  # of the variance, at first: of these lengths, and of the noise
-SHARED = 0.1  # of the process's variance, at first
 SPANS = (1e-3, 3.0)  # bounds of a length, of that distance
 SCALES = 0.5  # deviation of the logarithm of an end's variances
 DEPARTS = 0.7  # deviation of the logarithm of each of an end's settings
 VARIANCES_DB2 = (1e-4, 1e4)
 FLAT = 1e-6  # a step that gains less, per row [nats], is the last
-LEFT = (-2.0, 0.5)  # bounds of the logarithm of what shared terms leave to the ends
 BAD = 1e12  # in place of a likelihood where no Cholesky factor exists
 
 
 def start(rows: Heard, law: SiteLaw, stations: int, seed: int) -> Prior:
-    """A prior to learn from: its lengths, variances, places and grid follow from the rows."""
+    """A prior to learn from, without shared terms: its lengths and variances follow from the rows."""
     places = np.unique(rows.moving, axis=0)
     drawn = np.random.default_rng(seed).permutation(len(places))
     few = torch.from_numpy(places[np.sort(drawn[:400])])
@@ -47,26 +43,22 @@ def start(rows: Heard, law: SiteLaw, stations: int, seed: int) -> Prior:
     for number in np.unique(station):  # levels aside
         values[station == number] -= values[station == number].mean()
     whole = max(float(values.square().mean()), 1e-2)
-    ends = torch.from_numpy(np.concatenate([rows.moving, rows.still]))
-    log = torch.tensor
     own = [math.log(max(share * middle, 1e-3)) for share in STARTS]
     own += [math.log(share * whole) for share in PARTS]
     return Prior(
         law,
         torch.tensor(own, dtype=torch.float64),
         torch.zeros(stations, OWN, dtype=torch.float64),
-        log(math.log(max(0.3 * middle, 1e-3)), dtype=torch.float64),
-        log(math.log(SHARED * whole), dtype=torch.float64),
-        log(math.log(SHARED * whole / 4), dtype=torch.float64),
-        torch.from_numpy(places[np.sort(drawn[:INDUCING])]),
-        grid(ends.amin(0), ends.amax(0), CELLS),
+        torch.zeros((), dtype=torch.float64),
+        torch.zeros((), dtype=torch.float64),
+        torch.zeros((), dtype=torch.float64),
+        torch.zeros(0, 3, dtype=torch.float64),
+        Blockers.none(),
     )
 
 
 def with_inducing(prior: Prior, rows: Heard, most: int, seed: int) -> Prior:
-    """The same with the shared process known at more places, spread over those of rows."""
-    if not len(prior.inducing):
-        return prior
+    """The same with the shared process known at so many places of rows, drawn evenly."""
     places = np.unique(rows.moving, axis=0)
     drawn = np.random.default_rng(seed).permutation(len(places))[:most]
     return replace(prior, inducing=torch.from_numpy(places[np.sort(drawn)]))
@@ -82,11 +74,11 @@ def learn_shared(
     ends = _ends(prior, rows)
     count = sum(len(end.values) for end in ends)
     by_end = torch.tensor([0.0] * LENGTHS + [1.0] * (OWN - LENGTHS), dtype=torch.float64)
-    first = {"own": prior.own, "scales": prior.departures[:, -1], **_of_site(prior)}
+    first = {"own": prior.own, "scales": prior.departures[:, -1]}
 
     def at(values: dict[str, Tensor]) -> Prior:
         scales = values["scales"][:, None] * by_end
-        return replace(prior, departures=scales, **{k: v for k, v in values.items() if k != "scales"})
+        return replace(prior, own=values["own"], departures=scales)
 
     def loss(values: dict[str, Tensor]) -> Tensor:
         price = 0.5 * (values["scales"] / SCALES).square().sum()
@@ -105,7 +97,10 @@ def learn_ends(prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget
 
         def loss(values: dict[str, Tensor], end: End = end, number: int = number) -> Tensor:
             apart = values["own"] - prior.own
-            now = replace(bare(prior), departures=departures.index_put((torch.tensor([number]),), apart))
+            now = replace(
+                prior.without(place=True, cloud=True),
+                departures=departures.index_put((torch.tensor([number]),), apart),
+            )
             price = 0.5 * (apart / DEPARTS).square().sum()
             return (left_out_loss(now, [end]) + price) / len(end.values)
 
@@ -113,25 +108,6 @@ def learn_ends(prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget
         best, _ = _walk(loss, first, {"own": list(zip(low, high, strict=True))}, looks, budget)
         departures[number] = best["own"] - prior.own
     return replace(prior, departures=departures)
-
-
-def learn_site(
-    prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget | None = None
-) -> tuple[Prior, float]:
-    """Settings of the shared terms, and how much they leave to all ends; the density per row [nats]."""
-    ends = _ends(prior, rows)
-    count = sum(len(end.values) for end in ends)
-    parts = slice(LENGTHS, OWN)
-    first = {"left": torch.zeros(OWN - LENGTHS, dtype=torch.float64), **_of_site(prior)}
-
-    def at(values: dict[str, Tensor]) -> Prior:
-        own = torch.cat([prior.own[:LENGTHS], prior.own[parts] + values["left"]])
-        return replace(prior, own=own, **{k: v for k, v in values.items() if k != "left"})
-
-    best, value = _walk(
-        lambda values: left_out_loss(at(values), ends) / count, first, _bounds(first, rows), looks, budget
-    )
-    return at(best), -value
 
 
 def _walk(
@@ -176,13 +152,6 @@ def _ends(prior: Prior, rows: Heard) -> list[End]:
     return [End.of(loud, number, prior) for number in loud.stations]
 
 
-def _of_site(prior: Prior) -> dict[str, Tensor]:
-    """Settings of the shared terms that there are."""
-    place = {"log_length": prior.log_length, "log_shared": prior.log_shared}
-    cloud = {"log_cloud": prior.log_cloud}
-    return (place if len(prior.inducing) else {}) | (cloud if len(prior.blockers) else {})
-
-
 def left_out_loss(prior: Prior, ends: list[End]) -> Tensor:
     """Negative log density () [nats] of all rows, each given all others, with autograd."""
     factored = [Factored.of(end, prior) for end in ends]
@@ -203,13 +172,7 @@ def _bounds(first: dict[str, Tensor], rows: Heard) -> dict[str, list[tuple[float
     variance = (math.log(VARIANCES_DB2[0]), math.log(VARIANCES_DB2[1]))
     found: dict[str, list[tuple[float, float]]] = {}
     for name, value in first.items():
-        one = {"log_length": length, "scales": (-2.0, 2.0), "left": LEFT}.get(name, variance)
-        found[name] = [one] * value.numel()
+        found[name] = [(-2.0, 2.0) if name == "scales" else variance] * value.numel()
     if "own" in found:
         found["own"][:LENGTHS] = [length] * LENGTHS
     return found
-
-
-def bare(prior: Prior) -> Prior:
-    """The prior without what the site shares beside its law."""
-    return replace(prior, inducing=prior.inducing[:0], blockers=Blockers.none())

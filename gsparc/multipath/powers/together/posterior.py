@@ -6,8 +6,7 @@ its columns, the weights' precision is I + sum V^T V (M. A. Woodbury, "Inverting
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from torch import Tensor
 from gsparc.methods.censored_ep import condition, propagate
 from gsparc.multipath.powers.together.prior import Prior, restored_prior
 from gsparc.multipath.powers.together.rows import Heard
-
 
 NEVER = -1  # in place of a station's number: one that was never heard
 
@@ -125,6 +123,7 @@ class Posterior:
         weights: by station, (n,) of the covariances with its rows.
         lower: (P, P) Cholesky factor of the precision of the shared weights.
         mean: (P,) of these.
+        whole: variance of what was measured, of all ends [dB^2].
     """
 
     prior: Prior
@@ -132,6 +131,7 @@ class Posterior:
     weights: dict[int, Tensor]
     lower: Tensor
     mean: Tensor
+    whole: float
     _factored: dict[int, Factored] = field(default_factory=dict, repr=False)
 
     @torch.no_grad()
@@ -152,14 +152,14 @@ class Posterior:
         own = terms.square().sum(1) + lacks + prior.variance(station if end is not None else NEVER)
         if end is None:
             left = own + self._weights_variance(columns)
-            return explained, left, (left / self._whole).clamp_max(1.0), explained
+            return explained, left, (left / self.whole).clamp_max(1.0), explained
         one = self._factor(station)
         cross = prior.process(station, moving, end.moving) + terms @ prior.law.terms(end.decades).T
         mean = explained + cross @ self.weights[station]
         white = torch.linalg.solve_triangular(one.lower, cross.T, upper=False)
         left = (own - white.square().sum(0)).clamp_min(0.0)
         left = left + self._weights_variance(columns - white.T @ one.whitened)
-        return mean, left, (left / self._whole).clamp_max(1.0), explained
+        return mean, left, (left / self.whole).clamp_max(1.0), explained
 
     @torch.no_grad()
     def mean_of(self, moving: Tensor, still: Tensor, station: int) -> Tensor:
@@ -171,7 +171,9 @@ class Posterior:
         if end is None:
             return mean
         cross = prior.process(station, moving, end.moving)
-        return mean + (cross + prior.law.terms(decades) @ prior.law.terms(end.decades).T) @ self.weights[station]
+        return (
+            mean + (cross + prior.law.terms(decades) @ prior.law.terms(end.decades).T) @ self.weights[station]
+        )
 
     @torch.no_grad()
     def left_out(self) -> dict[int, tuple[Tensor, Tensor]]:
@@ -183,14 +185,26 @@ class Posterior:
             found[number] = error[loud], variance[loud]
         return found
 
+    def shared_alone(self) -> Posterior:
+        """What it says of ends that were never heard, without the rows."""
+        return replace(self, ends={}, weights={}, _factored={})
+
     def state(self) -> dict[str, Any]:
         """Tensors that `restored_posterior` needs."""
         ends = {
-            str(number): {"moving": end.moving, "still": end.still[:1], "values": end.values, "extra": end.extra}
+            str(number): {
+                "moving": end.moving,
+                "still": end.still[:1],
+                "values": end.values,
+                "extra": end.extra,
+            }
             for number, end in self.ends.items()
         }
         weights = {str(number): value for number, value in self.weights.items()}
-        return {"prior": self.prior.state(), "ends": ends, "weights": weights, "lower": self.lower, "mean": self.mean}
+        return {
+            "prior": self.prior.state(), "ends": ends, "weights": weights, "lower": self.lower,
+            "mean": self.mean, "whole": self.whole,
+        }  # fmt: skip
 
     def _weights_variance(self, columns: Tensor) -> Tensor:
         return torch.linalg.solve_triangular(self.lower, columns.T, upper=False).square().sum(0)
@@ -199,12 +213,6 @@ class Posterior:
         if station not in self._factored:
             self._factored[station] = Factored.of(self.ends[station], self.prior)
         return self._factored[station]
-
-    @cached_property
-    def _whole(self) -> Tensor:
-        """Variance () of what was measured, of all ends [dB^2]."""
-        every = torch.cat([end.values + self.prior.law.mean(end.decades) for end in self.ends.values()])
-        return every.var(correction=0).clamp_min(float(self.prior.variance(NEVER)))
 
 
 def restored_posterior(state: dict[str, Any]) -> Posterior:
@@ -218,7 +226,7 @@ def restored_posterior(state: dict[str, Any]) -> Posterior:
         decades = prior.law.decades(moving, still)
         ends[int(name)] = End(int(name), moving, still, decades, shadows, part["values"], part["extra"])
     weights = {int(name): value for name, value in state["weights"].items()}
-    return Posterior(prior, ends, weights, state["lower"], state["mean"])
+    return Posterior(prior, ends, weights, state["lower"], state["mean"], float(state["whole"]))
 
 
 @torch.no_grad()
@@ -242,7 +250,9 @@ def given(rows: Heard, prior: Prior) -> tuple[Posterior, tuple[str, ...], list[n
         )[:, 0]
         for number, one in factored.items()
     }
-    return Posterior(prior, ends, weights, lower, mean, factored), tuple(notes), kept
+    loud = rows.decibels[~rows.silent] if not rows.silent.all() else rows.decibels
+    whole = max(float(loud.var()), float(prior.variance(NEVER)))
+    return Posterior(prior, ends, weights, lower, mean, whole, factored), tuple(notes), kept
 
 
 def _told(end: End, silent: np.ndarray, prior: Prior) -> tuple[End, np.ndarray]:
@@ -262,5 +272,12 @@ def _told(end: End, silent: np.ndarray, prior: Prior) -> tuple[End, np.ndarray]:
         sites = propagate(told.of(near), level[near])
         at = np.flatnonzero(silent)[near]
         values[at], extra[at] = unit * sites.value, unit**2 * sites.variance
-    parts = (end.moving, end.still, end.decades, end.shadows, torch.from_numpy(values), torch.from_numpy(extra))
+    parts = (
+        end.moving,
+        end.still,
+        end.decades,
+        end.shadows,
+        torch.from_numpy(values),
+        torch.from_numpy(extra),
+    )
     return End(end.station, *(part[used] for part in parts)), used

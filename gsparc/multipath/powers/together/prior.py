@@ -33,7 +33,7 @@ class Prior:
 
     Attributes:
         law: of distance.
-        own: (OWN,) of an end that was never heard: logarithms of its process's lengths [m], of the variances of
+        own: (OWN,) of an end never heard: logarithms of its process's lengths [m], of the variances of
             its parts, and of the noise's.
         departures: (T, OWN) of each end from these.
         log_length, log_shared: () length [m] and variance of g.
@@ -87,7 +87,7 @@ class Prior:
         return self.settings_of(station)[LENGTHS:].exp().sum()
 
     def shared(self, moving: Tensor, shadows: Tensor) -> tuple[Tensor, Tensor]:
-        """Columns (n, P) of the shared terms for unit normal weights, and the variance (n,) that g lacks there.
+        """Columns (n, P) of the shared terms for unit normal weights, and what g lacks there (n,) [dB^2].
 
         Args:
             moving: (n, 3) [m].
