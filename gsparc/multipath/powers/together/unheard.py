@@ -25,7 +25,8 @@ LEAST_ENDS = 3
 ROWS = 4_800  # of all stations
 MOST_EACH = 400
 PLACES = 400  # that the shared process is known at
-CELLS = 600  # Gaussians of the grid
+CELLS = (16, 600)  # Gaussians of the grid, fewest and most
+ROWS_A_CELL = 8
 LENGTHS = (0.7, 2.0)  # of the shared process, of an end's shorter one
 PLACE, CLOUD = (0.0, 0.03, 0.1, 0.2), (0.0, 0.002, 0.006, 0.02, 0.06)  # variances, of an end's own
 WIDEST = 4.0  # factor that variances are corrected by at most
@@ -66,9 +67,10 @@ def for_unheard(
     few = thinned(loud, min(MOST_EACH, max(ROWS // count, 1)), seed)
     ends = torch.from_numpy(np.concatenate([few.moving, few.still]))
     one = torch.zeros((), dtype=torch.float64)
+    cells = min(max(len(few.rows) // ROWS_A_CELL, CELLS[0]), CELLS[1])
     full = replace(
         with_inducing(prior, few, PLACES, seed), log_cloud=one, log_shared=one,
-        blockers=grid(ends.amin(0), ends.amax(0), CELLS),
+        blockers=grid(ends.amin(0), ends.amax(0), cells),
     )  # fmt: skip
     whole = float(prior.variance(NEVER))
     best: tuple[float, Prior, np.ndarray, float] | None = None
