@@ -36,8 +36,8 @@ LEARNED_ON = 6_000  # rows of all stations, for settings that all have alike
 LEARNED_EACH = 500
 ENDS_FROM = 400  # rows that a station needs for settings of its own
 ENDS_ON = 700
-PLACES = 1_000  # that the shared process is known at in the end
-UNHEARD_EACH = 1_500  # rows of each station, for what is said of others
+PLACES = 600  # that the shared process is known at in the end
+UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 COMPARED_EACH = 400  # the same, for asking whether shared terms pay where stations were heard
 FOLDS = 5
 

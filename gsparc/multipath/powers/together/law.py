@@ -36,6 +36,7 @@ class SiteLaw:
         middle: decades of distance that levels are at.
         levels_db: standard deviation of ends' levels [dB].
         exponents: that of their exponents.
+        nearest, farthest: decades of what was heard, of the middle; beyond, the law bends no more.
     """
 
     level: float
@@ -44,6 +45,8 @@ class SiteLaw:
     middle: float
     levels_db: float
     exponents: float
+    nearest: float = -1.0
+    farthest: float = 1.0
 
     def decades(self, moving: Tensor, still: Tensor) -> Tensor:
         """log10 of the floored distance over that of the middle, (n,) between ends (n, 3) [m]."""
@@ -53,6 +56,11 @@ class SiteLaw:
     def mean(self, decades: Tensor) -> Tensor:
         """Powers (n,) [dB] of an end that nobody heard."""
         return self.level - 10 * self.exponent * decades
+
+    def bend(self, decades: Tensor) -> Tensor:
+        """(n,) what a second slope adds in first order: squared decades; straight beyond the rows."""
+        inside = decades.clamp(self.nearest, self.farthest)
+        return inside.square() + 2 * inside * (decades - inside)
 
     def terms(self, decades: Tensor) -> Tensor:
         """(n, 2) [dB]: an end's departures in level and exponent, for unit normal weights."""
@@ -93,9 +101,10 @@ def fit_site_law(rows: Heard) -> SiteLaw:
     levels = np.array([line[0] - 10 * line[1] * middle for line in lines])
     level = float(np.median(levels)) if len(levels) > 2 else float(levels.mean())
     between = np.maximum((slopes - exponent) ** 2 - 1 / told, 0.0)
+    every = np.concatenate(decades) - middle
     return SiteLaw(
-        level, exponent, floor, middle,
-        _spread((levels - level) ** 2, LEVELS_DB), _spread(between, EXPONENTS),
+        level, exponent, floor, middle, _spread((levels - level) ** 2, LEVELS_DB),
+        _spread(between, EXPONENTS), float(every.min()), float(every.max()),
     )  # fmt: skip
 
 

@@ -98,7 +98,7 @@ def learn_ends(prior: Prior, rows: Heard, looks: int = LOOKS, budget: TimeBudget
         def loss(values: dict[str, Tensor], end: End = end, number: int = number) -> Tensor:
             apart = values["own"] - prior.own
             now = replace(
-                prior.without(place=True, cloud=True),
+                prior.without(),
                 departures=departures.index_put((torch.tensor([number]),), apart),
             )
             price = 0.5 * (apart / DEPARTS).square().sum()

@@ -79,7 +79,7 @@ class Factored:
         Raises:
             torch.linalg.LinAlgError: the covariance is not positive definite.
         """
-        columns, lacks = prior.shared(end.moving, end.shadows)
+        columns, lacks = prior.shared(end.moving, end.decades, end.shadows)
         lower = torch.linalg.cholesky(end.gram(prior, lacks))
         both = torch.linalg.solve_triangular(lower, torch.cat([columns, end.values[:, None]], 1), upper=False)
         return cls(lower, both[:, :-1], both[:, -1])
@@ -146,7 +146,7 @@ class Posterior:
         """
         prior = self.prior
         decades = prior.law.decades(moving, still)
-        columns, lacks = prior.shared(moving, prior.shadows(moving, still))
+        columns, lacks = prior.shared(moving, decades, prior.shadows(moving, still))
         explained, end = prior.law.mean(decades) + columns @ self.mean, self.ends.get(station)
         terms = prior.law.terms(decades)
         own = terms.square().sum(1) + lacks + prior.variance(station if end is not None else NEVER)
@@ -166,7 +166,7 @@ class Posterior:
         """The mean alone (B,) [dB], without factorising anything."""
         prior = self.prior
         decades = prior.law.decades(moving, still)
-        columns, _ = prior.shared(moving, prior.shadows(moving, still))
+        columns, _ = prior.shared(moving, decades, prior.shadows(moving, still))
         mean, end = prior.law.mean(decades) + columns @ self.mean, self.ends.get(station)
         if end is None:
             return mean
@@ -260,7 +260,7 @@ def _told(end: End, silent: np.ndarray, prior: Prior) -> tuple[End, np.ndarray]:
 
     They follow from its own rows, with the shared terms as the prior has them.
     """
-    columns, lacks = prior.shared(end.moving, end.shadows)
+    columns, lacks = prior.shared(end.moving, end.decades, end.shadows)
     gram = (end.gram(prior, lacks) + columns @ columns.T).numpy()
     values = end.values.numpy().copy()
     extra = np.zeros(len(values))

@@ -40,6 +40,7 @@ class Prior:
         log_cloud: () variance of what one Gaussian takes straight through it.
         inducing: (M, 3) places that g is known at [m]; M = 0: there is no g.
         blockers: of the grid; none: nothing stands in the way. Their strengths are not read.
+        bend_db: deviation of what a bend of the law takes a decade from the middle [dB]; 0: it is straight.
     """
 
     law: SiteLaw
@@ -50,20 +51,25 @@ class Prior:
     log_cloud: Tensor
     inducing: Tensor
     blockers: Blockers
+    bend_db: float = 0.0
 
     @property
     def columns(self) -> int:
         """Of what the site shares."""
-        return len(self.inducing) + len(self.blockers)
+        return len(self.inducing) + len(self.blockers) + (self.bend_db > 0)
 
     def settings(self) -> dict[str, Tensor]:
         """Those that are learned."""
         return {name: getattr(self, name) for name in NAMES}
 
-    def without(self, place: bool, cloud: bool) -> Prior:
+    def without(self, place: bool = True, cloud: bool = True, bend: bool = True) -> Prior:
         """The same less shared terms."""
-        inducing = self.inducing[:0] if place else self.inducing
-        return replace(self, inducing=inducing, blockers=Blockers.none() if cloud else self.blockers)
+        return replace(
+            self,
+            inducing=self.inducing[:0] if place else self.inducing,
+            blockers=Blockers.none() if cloud else self.blockers,
+            bend_db=0.0 if bend else self.bend_db,
+        )
 
     def settings_of(self, station: int) -> Tensor:
         """(OWN,) of one end; negative: of one that was never heard."""
@@ -86,14 +92,17 @@ class Prior:
         """Variance () of an end's own process and noise."""
         return self.settings_of(station)[LENGTHS:].exp().sum()
 
-    def shared(self, moving: Tensor, shadows: Tensor) -> tuple[Tensor, Tensor]:
+    def shared(self, moving: Tensor, decades: Tensor, shadows: Tensor) -> tuple[Tensor, Tensor]:
         """Columns (n, P) of the shared terms for unit normal weights, and what g lacks there (n,) [dB^2].
 
         Args:
             moving: (n, 3) [m].
+            decades: (n,) see `SiteLaw`.
             shadows: (n, N) of the grid's Gaussians, see `shadows`.
         """
         columns = self.log_cloud.mul(0.5).exp() * shadows
+        if self.bend_db:
+            columns = torch.cat([columns, self.bend_db * self.law.bend(decades)[:, None]], 1)
         if not len(self.inducing):
             return columns, torch.zeros_like(moving[:, 0])
         among = self._place(self.inducing, self.inducing) + JITTER * torch.eye(len(self.inducing)).to(moving)
@@ -118,14 +127,26 @@ class Prior:
         """Tensors and numbers that `restored_prior` needs."""
         law = [*vars(self.law).values()]
         blockers = {name: part for name, part in vars(self.blockers).items()}
-        return {**self.settings(), "inducing": self.inducing, "law": law, "blockers": blockers}
+        return {
+            **self.settings(),
+            "inducing": self.inducing,
+            "law": law,
+            "blockers": blockers,
+            "bend_db": self.bend_db,
+        }
 
 
 def restored_prior(state: Mapping[str, Any]) -> Prior:
     """The prior whose `state()` this was."""
     law = SiteLaw(*(float(value) for value in state["law"]))
     blockers = Blockers(**state["blockers"])
-    return Prior(law, **{name: state[name] for name in NAMES}, inducing=state["inducing"], blockers=blockers)
+    return Prior(
+        law,
+        **{name: state[name] for name in NAMES},
+        inducing=state["inducing"],
+        blockers=blockers,
+        bend_db=float(state["bend_db"]),
+    )
 
 
 def matern(distance: Tensor, log_length: Tensor) -> Tensor:

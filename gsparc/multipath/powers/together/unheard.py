@@ -22,13 +22,15 @@ from gsparc.multipath.powers.together.prior import Prior, grid
 from gsparc.multipath.powers.together.rows import Heard, thinned
 
 LEAST_ENDS = 3
-ROWS = 4_800  # of all stations
-MOST_EACH = 400
-PLACES = 400  # that the shared process is known at
+ROWS = 3_600  # of all stations
+MOST_EACH = 300
+PLACES = 300  # that the shared process is known at
 CELLS = (16, 600)  # Gaussians of the grid, fewest and most
 ROWS_A_CELL = 8
 LENGTHS = (0.7, 2.0)  # of the shared process, of an end's shorter one
-PLACE, CLOUD = (0.0, 0.03, 0.1, 0.2), (0.0, 0.002, 0.006, 0.02, 0.06)  # variances, of an end's own
+PLACE, CLOUD = (0.0, 0.03, 0.1, 0.2), (0.0, 0.006, 0.02, 0.06)  # variances, of an end's own
+USUAL = (0.1, 0.02)  # of these, while the law's bend is tried
+BEND_DB = 7.0  # a decade from the middle
 WIDEST = 4.0  # factor that variances are corrected by at most
 TINY = 1e-12
 
@@ -70,31 +72,32 @@ def for_unheard(
     cells = min(max(len(few.rows) // ROWS_A_CELL, CELLS[0]), CELLS[1])
     full = replace(
         with_inducing(prior, few, PLACES, seed), log_cloud=one, log_shared=one,
-        blockers=grid(ends.amin(0), ends.amax(0), cells),
+        blockers=grid(ends.amin(0), ends.amax(0), cells), bend_db=1.0,
     )  # fmt: skip
     whole = float(prior.variance(NEVER))
+    bend, none = 0.0, np.zeros(0)
     best: tuple[float, Prior, np.ndarray, float] | None = None
-    none: np.ndarray | None = None
     for share in LENGTHS:
         if best is not None and budget is not None and budget.over():
             break
-        now = replace(full, log_length=prior.own[0] + math.log(share))
-        views = _views(few, now)
+        views = _views(few, now := replace(full, log_length=prior.own[0] + math.log(share)))
+        if best is None:
+            none, _ = _left_out(views, _with(now, 0.0, 0.0, 0.0))
+            usual = [_left_out(views, _with(now, *(v * whole for v in USUAL), b))[0] for b in (0.0, BEND_DB)]
+            bend = BEND_DB if (usual[1] ** 2).mean() < (usual[0] ** 2).mean() else 0.0
         for place, cloud in ((p, c) for p in PLACE for c in CLOUD):
-            if none is not None and not place and (not cloud or share != LENGTHS[0]):
+            if best is not None and not place and share != LENGTHS[0]:
                 continue  # without the shared process its length means nothing
-            strong = _with(now, place * whole, cloud * whole)
+            strong = _with(now, place * whole, cloud * whole, bend)
             errors, ratio = _left_out(views, strong)
-            if none is None:
-                none = errors
             value = float((errors**2).mean())
             if best is None or value < best[0]:
                 best = value, strong, errors, ratio
-    assert best is not None and none is not None
+    assert best is not None
     gain = compared(best[2] ** 2, none**2, few.station)
     if gain.exceeds(sure):
         return Unheard(best[1], _clipped(best[3]), gain)
-    bare = prior.without(place=True, cloud=True)
+    bare = prior.without()
     return Unheard(bare, _clipped(_left_out(_views(few, bare), bare)[1]), gain)
 
 
@@ -115,16 +118,16 @@ def _views(rows: Heard, prior: Prior) -> list[_View]:
         for number in rows.stations:
             end = End.of(rows, number, prior)
             one = Factored.of(end, prior)
-            columns, _ = prior.shared(end.moving, end.shadows)
+            columns, _ = prior.shared(end.moving, end.decades, end.shadows)
             own = prior.law.terms(end.decades).square().sum(1) + prior.variance(NEVER)
             gram, right = one.whitened.T @ one.whitened, one.whitened.T @ one.values
             found.append(_View(end, own, columns, gram, right))
     return found
 
 
-def _with(prior: Prior, place: float, cloud: float) -> Prior:
-    """The prior with shared terms of such variances [dB^2]; those of none are left out."""
-    strong = prior.without(place=not place, cloud=not cloud)
+def _with(prior: Prior, place: float, cloud: float, bend: float) -> Prior:
+    """The prior with shared terms of such variances [dB^2] and bend [dB]; those of none are left out."""
+    strong = replace(prior.without(place=not place, cloud=not cloud), bend_db=bend)
     log = torch.tensor([math.log(max(place, TINY)), math.log(max(cloud, TINY))], dtype=torch.float64)
     return replace(strong, log_shared=log[0], log_cloud=log[1])
 
@@ -135,13 +138,15 @@ def _left_out(views: list[_View], prior: Prior) -> tuple[np.ndarray, float]:
     Returns:
         The errors, and the mean square of errors without that constant over their predicted variances.
     """
-    count = views[0].columns.shape[1]
-    place = count - len(views[0].end.shadows[0])
-    strength = torch.zeros(count, dtype=torch.float64)
+    width, cells = views[0].columns.shape[1], views[0].end.shadows.shape[1]
+    place = max(width - cells - 1, 0)
+    strength = torch.zeros(width, dtype=torch.float64)
     if len(prior.inducing):
         strength[:place] = prior.log_shared.mul(0.5).exp()
     if len(prior.blockers):
-        strength[place:] = prior.log_cloud.mul(0.5).exp()
+        strength[place : place + cells] = prior.log_cloud.mul(0.5).exp()
+    if prior.bend_db:
+        strength[-1] = prior.bend_db
     used = strength > 0
     scale = strength[used]
     every = sum((view.gram for view in views), torch.zeros_like(views[0].gram))

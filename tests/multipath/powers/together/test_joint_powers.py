@@ -63,7 +63,7 @@ def prior_of(data: Measurements) -> Prior:
     departures[1] = 0.3
     own = torch.tensor([4.0, 20.0, 5.0, 9.0, 1.5]).double().log()
     one = torch.tensor(2.0).double().log()
-    return Prior(law, own, departures, one * 3, one * 2, one, places, grid(low, high, 16))
+    return Prior(law, own, departures, one * 3, one * 2, one, places, grid(low, high, 16), 3.0)
 
 
 def rows_of(data: Measurements, rows: np.ndarray | None = None):
@@ -75,7 +75,7 @@ def dense(rows, prior: Prior) -> tuple[np.ndarray, np.ndarray]:
     """Covariance (n, n) of rows with noise, and values (n,) less the law, by what the prior says of pairs."""
     moving, still = torch.from_numpy(rows.moving), torch.from_numpy(rows.still)
     decades = prior.law.decades(moving, still)
-    columns, lacks = prior.shared(moving, prior.shadows(moving, still))
+    columns, lacks = prior.shared(moving, decades, prior.shadows(moving, still))
     total = columns @ columns.T + torch.diag(lacks)
     for number in rows.stations:
         own = np.flatnonzero(rows.station == number)
@@ -157,7 +157,7 @@ def test_what_all_hear_alike_is_found(learned):
     error = db(field(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
     found = field(batch.tx, batch.rx, batch.station)
     assert np.mean(np.abs(error) < 1.645 * spread_db(found)) > 0.8
-    bare = JointPowerField(data.site, field.places, field.heard.without(True, True), field.heard)
+    bare = JointPowerField(data.site, field.places, field.heard.without(), field.heard)
     bare.condition(data, fold.train)
     plain = db(bare(batch.tx, batch.rx, batch.station).mean) - db(batch.target)
     assert np.mean(error**2) < 1.02 * np.mean(plain**2), notes
