@@ -10,11 +10,13 @@ import pytest
 import torch
 from releases import real
 
+import gsparc
 from gsparc.data.modules.ble import BLE
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.field.initial import InitSettings
+from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext
 from gsparc.methods.per_station import for_links
 from gsparc.methods.registry import method_class
@@ -262,9 +264,16 @@ def test_gsparc_learns_stations_together(tmp_path):
     batch = data.batch(fold.test)
     said = method.answer(batch)
     assert torch.allclose(said.mean, method.predict(batch.tx, batch.rx).mean, rtol=1e-4)
-    twin = for_links(Gsparc, data)
-    twin.restore(data.site, method.state())
+    checkpoint.save(tmp_path / "m.ckpt", method)
+    twin, _ = checkpoint.load(tmp_path / "m.ckpt")
     assert torch.allclose(said.mean, twin.answer(batch).mean, rtol=1e-5)
+    predictor = gsparc.load(tmp_path / "m.ckpt")
+    place, number = data.tx[fold.test[0]] + data.site.origin, int(data.station[fold.test[0]])
+    post = POSTS[number]
+    one = predictor.at(number).rssi(tx=place)
+    assert np.allclose(one, said.mean[0].numpy() * data.site.target_scale, rtol=1e-3)
+    assert np.allclose(one, predictor.rssi(tx=place, rx=post), rtol=1e-3)
+    assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()  # no station
 
 
 def test_stations_at_one_place_are_told_apart_by_their_numbers():
