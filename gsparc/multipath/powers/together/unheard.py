@@ -94,7 +94,7 @@ def for_unheard(
             if best is None or value < best[0]:
                 best = value, strong, errors, ratio
     assert best is not None
-    gain = compared(best[2] ** 2, none**2, few.station)
+    gain = compared(best[2] ** 2, none**2, np.sort(few.station))  # errors come station by station
     if gain.exceeds(sure):
         return Unheard(best[1], _clipped(best[3]), gain)
     bare = prior.without()

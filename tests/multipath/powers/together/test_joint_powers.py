@@ -27,6 +27,7 @@ from gsparc.multipath.powers.together.learning import learn_shared, left_out_los
 from gsparc.multipath.powers.together.posterior import End, given
 from gsparc.multipath.powers.together.prior import Prior, grid
 from gsparc.multipath.powers.together.rows import heard_rows, places_of, thinned
+from gsparc.multipath.powers.together.unheard import for_unheard
 from gsparc.ops import Pose
 from gsparc.training.gsparc import Gsparc
 from gsparc.training.terms import EffectSettings, plan
@@ -304,3 +305,13 @@ def test_halls_gain_over_a_process_of_each_sensor():
         batch = data.batch(fold.test)
         errors.append(np.mean((db(method.answer(batch).mean) - db(batch.target)) ** 2))
     assert errors[0] < errors[1], errors
+
+
+def test_the_error_of_a_gain_is_that_of_stations():
+    every = rows_of(town())
+    prior, _ = learn_shared(start(every, fit_site_law(every), 6, 0), every)
+    turned = every.at(np.argsort(every.station, kind="stable"))
+    one, other = (for_unheard(rows, prior, 1.0, 0).gain for rows in (every, turned))
+    assert one is not None and other is not None
+    assert np.isclose(one.squares, other.squares, rtol=0.3) and np.isclose(one.error, other.error, rtol=0.5)
+    assert one.error > 0.05 * one.squares
