@@ -112,7 +112,7 @@ class PerStation(Method):
         if together:
             numbers = [UNHEARD]
         elif unheard.any():
-            if not self.wrapped.both_ends:
+            if not self.wrapped.both_ends and not joint:
                 names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
@@ -255,7 +255,7 @@ def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
     assert site is not None
     if not rx.batched:
         return rx
-    if site.static_end == "rx":
+    if site.static_end == "rx" and site.stations is None:
         return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
     return Pose(rx.position[chosen], rx.rotation[chosen])
 
@@ -265,4 +265,6 @@ def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
         name: value if value is None or name in ("rx", "station") else value[chosen]
         for name, value in vars(batch).items()
     }
-    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": None})
+    known = batch.station is not None and site is not None and site.stations is not None
+    station = batch.station[chosen] if known else None
+    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": station})

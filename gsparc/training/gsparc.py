@@ -345,8 +345,9 @@ class Gsparc(LearnedField):
     # -- answering ---------------------------------------------------------------------------------
 
     def shares(self, site: Site) -> bool:
-        """Channels of a known carrier: see `gsparc.multipath.waves`."""
-        return site.kind == "csi" and site.wavelength is not None and site.static_end is not None
+        """Received powers, and channels of a known carrier."""
+        waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
+        return waves or site.kind == "rssi"
 
     @torch.no_grad()
     def answer(self, batch: Batch) -> Prediction:
