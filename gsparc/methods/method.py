@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, runtime_chec
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.schema import Batch, Kind, Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
 from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget
 from gsparc.ops import Pose

@@ -102,8 +102,9 @@ class PerStation(Method):
         """
         assert data.station is not None and data.site.stations is not None
         together = context.stations == "together"
-        self._shared = together and self.wrapped.shares(data.site)
-        if together and not (self._shared or self.wrapped.both_ends):
+        joint = self.wrapped.shares(data.site)
+        self._shared = together and joint
+        if together and not (joint or self.wrapped.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
         self._shape = tuple(data.target.shape[1:])
@@ -165,7 +166,8 @@ class PerStation(Method):
         return OfStation(copy, number) if self._shared else copy
 
     def _site_of(self, site: Site, number: int) -> Site:
-        return site if self._shared else of_station(site, number)
+        """The site as a copy sees it: whole, where one learns several stations as such."""
+        return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
 
     def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
@@ -266,5 +268,5 @@ def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
         for name, value in vars(batch).items()
     }
     known = batch.station is not None and site is not None and site.stations is not None
-    station = batch.station[chosen] if known else None
+    station = batch.station[chosen] if known and batch.station is not None else None
     return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": station})

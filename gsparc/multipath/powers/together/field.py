@@ -146,7 +146,8 @@ class JointPowerField(ConditionalField):
         moving, still, number = self._asked(batch.tx, batch.rx, batch.station)
         decibels = 10 * batch.target.flatten(1)[:, 0].double().clamp_min(TINY_POWER).log10()
         order = torch.nonzero(used)[:, 0].numpy()
-        rows = Heard(*(v.numpy()[order] for v in (moving, still, number, decibels, ~used)), order)
+        ends = moving.numpy()[order], still.numpy()[order], number.numpy()[order]
+        rows = Heard(*ends, decibels.numpy()[order], ~used.numpy()[order], order)
         posterior, _, kept = given(rows, self.heard)
         for own, (error, variance) in zip(kept, posterior.left_out().values(), strict=True):
             density = 0.5 * (error.square() / variance + variance.log() + math.log(2 * math.pi))

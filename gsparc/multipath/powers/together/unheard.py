@@ -83,7 +83,8 @@ def for_unheard(
         views = _views(few, now := replace(full, log_length=prior.own[0] + math.log(share)))
         if best is None:
             none, _ = _left_out(views, _with(now, 0.0, 0.0, 0.0))
-            usual = [_left_out(views, _with(now, *(v * whole for v in USUAL), b))[0] for b in (0.0, BEND_DB)]
+            place, cloud = (strength * whole for strength in USUAL)
+            usual = [_left_out(views, _with(now, place, cloud, b))[0] for b in (0.0, BEND_DB)]
             bend = BEND_DB if (usual[1] ** 2).mean() < (usual[0] ** 2).mean() else 0.0
         for place, cloud in ((p, c) for p in PLACE for c in CLOUD):
             if best is not None and not place and share != LENGTHS[0]:
