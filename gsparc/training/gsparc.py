@@ -27,7 +27,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
-from gsparc.methods.registry import field_initialiser, field_restored, method_class
+from gsparc.methods.registry import field_initialiser, method_class
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
 from gsparc.ops import Pose
 from gsparc.training import weighing
@@ -38,6 +38,7 @@ from gsparc.training.fit import run_stage, total_steps
 from gsparc.training.keep_best import SHORT, KeepBest
 from gsparc.training.lightning_module import GaussianModule
 from gsparc.training.splatting import QUERY_CHUNK, LearnedField
+from gsparc.training.stored_field import as_today, restored, stored
 from gsparc.training.terms import EffectSettings, Plan, plan
 from gsparc.training.time_budget import Pace
 
@@ -448,7 +449,7 @@ class Gsparc(LearnedField):
             beside = {"name": method.name, "state": method.state(), "weight": weight}
         return {
             "inner": super().state() if self.field is None else None,
-            "field": None if self.field is None else _stored(self.field),
+            "field": None if self.field is None else stored(self.field),
             "beside": beside,
             "facts": {"explained": self.explained, "steps": self.steps},
             "init": self.started,
@@ -461,7 +462,7 @@ class Gsparc(LearnedField):
         Raises:
             ValueError: an earlier version's, in which another method had been chosen.
         """
-        state = _as_today(state)
+        state = as_today(state)
         self.site, self.field, self._beside, self._lean = site, None, None, None
         response = replace(
             self.settings.response, array=bool(state.get("array", self.switches.array is True))
@@ -505,53 +506,6 @@ class Summed(View):
         """See `Method.predict`."""
         found = self.inner.predict(tx, rx)
         return replace(found, mean=found.mean + self.weight * self.residual(tx, rx).mean)
-
-
-def _as_today(state: dict[str, Any]) -> dict[str, Any]:
-    """A state of today's keys, of one from when `model=gsparc` chose among other methods.
-
-    Raises:
-        ValueError: it had chosen what is no longer there.
-    """
-    if "chosen" not in state:
-        return state
-    chosen = {"bearings": "moving_array"}.get(state["chosen"], state["chosen"])
-    if chosen == "array":
-        raise ValueError("it is made of wave packets, as earlier versions were; train it again")
-    if state.get("rest") is not None:
-        raise ValueError("it has a companion of an earlier version; train it again")
-    if chosen is None:
-        stored = state["inner"]["model"]
-        if "response.steering" in stored and "response.delays" not in stored:
-            raise ValueError("its carrier phase is of splatted Gaussians, as in earlier versions; train anew")
-        return {"inner": state["inner"], "init": state["inner"]["choices"]["init"]}
-    kind = {"phase": "sources", "directions": "rays", "moving_array": "bearings"}[chosen]
-    return {"inner": None, "field": {"kind": kind, "method": state["inner"]}, "init": kind}
-
-
-def _stored(field: ConditionalField) -> dict[str, Any]:
-    """What `restored` reads."""
-    if isinstance(field, StackedField):
-        return {"members": [_stored(member) for member in field.members], "weights": list(field.weights)}  # type: ignore[arg-type]
-    if isinstance(field, CompletedField):
-        parts = {"field": _stored(field.field), "residual": _stored(field.residual)}
-        return {**parts, "weight": field.weight}
-    return {"kind": field.kind, **field.state()}
-
-
-def restored(site: Site, state: dict[str, Any]) -> ConditionalField:
-    """The field whose `state()` this was."""
-    if "members" in state:
-        found: ConditionalField = StackedField(
-            [restored(site, m) for m in state["members"]], state["weights"]
-        )
-    elif "residual" in state:
-        field, residual = restored(site, state["field"]), restored(site, state["residual"])
-        found = CompletedField(field, residual, float(state["weight"]))
-    else:
-        found = field_restored(str(state["kind"]))(site, state)
-    found.site = site
-    return found
 
 
 def _say_cost(stages: dict[str, float], seconds: float) -> None:
