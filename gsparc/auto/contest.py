@@ -67,7 +67,11 @@ class Contest:
             attempt(trial, make, self.way, replace(self.context, budget_s=seconds))
             trial.seconds.append(self.budget.spent - began)
             trial.over_s = max(trial.over_s, trial.seconds[-1] - (seconds or 0.0))
-            trial.stopped = trial.refusal is None and len(trial.residual) == 1 and self._hopeless(trial)
+            first = trial.refusal is None and len(trial.residual) == 1
+            trial.stopped = first and self._hopeless(trial)
+            if first and waiting == 1 and folds > 1 and self._settled(trial):
+                log.info("auto: %s: clearly better than all others, tried no further", trial.name)
+                break
         self._say(trial)
 
     def _seconds(self, trial: Trial, rest: float, folds: int) -> float:
@@ -104,8 +108,17 @@ class Contest:
         best = self._best(other=trial)
         if best is None or len(self.way.asked) == 1:
             return False
+        return self._behind(trial, best)
+
+    def _settled(self, trial: Trial) -> bool:
+        """Whether all others are hopeless beside it: its fit to all rows has the seconds of more folds."""
+        others = [one for one in self.trials if one.usable and one is not trial]
+        return bool(others) and trial.usable and all(self._behind(one, trial) for one in others)
+
+    def _behind(self, trial: Trial, best: Trial) -> bool:
         gram = self._squares([trial, best])
-        return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], self.way.units(1))
+        units = self.way.units(min(len(trial.residual), len(best.residual)))
+        return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], units)
 
     def _say(self, trial: Trial) -> None:
         """One line of what was found."""

@@ -133,6 +133,21 @@ def test_a_hopeless_candidate_is_given_up_after_one_fold(tmp_path):
     assert max(rows for rows, _ in good.fits[:-1]) < good.fits[-1][0]
 
 
+def test_a_clear_winner_has_the_seconds_of_further_folds(tmp_path, monkeypatch, caplog):
+    clock = wound(monkeypatch).monotonic
+
+    class Timed(Shared):
+        def fit(self, data, fold, context):
+            clock.wind(context.budget_s)
+            return super().fit(data, fold, context)
+
+    slow, quick = Timed("slow", 1.0, 0, 1.0), Shared("quick", 15.0, 1)
+    with caplog.at_level("INFO", logger="gsparc.auto"):
+        fitted(Auto([slow, quick], budget_s=60.0), street(150), tmp_path)
+    assert len(slow.fits) == 2 and slow.fits[1][1] > 2 * slow.fits[0][1]
+    assert "slow: clearly better than all others" in caplog.text
+
+
 def test_what_ignores_its_seconds_is_kept_as_its_trial_left_it(tmp_path, monkeypatch):
     clock = wound(monkeypatch).monotonic
 
@@ -178,7 +193,7 @@ def test_a_candidate_that_ignores_its_seconds_is_compared_on_what_it_came_to(tmp
             clock.wind(14.0)
             return super().fit(data, fold, context)
 
-    endless, quick = Endless("endless", 1.0, 0, 1.0), Shared("quick", 4.0, 1)
+    endless, quick = Endless("endless", 1.0, 0, 1.0), Shared("quick", 1.3, 1)
     method = Auto([endless, quick], budget_s=45.0)
     before = clock.now
     _, report = fitted(method, street(150), tmp_path)
