@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.field.site_objects import SiteObjects
 from gsparc.ops import Pose
 
 
@@ -102,6 +103,10 @@ class ConditionalField(nn.Module, ABC):
         found: Posterior = self(batch.tx, batch.rx)
         return found
 
+    def objects(self) -> SiteObjects:
+        """What it found to stand in the site."""
+        return SiteObjects.of()
+
     @abstractmethod
     def left_out(self) -> LeftOutRows:
         """The rows it was conditioned on, each predicted from the others."""
@@ -138,6 +143,11 @@ class StackedField(ConditionalField):
     def heaviest(self) -> ConditionalField:
         """The member of largest weight."""
         return self._fields()[int(np.argmax(self.weights))]
+
+    def objects(self) -> SiteObjects:
+        """Those of the heaviest member that found any."""
+        found = [self._fields()[i].objects() for i in np.argsort(self.weights)[::-1]]
+        return next((one for one in found if len(one)), found[0])
 
     def _fields(self) -> list[ConditionalField]:
         return list(self.members)  # type: ignore[arg-type]
@@ -202,6 +212,10 @@ class CompletedField(ConditionalField):
     def terms(self) -> tuple[str, ...]:
         """The field's, and the residual."""
         return (*self.field.terms, "residual")
+
+    def objects(self) -> SiteObjects:
+        """The field's."""
+        return self.field.objects()
 
     def loss(self, batch: Batch) -> Tensor:
         """The field's; the residual's settings follow from its likelihood."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.censored import heard
 from gsparc.methods.label import common_label
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
@@ -212,6 +214,12 @@ class PerStation(Method):
         for number, part in state["per_station"].items():
             self._copies[int(number)] = copy = self._make()
             copy.restore(self._site_of(site, int(number)), part)
+
+    def objects(self) -> SiteObjects:
+        """Those of all copies: what stands in a site stands there for all its stations."""
+        return reduce(
+            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.of()
+        )
 
     def size(self) -> int:
         """That of all copies."""

@@ -24,6 +24,7 @@ from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
 from gsparc.field.initial import InitSettings
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
@@ -344,6 +345,10 @@ class Gsparc(LearnedField):
         return total_steps(context) if self.most_steps is None else self.most_steps
 
     # -- answering ---------------------------------------------------------------------------------
+
+    def objects(self) -> SiteObjects:
+        """Those of the field with closed-form weights."""
+        return SiteObjects.of() if self.field is None else self.field.objects()
 
     def shares(self, site: Site) -> bool:
         """Received powers, and channels of a known carrier."""

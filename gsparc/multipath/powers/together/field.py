@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.per_station import SAME_PLACE_M
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real
 from gsparc.methods.time_budget import TimeBudget
@@ -84,6 +85,17 @@ class JointPowerField(ConditionalField):
     def terms(self) -> tuple[str, ...]:
         """`power` always: its law is of the site."""
         return ("power", "residual")
+
+    def objects(self) -> SiteObjects:
+        """Gaussians that all stations are seen through, else those that stations never heard would be."""
+        for posterior in (one for one in (self.posterior, self.elsewhere) if one is not None):
+            means, scales, turns, _ = (part.numpy() for part in posterior.prior.blockers.parts())
+            if len(means):
+                first = len(posterior.prior.inducing)
+                deviation = math.exp(0.5 * posterior.prior.log_cloud.item())
+                losses = -deviation * posterior.mean[first : first + len(means)].numpy()
+                return SiteObjects.of(gaussians=(means, np.exp(scales), turns, losses))
+        return SiteObjects.of()
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`; silent rows say that powers are below a level.
