@@ -22,6 +22,7 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, or_null, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods import stacking
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
 from gsparc.methods.registry import METHODS, method_class
@@ -278,6 +279,11 @@ class Auto(PredictsVariance):
                 count = sum(one.size() for one in self._fitted if one.has_gaussians)
                 return {**method.facts(), "model/num_gaussians": count}
         return super().facts()
+
+    def objects(self) -> SiteObjects:
+        """Those of the heaviest that found any."""
+        every = (method.objects() for method in self._fitted)
+        return next((found for found in every if len(found)), SiteObjects.of())
 
     def size(self) -> int:
         """That of all that was chosen."""

@@ -27,8 +27,10 @@ from gsparc.data.instantiate import suggest
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Kind, Measurements
 from gsparc.data.splits import Split, write_split
+from gsparc.data.walls import read_walls
 from gsparc.evaluation.evaluate import Evaluation, evaluate
 from gsparc.evaluation.figures import DECIDING, score_of
+from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
@@ -75,6 +77,8 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     module = _data(config)
     data = module.measurements
     objective_of(config, data.site.kind)  # refused now, not after the training
+    walls = config.get("known_walls") or OmegaConf.select(config, "init.file")
+    known = None if walls is None else read_walls(walls)
     split = _split(config, data, run_dir / "split.json")
     count = len(split.folds)
     folders = [run_dir] if count == 1 else [run_dir / f"fold{number}" for number in range(count)]
@@ -109,6 +113,9 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
             logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
     title = f"{data.site.name}: test rows of {methods[0].label}"
     draw_predictions(methods[0], data, split.folds[0], title, run_dir / "test.png")
+    objects = methods[0].objects()
+    if len(objects):
+        draw_found(data, objects, run_dir / "found.png", known)
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_summary(run_dir / "summary.json", facts)
     return facts, Objects(methods, files, data, split, found)

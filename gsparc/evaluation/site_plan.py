@@ -145,7 +145,7 @@ def _title(data: Measurements, found: Spots) -> str:
     return f"{data.site.name}: {len(data)} {kind} at {len(found.place)} places{at}"
 
 
-def _still(data: Measurements) -> np.ndarray:
+def still_ends(data: Measurements) -> np.ndarray:
     """World x and y (T, 2) of the ends that stand still, where that is known."""
     site = data.site
     if site.stations is not None:
@@ -157,7 +157,7 @@ def _still(data: Measurements) -> np.ndarray:
 
 def _view(data: Measurements, found: Spots) -> tuple[np.ndarray, np.ndarray]:
     """Corners (2,) of the map: all places but those far outside, all stations, and a margin."""
-    shown = [found.place[~found.far], _still(data)]
+    shown = [found.place[~found.far], still_ends(data)]
     if data.site.static_end is None:
         shown.append(data.tx[:, :2] + data.site.origin[:2])
     every = np.concatenate(shown)
@@ -201,7 +201,7 @@ def _size(place: np.ndarray, extent: float) -> float:
 
 
 def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> None:
-    place, site = _still(data), data.site
+    place, site = still_ends(data), data.site
     if not len(place):
         return
     what = "transmitter" if site.static_end == "tx" else "receiver"

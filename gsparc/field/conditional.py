@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.field.site_objects import SiteObjects
 from gsparc.ops import Pose
 
 
@@ -67,6 +68,7 @@ class ConditionalField(nn.Module, ABC):
     kind: ClassVar[str] = ""
     site: Site
     held: LeftOutRows | None = None
+    reads_rows: ClassVar[bool] = False  # whether `answer` knows more than `forward`
     RATE: ClassVar[float] = 0.01  # of logarithms of lengths and variances
     rates: ClassVar[dict[str, float]] = {}
 
@@ -95,6 +97,15 @@ class ConditionalField(nn.Module, ABC):
     @abstractmethod
     def forward(self, tx: Tensor, rx: Pose) -> Posterior:
         """Answer at tx (B, 3) [m] and one shared or B receiver poses, local coordinates."""
+
+    def answer(self, batch: Batch) -> Posterior:
+        """Answer rows, whose stations and runs may matter."""
+        found: Posterior = self(batch.tx, batch.rx)
+        return found
+
+    def objects(self) -> SiteObjects:
+        """What it found to stand in the site."""
+        return SiteObjects.of()
 
     @abstractmethod
     def left_out(self) -> LeftOutRows:
@@ -132,6 +143,11 @@ class StackedField(ConditionalField):
     def heaviest(self) -> ConditionalField:
         """The member of largest weight."""
         return self._fields()[int(np.argmax(self.weights))]
+
+    def objects(self) -> SiteObjects:
+        """Those of the heaviest member that found any."""
+        found = [self._fields()[i].objects() for i in np.argsort(self.weights)[::-1]]
+        return next((one for one in found if len(one)), found[0])
 
     def _fields(self) -> list[ConditionalField]:
         return list(self.members)  # type: ignore[arg-type]
@@ -197,6 +213,10 @@ class CompletedField(ConditionalField):
         """The field's, and the residual."""
         return (*self.field.terms, "residual")
 
+    def objects(self) -> SiteObjects:
+        """The field's."""
+        return self.field.objects()
+
     def loss(self, batch: Batch) -> Tensor:
         """The field's; the residual's settings follow from its likelihood."""
         return self.field.loss(batch)
@@ -223,7 +243,7 @@ class CompletedField(ConditionalField):
 
 def learns(field: nn.Module) -> bool:
     """Whether there is anything that gradient steps move."""
-    return next(field.parameters(), None) is not None
+    return any(parameter.requires_grad for parameter in field.parameters())
 
 
 def residuals(field: ConditionalField, data: Measurements) -> Measurements:

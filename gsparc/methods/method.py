@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget
 from gsparc.ops import Pose
 
@@ -155,6 +156,14 @@ class Method(ABC):
     def size(self) -> int:
         """Number of Gaussians, sources or stored training samples."""
         return 0
+
+    def objects(self) -> SiteObjects:
+        """What it found to stand in the site."""
+        return SiteObjects.of()
+
+    def shares(self, site: Site) -> bool:
+        """Whether it learns several stations of this site at once, told which by `Batch.station`."""
+        return False
 
     def problem(self, data: Measurements) -> str | None:
         """Why it cannot serve these measurements, as far as that is known before a fit; None where it may."""

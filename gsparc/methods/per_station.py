@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,11 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import LEAST_ROWS, Fold
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.censored import heard
 from gsparc.methods.label import common_label
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.reduced import View
 from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.ops import Pose
 
@@ -77,6 +80,7 @@ class PerStation(Method):
         self.name, self.guesses = first.name, first.guesses
         self.wrapped = first
         self._copies: dict[int, Method] = {}
+        self._shared = False  # whether one copy knows all stations
 
     @property
     def label(self) -> str:
@@ -90,7 +94,9 @@ class PerStation(Method):
         return ", ".join(dict.fromkeys(said)) if said else self.wrapped.effects
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit every station that is asked for, or all together as if both ends moved; seconds are shared.
+        """Fit every station that is asked for, or all together; seconds are shared.
+
+        Together, a method that shares stations learns them as they are, any other as if both ends moved.
 
         Raises:
             ValueError: a station of the test rows has too few training rows, or all are learned together, and
@@ -98,7 +104,9 @@ class PerStation(Method):
         """
         assert data.station is not None and data.site.stations is not None
         together = context.stations == "together"
-        if together and not self.wrapped.both_ends:
+        joint = self.wrapped.shares(data.site)
+        self._shared = together and joint
+        if together and not (joint or self.wrapped.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
         self._shape = tuple(data.target.shape[1:])
@@ -107,7 +115,7 @@ class PerStation(Method):
         if together:
             numbers = [UNHEARD]
         elif unheard.any():
-            if not self.wrapped.both_ends:
+            if not self.wrapped.both_ends and not joint:
                 names = ", ".join(data.site.stations.name[t] for t in np.flatnonzero(unheard)[:3])
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
@@ -117,7 +125,7 @@ class PerStation(Method):
         limited: Clock | None = None
         for number in numbers:
             rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
-            copy, part = self._make(), data.subset(rows, of_station(data.site, number))
+            copy, part = self._make(), data.subset(rows, self._site_of(data.site, number))
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             where = context.run_dir / f"station{number}" if number != UNHEARD else context.run_dir / "unheard"
             report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
@@ -130,11 +138,15 @@ class PerStation(Method):
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row by its station's copy."""
+        if self._shared:
+            return self._copies[UNHEARD].answer(batch)
         stations = self._stations(batch.tx, batch.rx) if batch.station is None else batch.station
         return self._gathered(stations, lambda copy, chosen: copy.answer(_rows(batch, chosen, copy.site)))
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
         """By the copy of the station that stands at the static end; see `Method.predict`."""
+        if self._shared:
+            return self._copies[UNHEARD].predict(tx, rx)
         everyone = torch.arange(len(tx))
 
         def ask(copy: Method, chosen: Tensor) -> Prediction:
@@ -153,7 +165,11 @@ class PerStation(Method):
             assert self.site is not None and self.site.stations is not None
             name = self.site.stations.name[number]
             raise ValueError(f"{self.name}: station {name} had too few training rows")
-        return copy
+        return OfStation(copy, number) if self._shared else copy
+
+    def _site_of(self, site: Site, number: int) -> Site:
+        """The site as a copy sees it: whole, where one learns several stations as such."""
+        return site if number == UNHEARD and self.wrapped.shares(site) else of_station(site, number)
 
     def _stations(self, tx: Tensor, rx: Pose) -> Tensor:
         """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
@@ -189,14 +205,21 @@ class PerStation(Method):
 
     def state(self) -> dict[str, Any]:
         """The state of every copy, by its station's number."""
-        return {"per_station": {str(number): copy.state() for number, copy in self._copies.items()}}
+        copies = {str(number): copy.state() for number, copy in self._copies.items()}
+        return {"per_station": copies, "shared": self._shared}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site = site
+        self.site, self._shared = site, bool(state.get("shared", False))
         for number, part in state["per_station"].items():
             self._copies[int(number)] = copy = self._make()
-            copy.restore(of_station(site, int(number)), part)
+            copy.restore(self._site_of(site, int(number)), part)
+
+    def objects(self) -> SiteObjects:
+        """Those of all copies: what stands in a site stands there for all its stations."""
+        return reduce(
+            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.of()
+        )
 
     def size(self) -> int:
         """That of all copies."""
@@ -211,6 +234,20 @@ class PerStation(Method):
 
     def __iter__(self) -> Iterator[tuple[int, Method]]:
         return iter(self._copies.items())
+
+
+class OfStation(View):
+    """A method that knows all stations, asked about one: several may stand at one place."""
+
+    def __init__(self, inner: Method, number: int) -> None:
+        super().__init__(inner)
+        self.number = number
+
+    def predict(self, tx: Tensor, rx: Pose) -> Prediction:
+        """See `Method.predict`."""
+        rows = torch.arange(len(tx))
+        station = torch.full_like(rows, self.number)
+        return self.inner.answer(Batch(rows, tx, rx, torch.zeros(len(tx), 1), station=station))
 
 
 def _over(values: list[Any], name: str) -> float | int | str | None:
@@ -228,7 +265,7 @@ def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
     assert site is not None
     if not rx.batched:
         return rx
-    if site.static_end == "rx":
+    if site.static_end == "rx" and site.stations is None:
         return Pose(rx.position[chosen[0]], rx.rotation[chosen[0]])
     return Pose(rx.position[chosen], rx.rotation[chosen])
 
@@ -238,4 +275,6 @@ def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
         name: value if value is None or name in ("rx", "station") else value[chosen]
         for name, value in vars(batch).items()
     }
-    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": None})
+    known = batch.station is not None and site is not None and site.stations is not None
+    station = batch.station[chosen] if known and batch.station is not None else None
+    return Batch(**{**parts, "rx": _pose(batch.rx, chosen, site), "station": station})

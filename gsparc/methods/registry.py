@@ -53,6 +53,10 @@ FIELDS = {  # fields whose weights are in closed form: what makes them of measur
     "rays": ("gsparc.multipath.initialise.rays", "gsparc.multipath.source_field.restored_rays"),
     "diffuse": ("gsparc.multipath.initialise.diffuse", "gsparc.multipath.waves.field.restored"),
     "powers": ("gsparc.multipath.initialise.powers", "gsparc.multipath.powers.field.restored"),
+    "joint_powers": (
+        "gsparc.multipath.initialise.joint_powers",
+        "gsparc.multipath.powers.together.field.restored",
+    ),
     "bearings": ("gsparc.array.moving.initialise.bearings", "gsparc.array.moving.bearing_field.restored"),
 }
 

@@ -21,6 +21,7 @@ from gsparc.multipath.known.method import KnownWallsGP
 from gsparc.multipath.known.panels import panels
 from gsparc.multipath.powers import field as power_field
 from gsparc.multipath.powers.field import PowerSettings
+from gsparc.multipath.powers.together import field as joint_field
 from gsparc.multipath.source_field import RayField, SourceField
 from gsparc.multipath.waves import initial as waves
 from gsparc.multipath.waves.settings import ChannelSettings
@@ -99,6 +100,17 @@ def powers(
         if leaning:
             log.info("%d walls that lean are left out: only floors and upright walls take power", leaning)
     field, notes = power_field.initialise(data, rows, settings, context.seed, budget, known)
+    field.condition(data, rows)
+    return field, FitReport(budget.counted.wall, notes, budget.limited_by)
+
+
+def joint_powers(
+    data: Measurements, rows: np.ndarray, init: InitSettings, clutter: bool, context: FitContext
+) -> tuple[ConditionalField, FitReport]:
+    """Powers of several stations in one field; without `clutter` they share their law alone."""
+    budget = context.time_budget()
+    shared = clutter and init.name != "diffuse"
+    field, notes = joint_field.initialise(data, rows, shared=shared, seed=context.seed, budget=budget)
     field.condition(data, rows)
     return field, FitReport(budget.counted.wall, notes, budget.limited_by)
 

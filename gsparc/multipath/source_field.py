@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.method import FitContext
 from gsparc.multipath.diffraction import subtract_edges
 from gsparc.multipath.directional_gp import DirectionalGP
@@ -56,6 +57,17 @@ class SourceField(ConditionalField):
         """Carrier phase, and visibility where it is modelled."""
         clutter = any(len(member.scene.clutter) for member in self.method.members)
         return ("phase", "visibility") if clutter else ("phase",)
+
+    def objects(self) -> SiteObjects:
+        """Planes and boxes of the heaviest search."""
+        method = self.method
+        scene = method.members[int(torch.as_tensor(method.weights).argmax())].scene
+        middle = method.frame.middle.double()
+        planes = scene.planes.detach().double()
+        normal = planes[:, :3] / torch.linalg.vector_norm(planes[:, :3], dim=1, keepdim=True)
+        moved = torch.cat([normal, planes[:, 3:] + (normal @ middle)[:, None]], 1)
+        boxes = scene.clutter.boxes.detach().double().view(-1, 2, 3) + middle
+        return SiteObjects.of(moved.numpy(), boxes.numpy())
 
     def loss(self, batch: Batch) -> Tensor:
         """See `ConditionalField.loss`; of every search by its weight, with circular gains."""

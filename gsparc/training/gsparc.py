@@ -19,11 +19,12 @@ import torch
 from torch import Tensor
 
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds, cut_inside
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
 from gsparc.field.initial import InitSettings
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced
@@ -344,6 +345,23 @@ class Gsparc(LearnedField):
         return total_steps(context) if self.most_steps is None else self.most_steps
 
     # -- answering ---------------------------------------------------------------------------------
+
+    def objects(self) -> SiteObjects:
+        """Those of the field with closed-form weights."""
+        return SiteObjects.of() if self.field is None else self.field.objects()
+
+    def shares(self, site: Site) -> bool:
+        """Received powers, and channels of a known carrier."""
+        waves = site.kind == "csi" and site.wavelength is not None and site.static_end is not None
+        return waves or site.kind == "rssi"
+
+    @torch.no_grad()
+    def answer(self, batch: Batch) -> Prediction:
+        """See `Method.answer`."""
+        if self.field is None or not self.field.reads_rows:
+            return super().answer(batch)
+        found = self.field.answer(batch)
+        return Prediction(found.mean, (1 - found.unknown).clamp(0, 1), found.variance)
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:

@@ -93,7 +93,8 @@ def plan(
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     if on["power"]:
-        part = "scene" if init.name == "scene" else "powers"
+        joint = site.stations is not None and len(site.stations) > 1
+        part = "scene" if init.name == "scene" else "joint_powers" if joint else "powers"
         return Plan(False, parts=(part,), reasons=tuple(reasons))
     if on["moving_array"] and (count or not plain):
         if switches.visibility is True:
@@ -136,6 +137,8 @@ def _refuse_scene(
         why = obstacles[term] or f"model.effects.{term}=false"
     elif not count:
         why = "model.field.count=0 is the residual alone"
+    elif site.kind == "rssi" and site.stations is not None and len(site.stations) > 1:
+        why = "known walls are of one station's model; say stations=each"
     elif site.kind == "rssi" and site.static_end is not None and site.static_position is None:
         why = "the dataset does not say where the static end is"
     elif site.kind == "rssi" and switches.visibility is False:
@@ -170,6 +173,8 @@ def _no_phase(data: Measurements) -> str | None:
     site = data.site
     if site.kind != "csi":
         return f"the target is {site.kind}, which carries no phase"
+    if site.stations is not None and len(site.stations) > 1:
+        return "several stations are learned together, for which sources are not searched"
     if site.static_position is None:
         return "the dataset does not say where the static end is"
     if site.carrier_hz is None and site.subcarriers_hz is None:

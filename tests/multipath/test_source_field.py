@@ -12,6 +12,7 @@ from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext
 from gsparc.multipath.initialise import sources
 from gsparc.multipath.source_field import SourceField
+from gsparc.physics.mirror_planes import reflect
 
 ROWS = np.arange(60)
 INIT = InitSettings(searches=1, search_rows=60, max_sources=6, edges=False)
@@ -46,3 +47,17 @@ def test_slopes_are_those_of_finite_differences(field, name, step):
         numeric[number] = (ends[1] - ends[0]) / (2 * step)
     # how alike sources are seen from two places is held fixed in the slope
     assert np.linalg.norm(slope - numeric) < 0.1 * np.linalg.norm(numeric), (slope, numeric)
+
+
+def test_objects_mirror_the_transmitter_into_its_images(field):
+    field, _ = field
+    method = field.method
+    scene = method.members[int(torch.as_tensor(method.weights).argmax())].scene
+    planes = torch.from_numpy(field.objects().planes)
+    assert torch.linalg.vector_norm(planes[:, :3], dim=1).allclose(
+        torch.ones(len(planes), dtype=planes.dtype)
+    )
+    end = scene.transmitter + method.frame.middle
+    for word, place in zip(scene.words, scene.sources, strict=True):
+        if len(word) == 1:
+            assert torch.allclose(reflect(end, planes[word[0]]), place + method.frame.middle, atol=1e-6)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from gsparc.data.limits import Checked, choice, number, setting, switch, whole
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
+from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.censored import silent
 from gsparc.methods.distance_law import Law, Rows
 from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
@@ -131,6 +132,14 @@ class PowerField(ConditionalField):
     def blockers(self) -> Blockers:
         """The Gaussians as they are, with their gradients."""
         return Blockers(self.means, self.log_scales, self.turns, self.log_strengths)
+
+    def objects(self) -> SiteObjects:
+        """The Gaussians with the losses that rows say."""
+        if not len(self.means):
+            return SiteObjects.of()
+        still = [part.detach() for part in self.blockers.parts()]
+        losses = -self.alone[-len(self.means) :] * still[3].exp().numpy()
+        return SiteObjects.of(gaussians=(still[0].numpy(), still[1].exp().numpy(), still[2].numpy(), losses))
 
     def prior(self) -> tuple[Trend, PowerKernel]:
         """What the parameters say, without gradients."""

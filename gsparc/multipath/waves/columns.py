@@ -17,6 +17,8 @@ from torch import Tensor
 from gsparc.data.schema import LIGHT, Measurements, Site
 from gsparc.ops import Pose
 
+NOBODY = -1  # in place of a station's number: none of them
+SAME_PLACE_M = 0.01  # a static end nearer than this to a station is that station
 BAND_RAD = 1.0  # tones whose phases turn no more than this against each other over all places are one band
 
 
@@ -190,17 +192,34 @@ def carrier_of(site: Site, station: int) -> float:
     return float(site.carrier_hz)
 
 
-def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor]:
-    """Moving end's places (B, 3) float64, the receiver's turns (B, 3, 3) and stations (B,) of queries."""
+def asked(site: Site, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Moving and static ends' places (B, 3) float64, the receiver's turns (B, 3, 3), and stations (B,).
+
+    A static end that is not where any station stands is of station `NOBODY`.
+    """
     count = len(tx)
     receiver = rx.position.reshape(-1, 3).expand(count, 3).cpu().double()
     turned = rx.rotation.reshape(-1, 3, 3).expand(count, 3, 3).cpu().double()
     sender = tx.cpu().double()
     moving, static = (sender, receiver) if site.moving_end == "tx" else (receiver, sender)
     if site.stations is None:
-        return moving, turned, torch.zeros(count, dtype=torch.long)
+        return moving, static, turned, torch.zeros(count, dtype=torch.long)
     known = torch.from_numpy(np.asarray(site.stations.position, np.float64))
-    return moving, turned, torch.cdist(static, known).argmin(1)
+    away, nearest = torch.cdist(static, known).min(1)
+    return moving, static, turned, torch.where(away <= SAME_PLACE_M, nearest, NOBODY)
+
+
+def ends_of(groups: tuple[Group, ...]) -> int:
+    """How many static ends there are."""
+    return len({group.slot.station for group in groups})
+
+
+def of_runs(factors: Tensor, groups: tuple[Group, ...]) -> Tensor:
+    """Factors of runs (runs,) as they may be: of several ends that share them, phases alone.
+
+    What a run has changed beside its phase is each end's own, and would be taken for a level of all.
+    """
+    return factors / factors.abs() if ends_of(groups) > 1 else factors
 
 
 def thinned(groups: tuple[Group, ...], columns: int, rows: int) -> tuple[Group, ...]:

@@ -1,16 +1,19 @@
 """Covariance of channels at two sets of places: leakage, direct wave, sources and the diffuse field.
 
-    C = p_0 E sinc(k d) + E sum_b p_b V_b(d) + R (p_c + p_d a a^H + sum_n s_n b_n b_n^H)
+    C = p_0 E sinc(k d) + E sum_b p_b w_b V_b(d) + R (p_c + p_d a a^H + sum_n s_n b_n b_n^H)
         + S (p_g a a^H + sum_n t_n b_n b_n^H)
 
-with E the Matern-3/2 envelope, V_b the correlation of waves from one direction, a and b_n the spherical waves
-of the static end and of sources, S a squared exponential of gains that vary over places, and R one that is so
-long that it only ends far outside. Noise, and what is correlated over the order of rows, is training's alone.
+with E the Matern-3/2 envelope, V_b the correlation of waves from one direction, w_b a factor by its angle to
+the static end, 1 where there is one end, a and b_n the spherical waves of the static end and of sources, S a
+squared exponential of gains that vary over places, and R one that is so long that it only ends far outside.
+Noise, and what is correlated over the order of rows, is training's alone.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +26,7 @@ from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
 DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike
 BLOCK = 1_000_000  # correlations of directions that are computed at a time
+HALF = 0.25  # length of the mean of directions from which they are of a half sphere
 BEYOND = 10.0  # extents of the places after which nothing is known any more
 
 
@@ -93,6 +97,8 @@ class Values:
         envelope, gain: () float64 lengths [m] of the diffuse field's envelope and of gains.
         offset: (3,) float64 [m] of static ends from where they are said to be.
         sources: (N, 3) float64 [m], local.
+        towards: (J,) float64 logarithms of factors of directions' powers, at angles to the static end from 0
+            to pi; none: directions are those of the room alone.
     """
 
     power: Tensor
@@ -100,6 +106,7 @@ class Values:
     gain: Tensor
     offset: Tensor
     sources: Tensor
+    towards: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
 
 
 def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
@@ -119,17 +126,65 @@ def source_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Te
 
 
 def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
-    """The diffuse field's covariance (n, m) complex128 of places a (n, 3) and b (m, 3) [m]."""
+    """The diffuse field's covariance (n, m) complex128 of places a (n, 3) and b (m, 3) [m], as of any end."""
+    return diffuse_of(shape, values, wavenumber, shape.of("direction", values.power)[None], a, b)[0]
+
+
+def diffuse_of(
+    shape: Shape, values: Values, wavenumber: float, powers: Tensor, a: Tensor, b: Tensor
+) -> Tensor:
+    """The same (T, n, m) of T static ends, by their powers (T, M) of directions."""
     distance = apart(a, b)
     found = shape.of("isotropic", values.power)[0] * isotropic(distance, wavenumber)
+    found = found[None].expand(len(powers), *distance.shape)
     block = max(BLOCK // max(distance.numel(), 1), 1)
-    for angles, power in zip(
-        shape.angles.split(block), shape.of("direction", values.power).split(block), strict=False
-    ):
+    for angles, power in zip(shape.angles.split(block), powers.split(block, dim=1), strict=False):
         if len(angles):
             correlations = directions(angles, shape.concentration, wavenumber, a, b, distance)
             found = found + torch.tensordot(power.to(correlations.dtype), correlations, 1)
     return (found * envelope(distance, values.envelope)).to(torch.complex128)
+
+
+def diffuse_fields(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """Covariances (n, n) of the groups' diffuse fields; correlations of shared places are computed once."""
+    alike: dict[tuple[bytes, float], list[int]] = {}
+    for number, group in enumerate(groups):
+        alike.setdefault((group.displacements, group.slot.wavenumber), []).append(number)
+    found: list[Tensor] = [torch.empty(0)] * len(groups)
+    for (_, wavenumber), numbers in alike.items():
+        places = groups[numbers[0]].places
+        powers = directional(shape, values, [groups[number].slot for number in numbers])
+        rows = max(BLOCK // (len(places) * max(len(shape.angles), 1)), 1) if len(powers) > 1 else len(places)
+        parts = [diffuse_of(shape, values, wavenumber, powers, part, places) for part in places.split(rows)]
+        whole = torch.cat(parts, 1)
+        for at, number in enumerate(numbers):
+            found[number] = whole[min(at, len(whole) - 1)]
+    return found
+
+
+def directional(shape: Shape, values: Values, slots: Sequence[Slot]) -> Tensor:
+    """Powers (T, M) of directions as ends have them; (1, M) where all have the same."""
+    power = shape.of("direction", values.power)
+    if not len(values.towards) or not len(power):
+        return power[None]
+    ends = torch.stack([slot.end for slot in slots]) + values.offset
+    return power * (ways(shape, ends, len(values.towards)) @ values.towards).exp()
+
+
+def ways(shape: Shape, ends: Tensor, knots: int) -> Tensor:
+    """Weights (T, M, J) of J knots in the angle, evenly from 0 to pi, between directions and ends (T, 3).
+
+    Directions of a half sphere stand for their mirror images as well: the nearer one counts.
+    """
+    towards = torch.nn.functional.normalize(ends - shape.middle, dim=1)
+    cosine = towards @ shape.angles.T
+    normal = shape.angles.mean(0)
+    if float(torch.linalg.vector_norm(normal)) > HALF:
+        normal = torch.nn.functional.normalize(normal, dim=0)
+        mirrored = shape.angles - 2 * (shape.angles @ normal)[:, None] * normal
+        cosine = torch.maximum(cosine, towards @ mirrored.T)
+    at = torch.acos(cosine.clamp(-1, 1)) * ((knots - 1) / math.pi)
+    return (1 - (at[..., None] - torch.arange(knots, dtype=torch.float64)).abs()).clamp_min(0)
 
 
 def directions(
@@ -169,7 +224,7 @@ def told(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tens
 def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
     """Variance (n,) of the signal."""
     power = values.power
-    found = shape.of("isotropic", power)[0] + shape.of("direction", power).sum()
+    found = shape.of("isotropic", power)[0] + directional(shape, values, [slot])[0].sum()
     found = found + shape.of("constant", power).sum()
     if shape.direct:
         level = direct_wave(shape, values, slot, places).abs().square()
@@ -194,9 +249,9 @@ def temporal(length: Tensor | float, group: Group) -> tuple[Tensor, Tensor]:
     between = (group.order[:, None] - group.order[None]).abs()
     same = group.run[:, None] == group.run[None]
     distance = apart(group.places, group.places)
-    field = isotropic(distance, group.slot.wavenumber) * envelope(distance, length)
+    waves = isotropic(distance, group.slot.wavenumber) * envelope(distance, length)
     fast, slow = (torch.exp(-between / rows) * same for rows in (FAST_ROWS, DRIFT_ROWS))
-    return fast, slow * (DRIFT_FIELD * field + 1 - DRIFT_FIELD)
+    return fast, slow * (DRIFT_FIELD * waves + 1 - DRIFT_FIELD)
 
 
 def apart(a: Tensor, b: Tensor) -> Tensor:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import torch
@@ -17,8 +16,7 @@ from torch import Tensor
 
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
-from gsparc.multipath.waves.covariance import Shape, Values, diffuse, temporal, told
-from gsparc.multipath.waves.evidence import Kept
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse_fields, temporal, told
 
 STRETCH = 400  # rows looked at
 COLUMNS = 3  # groups looked at
@@ -106,13 +104,11 @@ def _left_out(group: Group, other: Tensor, inverse: Tensor, cell: np.ndarray) ->
 
 def signals_of(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
     """Covariances (n, n) of the groups' signals."""
-    fields, found = Kept(), []
-    for group in groups:
-        places, slot = group.places, group.slot
-        make = partial(diffuse, shape, values, slot.wavenumber, places, places)
-        field = fields.of((group.displacements, slot.wavenumber), make)
-        found.append(field + told(shape, values, slot, places, places))
-    return found
+    fields = diffuse_fields(groups, shape, values)
+    return [
+        field + told(shape, values, group.slot, group.places, group.places)
+        for field, group in zip(fields, groups, strict=True)
+    ]
 
 
 def _likelihood(

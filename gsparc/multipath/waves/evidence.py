@@ -21,7 +21,15 @@ from torch import Tensor
 
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.waves.columns import Group
-from gsparc.multipath.waves.covariance import Shape, Values, apart, direct_wave, directions, source_waves
+from gsparc.multipath.waves.covariance import (
+    Shape,
+    Values,
+    apart,
+    direct_wave,
+    directions,
+    source_waves,
+    ways,
+)
 from gsparc.multipath.waves.kernels import envelope, isotropic, smooth
 
 FLOOR = 1e-3  # of the noise: powers of eigenvectors that are left out
@@ -30,8 +38,10 @@ LOW_RANK = 1e-6  # of the largest eigenvalue of a gain's correlation, those left
 LOWEST, HIGHEST = -14.0, 7.0  # logarithms of powers
 LOW = 0.3  # of the rows, columns of a factor up to which its product is not kept
 WEAK = 1e-3  # pull of every log power to where it started, which holds those that nothing depends on
+TILTED = 0.5  # pull of logarithms of factors towards ends to 0: a prior of standard deviation 1
 STEPS = 30
 SETTLED = 1e-6  # relative change of the objective at which steps end
+NOTHING = torch.zeros(0, dtype=torch.float64)
 
 
 @dataclass(frozen=True)
@@ -73,6 +83,7 @@ class Compressed:
         basis: (n, r) float64 of orthonormal columns.
         room: (1 + M, r, r) complex128, the isotropic field and those of directions.
         terms: of leakage, direct wave and sources, in the order of `Shape.names`.
+        ways: (M, J), see `covariance.ways`; J is 0 where directions are of the room alone.
         target: (r, D) complex128.
         rest: sum of squares outside the basis.
     """
@@ -81,8 +92,16 @@ class Compressed:
     basis: Tensor
     room: Tensor
     terms: tuple[Term, ...]
+    ways: Tensor
     target: Tensor
     rest: float
+
+    def own(self, power: Tensor, towards: Tensor) -> Tensor:
+        """Powers (P,) as this end has them, of powers (P,) that all share."""
+        if not len(towards):
+            return power
+        room = len(self.room)
+        return torch.cat([power[:1], power[1:room] * (self.ways @ towards).exp(), power[room:]])
 
 
 @dataclass(frozen=True)
@@ -138,7 +157,10 @@ def compressed(
         target = basis.T.to(torch.complex128) @ group.target
         rest = float(group.target.abs().square().sum() - target.abs().square().sum())
         terms = tuple(map(Term.of, _factors(group, shape, values, basis, fixed, varying)))
-        found.append(Compressed(group, basis, room, terms, target, max(rest, 0.0)))
+        bins = torch.zeros(len(shape.angles), 0, dtype=torch.float64)
+        if len(values.towards):
+            bins = ways(shape, (group.slot.end + values.offset)[None], len(values.towards))[0]
+        found.append(Compressed(group, basis, room, terms, bins, target, max(rest, 0.0)))
     return tuple(found)
 
 
@@ -202,11 +224,11 @@ def without(part: Compressed, left: Tensor) -> Compressed:
     target = basis.T.to(torch.complex128) @ group.target
     outside = float(group.target.abs().square().sum() - target.abs().square().sum())
     terms = tuple(Term.of(wide @ term.factor) for term in part.terms)
-    return Compressed(group, basis, room, terms, target, max(outside, 0.0))
+    return Compressed(group, basis, room, terms, part.ways, target, max(outside, 0.0))
 
 
 def solved(part: Compressed, power: Tensor) -> Solved:
-    """With powers (P,), those of correlated noise ignored."""
+    """With its own powers (P,), those of correlated noise ignored."""
     room = len(part.room)
     noise = power[room + len(part.terms)]
     size = part.room.shape[1:]
@@ -240,31 +262,52 @@ def slope(part: Compressed, power: Tensor, at: Solved) -> Tensor:
     return found * power
 
 
-def evidence(parts: tuple[Compressed, ...], power: Tensor) -> float:
+def evidence(parts: tuple[Compressed, ...], power: Tensor, towards: Tensor = NOTHING) -> float:
     """Negative log marginal likelihood of all groups [nats]."""
-    return sum(solved(part, power).nll for part in parts)
+    return sum(solved(part, part.own(power, towards)).nll for part in parts)
 
 
 def fit_powers(
     parts: tuple[Compressed, ...], shape: Shape, start: Tensor, shrinkage: float, steps: int = STEPS
 ) -> tuple[Tensor, float]:
-    """Powers (P,) of largest evidence, and its negative logarithm [nats] without the priors.
+    """As `fit_all`, of ends whose directions are those of the room."""
+    power, _, nll = fit_all(parts, shape, start, NOTHING, shrinkage, steps)
+    return power, nll
+
+
+def fit_all(
+    parts: tuple[Compressed, ...],
+    shape: Shape,
+    start: Tensor,
+    towards: Tensor,
+    shrinkage: float,
+    steps: int = STEPS,
+) -> tuple[Tensor, Tensor, float]:
+    """Powers (P,) and `Values.towards` (J,) of largest evidence, its negative logarithm without the priors.
 
     Args:
         start: (P,) powers.
+        towards: (J,) to start from.
         shrinkage: rows that an inverse Gamma prior of directions' powers about their mean counts for.
     """
-    begin = start.log().clamp(LOWEST, HIGHEST)
+    count = len(start)
+    begin = torch.cat([start.log().clamp(LOWEST, HIGHEST), towards])
     angles = shape.where("direction")
 
     def objective(logs: np.ndarray) -> tuple[float, np.ndarray]:
         log = torch.from_numpy(logs)
-        power, total = log.exp(), 0.0
+        power, tilt, total = log[:count].exp(), log[count:], 0.0
         gradient = torch.zeros_like(log)
         for part in parts:
-            at = solved(part, power)
+            own = part.own(power, tilt)
+            at = solved(part, own)
             total += at.nll
-            gradient += slope(part, power, at)
+            found = slope(part, own, at)
+            gradient[:count] += found
+            if len(tilt):
+                gradient[count:] += part.ways.T @ found[1 : len(part.room)]
+        total += TILTED * float(tilt.square().sum())
+        gradient[count:] += 2 * TILTED * tilt
         if angles and shrinkage > 0:
             mean = power[angles].mean()
             ratio = mean / power[angles]
@@ -274,7 +317,7 @@ def fit_powers(
         total += WEAK * float((log - begin).square().sum())
         return total, (gradient + 2 * WEAK * (log - begin)).numpy()
 
-    bounds = [(LOWEST, HIGHEST)] * len(begin)
+    bounds = [(LOWEST, HIGHEST)] * count + [(-HIGHEST, HIGHEST)] * len(towards)
     found = minimize(
         objective,
         begin.numpy(),
@@ -283,12 +326,15 @@ def fit_powers(
         bounds=bounds,
         options={"maxiter": steps, "ftol": SETTLED},
     )
-    power = torch.from_numpy(found.x).exp()
-    return power, evidence(parts, power)
+    power, towards = torch.from_numpy(found.x[:count]).exp(), torch.from_numpy(found.x[count:])
+    return power, towards, evidence(parts, power, towards)
 
 
 def left_out_cells(part: Compressed, power: Tensor, cell: np.ndarray) -> Tensor:
-    """Errors (n, D) of rows predicted without any of their cell (n,) (Rasmussen and Williams 2006, 5.12)."""
+    """Errors (n, D) of rows predicted without any of their cell (n,) (Rasmussen and Williams 2006, 5.12).
+
+    Powers (P,) are its own.
+    """
     at, noise = solved(part, power), power[len(part.room) + len(part.terms)]
     wide = part.basis.to(torch.complex128)
     alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,19 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
-from gsparc.multipath.waves.columns import Group, Slot, asked, gather
-from gsparc.multipath.waves.covariance import Shape, Values, diffuse, disturbance, explained, prior, told
-from gsparc.multipath.waves.evidence import Kept
+from gsparc.multipath.waves.columns import Group, Slot, asked, gather, of_runs, static_place
+from gsparc.multipath.waves.common import Common
+from gsparc.multipath.waves.covariance import (
+    Shape,
+    Values,
+    diffuse_fields,
+    diffuse_of,
+    directional,
+    disturbance,
+    explained,
+    prior,
+    told,
+)
 from gsparc.ops import Pose
 
 CHUNK = 2_000_000  # entries of a covariance that are held at a time
@@ -79,9 +89,11 @@ class ChannelField(ConditionalField):
         log_envelope, log_gain: lengths [log m].
         offset: (3,) of static ends [m].
         sources: (N, 3) [m], local.
+        towards: (J,) see `Values`.
     """
 
     kind = "diffuse"
+    reads_rows = True
 
     def __init__(self, site: Site, shape: Shape, values: Values, channel: tuple[int, int]) -> None:
         super().__init__()
@@ -91,7 +103,11 @@ class ChannelField(ConditionalField):
         self.log_gain = nn.Parameter(values.gain.log())
         self.offset = nn.Parameter(values.offset.clone())
         self.sources = nn.Parameter(values.sources.clone())
+        # An empty parameter would have no slope.
+        self.towards = nn.Parameter(values.towards.clone()) if len(values.towards) else values.towards
         self.weights: tuple[Weights, ...] = ()
+        self.stations: dict[int, list[Weights]] = {}
+        self.common: Common | None = None
         self.rows = np.zeros(0, np.int64)
         self.runs = np.zeros(1, np.int64)
         self.run_factors = torch.ones(1, dtype=torch.complex128)
@@ -100,7 +116,7 @@ class ChannelField(ConditionalField):
     def values(self) -> Values:
         """The parameters as they are, differentiable."""
         lengths = self.log_envelope.exp(), self.log_gain.exp()
-        return Values(self.log_power.exp(), *lengths, self.offset, self.sources)
+        return Values(self.log_power.exp(), *lengths, self.offset, self.sources, self.towards)
 
     @property
     def _held(self) -> Values:
@@ -137,7 +153,7 @@ class ChannelField(ConditionalField):
         Raises:
             ValueError: not conditioned yet.
         """
-        moving, turned, nearest = asked(self.site, batch.tx, batch.rx)
+        moving, _, turned, nearest = asked(self.site, batch.tx, batch.rx)
         station = nearest if batch.station is None else batch.station.cpu()
         target = batch.target.cpu().to(torch.complex128) / self.run_factor(batch.run)[:, None, None]
         shape, values = self.shape, self.values
@@ -153,7 +169,7 @@ class ChannelField(ConditionalField):
             run = torch.zeros(len(here), dtype=torch.long) if batch.run is None else batch.run[here].cpu()
             places = slot.places(moving[here], turned[here])
             group = Group(slot, here, places, _entries(target, here, slot), run, order)
-            inverse = torch.linalg.inv(self._covariance(group, shape, values, Kept()))
+            inverse = torch.linalg.inv(_covariances((group,), shape, values)[0])
             variance = known.scale / inverse.diagonal().real
             error = (inverse @ group.target) / inverse.diagonal()[:, None]
             density = (math.pi * variance).log() + error.abs().square().mean(1) / variance
@@ -181,12 +197,11 @@ class ChannelField(ConditionalField):
     def _solve(self, groups: tuple[Group, ...], factors: Tensor | None) -> None:
         """Set the weights; factors of runs (runs,), as measured, are estimated unless given."""
         shape, values = self.shape, self.values
-        fields = Kept()
-        lowers = [cholesky(self._covariance(group, shape, values, fields)) for group in groups]
+        lowers = [cholesky(covariance) for covariance in _covariances(groups, shape, values)]
         if factors is None:
             factors = torch.ones(len(self.runs), dtype=torch.complex128)
             if len(self.runs) > 1:
-                factors = _factors(groups, lowers, len(self.runs))
+                factors = of_runs(_factors(groups, lowers, len(self.runs)), groups)
         self.run_factors, found, noise = factors, [], float(shape.of("noise", values.power))
         for group, lower in zip(groups, lowers, strict=True):
             aligned = replace(group, target=group.target / factors[group.run][:, None])
@@ -194,16 +209,11 @@ class ChannelField(ConditionalField):
             scale = float((aligned.target.conj() * alpha).real.mean())
             found.append(Weights(aligned, lower, alpha, max(scale, 1e-300), noise, shape.is_real))
         self.weights = tuple(found)
-
-    @staticmethod
-    def _covariance(group: Group, shape: Shape, values: Values, fields: Kept) -> Tensor:
-        """(n, n) complex128 of a group's rows with what disturbs them, relative to its scale."""
-        slot, places = group.slot, group.places
-        field = fields.of(
-            (group.displacements, slot.wavenumber),
-            partial(diffuse, shape, values, slot.wavenumber, places, places),
-        )
-        return field + told(shape, values, slot, places, places) + disturbance(shape, values, group)
+        self.stations = {}
+        for known in found:
+            self.stations.setdefault(known.group.slot.station, []).append(known)
+        heard = [(known.group, known.alpha, known.scale) for known in found]
+        self.common = Common.of(shape, self._held, heard) if len(self.stations) > 1 else None
 
     def forward(self, tx: Tensor, rx: Pose, station: Tensor | None = None) -> Posterior:
         """See `ConditionalField`; in the phase and level of the largest run, see `run_factor`.
@@ -212,13 +222,14 @@ class ChannelField(ConditionalField):
 
         Args:
             tx, rx: see `ConditionalField`.
-            station: (B,) int64 static ends; None takes the nearest, the first of those at one place.
+            station: (B,) int64 static ends; None takes those at the static places, the first of several at
+                one. Of one that no row was learned of, what ends have in common answers (`Common`).
         """
-        moving, turned, nearest = asked(self.site, tx, rx)
+        moving, static, turned, nearest = asked(self.site, tx, rx)
         station = nearest if station is None else station.cpu()
         count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
-            self._answer(moving[part], turned[part], station[part])
+            self._answer(moving[part], static[part], turned[part], station[part])
             for part in torch.arange(count).split(max(CHUNK // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
@@ -230,8 +241,19 @@ class ChannelField(ConditionalField):
             (after / before.clamp_min(1e-300)).clamp(0, 1).float().to(device),
         )
 
+    def answer(self, batch: Batch) -> Posterior:
+        """Answer rows of known stations, in the phase and level of their runs."""
+        found = self(batch.tx, batch.rx, batch.station)
+        if len(self.runs) == 1:
+            return found
+        factor = self.run_factor(batch.run).to(found.mean.device)
+        turned = factor[:, None, None].to(found.mean.dtype)
+        explained = None if found.explained is None else found.explained * turned
+        variance = found.variance * factor.abs().square().float()
+        return replace(found, mean=found.mean * turned, variance=variance, explained=explained)
+
     def _answer(
-        self, moving: Tensor, turned: Tensor, station: Tensor
+        self, moving: Tensor, static: Tensor, turned: Tensor, station: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and sources' share of it (B, A, K), variance after and before learning (B,)."""
         shape, values, size = self.shape, self._held, math.prod(self.channel)
@@ -239,25 +261,68 @@ class ChannelField(ConditionalField):
         share = torch.zeros_like(mean) if self.count else mean
         after, before = (torch.zeros(len(moving), dtype=torch.float64) for _ in range(2))
         disturbed = sum(shape.of(name, values.power).sum() for name in ("noise", "fast", "drift"))
-        last: tuple[Any, ...] = ()
-        for known in self._conditioned():
-            group, slot = known.group, known.group.slot
-            here = torch.nonzero(station == slot.station).flatten()
-            if not len(here):
-                continue
-            places = slot.places(moving[here], turned[here])
-            key = (slot.wavenumber, group.places, places)
-            if not last or last[0] != slot.wavenumber or not all(map(torch.equal, last[1:3], key[1:])):
-                last = (*key, diffuse(shape, values, slot.wavenumber, places, group.places))
-            cross = last[3] + told(shape, values, slot, places, group.places)
-            slot.put(mean, here, cross @ known.alpha)
-            if self.count:
-                slot.put(share, here, explained(shape, values, slot, places, group.places) @ known.alpha)
-            weight = known.scale * known.alpha.shape[1] / size
-            whole = prior(shape, values, slot, places) + disturbed
-            after.index_add_(0, here, weight * (whole - known.learned(cross)).clamp_min(0))
-            before.index_add_(0, here, weight * whole)
+        for alike in self._by_places(moving, turned, station):
+            slots, places, learned = (
+                [one.group.slot for one, _, _ in alike],
+                alike[0][2],
+                alike[0][0].group.places,
+            )
+            powers = directional(shape, values, slots)
+            fields = diffuse_of(shape, values, slots[0].wavenumber, powers, places, learned)
+            for number, (known, here, _) in enumerate(alike):
+                slot = slots[number]
+                cross = fields[min(number, len(fields) - 1)] + told(shape, values, slot, places, learned)
+                slot.put(mean, here, cross @ known.alpha)
+                if self.count:
+                    slot.put(share, here, explained(shape, values, slot, places, learned) @ known.alpha)
+                weight = known.scale * known.alpha.shape[1] / size
+                whole = prior(shape, values, slot, places) + disturbed
+                after.index_add_(0, here, weight * (whole - known.learned(cross)).clamp_min(0))
+                before.index_add_(0, here, weight * whole)
+        unheard = torch.tensor([number not in self.stations for number in station.tolist()], dtype=torch.bool)
+        for place in static[unheard].unique(dim=0):
+            here = torch.nonzero(unheard & (static == place).all(1)).flatten()
+            self._of_unheard(place, here, moving, turned, mean, after, before)
         return mean, share, after, before
+
+    def _by_places(
+        self, moving: Tensor, turned: Tensor, station: Tensor
+    ) -> list[list[tuple[Weights, Tensor, Tensor]]]:
+        """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
+        found: dict[tuple[Any, ...], list[tuple[Weights, Tensor, Tensor]]] = {}
+        for number in station.unique().tolist():
+            here = torch.nonzero(station == number).flatten()
+            for known in self.stations.get(number, ()):
+                slot, learned = known.group.slot, known.group
+                places = slot.places(moving[here], turned[here])
+                first = learned.places[0].numpy().tobytes()
+                asked_at = places.detach().numpy().tobytes()
+                key = (slot.wavenumber, learned.displacements, first, asked_at)
+                found.setdefault(key, []).append((known, here, places))
+        return list(found.values())
+
+    def _of_unheard(
+        self,
+        place: Tensor,
+        here: Tensor,
+        moving: Tensor,
+        turned: Tensor,
+        mean: Tensor,
+        after: Tensor,
+        before: Tensor,
+    ) -> None:
+        """Write what ends have in common for queries `here` of a static end at `place` (3,)."""
+        assert self.common is not None
+        size, values = math.prod(self.channel), self._held
+        for template in next(iter(self.stations.values())):
+            slot = template.group.slot
+            slot = replace(slot, end=slot.end + place - static_place(self.site, slot.station))
+            places = slot.places(moving[here], turned[here])
+            found, variance, prior_variance = self.common.at(self.shape, values, slot, places)
+            outputs = template.alpha.shape[1]
+            slot.put(mean, here, found[:, None].expand(-1, outputs))
+            after.index_add_(0, here, variance * outputs / size)
+            before.index_add_(0, here, prior_variance * outputs / size)
 
     def run_factor(self, run: Tensor | None) -> Tensor:
         """What predictions of rows of runs (B,) must be multiplied by, (B,) complex128; 1 where unknown."""
@@ -322,7 +387,9 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
     shape, kept = Shape(**state["shape"]), state["values"]
     lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
-    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"])
+    none = torch.zeros(0, dtype=torch.float64)  # earlier versions knew no angles to ends
+    towards = kept.get("towards", none)
+    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"], towards)
     antennas, tones = (int(n) for n in state["channel"])
     field = ChannelField(site, shape, values, (antennas, tones))
     with torch.no_grad():
@@ -335,6 +402,16 @@ def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     with torch.no_grad():
         field._solve(tuple(groups), state["run_factors"])
     return field
+
+
+def _covariances(groups: tuple[Group, ...], shape: Shape, values: Values) -> list[Tensor]:
+    """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
+    return [
+        field
+        + told(shape, values, group.slot, group.places, group.places)
+        + disturbance(shape, values, group)
+        for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
+    ]
 
 
 def _stored(slot: Slot) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from gsparc.multipath.complex_gp import CHOSEN_ON, LENGTHS, NOISES
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
 from gsparc.multipath.waves import drift
-from gsparc.multipath.waves.columns import Group, gather, thinned
+from gsparc.multipath.waves.columns import Group, ends_of, gather, of_runs, thinned
 from gsparc.multipath.waves.covariance import BEYOND, Shape, Values, disturbance
 from gsparc.multipath.waves.evidence import (
     Compressed,
@@ -29,6 +29,7 @@ from gsparc.multipath.waves.evidence import (
     compressed,
     compressible,
     evidence,
+    fit_all,
     fit_powers,
     left_out_cells,
     normalised,
@@ -108,6 +109,8 @@ def initialise(
     channel = (int(data.target.shape[1]), int(data.target.shape[2]))
     field = ChannelField(data.site, best.shape, best.values, channel)
     field.condition(data, rows)
+    # Steps on a few rows of each end would find less than the likelihood of all of them has.
+    field.requires_grad_(ends_of(search.every) == 1)
     return field, (*notes, *more)
 
 
@@ -163,7 +166,7 @@ def _grid_point(
     heard = size > 0
     if runs > 1:
         factors[heard] = aligning(total[np.ix_(heard, heard)], size[heard])
-    turn, nll = torch.from_numpy(factors), 0.0
+    turn, nll = of_runs(torch.from_numpy(factors), groups), 0.0
     for group, lower in zip(groups, solved, strict=True):
         target = group.target * turn[group.run][:, None]
         white = torch.cat([target.real, target.imag], 1)
@@ -237,6 +240,8 @@ class _Search:
             best = self._step(best, self._with_sources(best), "auto", "sources", notes)
         if wanted.directions is not False and not budget.over():
             best = self._step(best, self._with_directions(best), wanted.directions, "directions", notes)
+        if ends_of(self.every) > 1 and not budget.over():
+            best = self._of_all_ends(best, known, notes)
         if wanted.correlated is not False and not budget.over():
             best = self._with_drift(best, notes)
         return best, notes
@@ -258,20 +263,23 @@ class _Search:
 
     def _measured(self, shape: Shape, values: Values, parts: tuple[Compressed, ...]) -> Candidate:
         """With what left-out rows say."""
-        errors = np.mean([_left_out(part, values.power).mean(1) for part in parts], axis=0)
-        return Candidate(
-            shape, values, evidence(parts, values.power) + self._worth(shape, values.offset), errors
+        own = [part.own(values.power, values.towards) for part in parts]
+        errors = np.mean(
+            [_left_out(part, power).mean(1) for part, power in zip(parts, own, strict=True)], axis=0
         )
+        nll = evidence(parts, values.power, values.towards) + self._worth(shape, values)
+        return Candidate(shape, values, nll, errors)
 
     def _fitted(self, shape: Shape, values: Values) -> Candidate:
         """With powers of largest evidence; measured."""
         parts = self._compressed(shape, values)
-        power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage)
-        return self._measured(shape, replace(values, power=power), parts)
+        shrinkage = self.settings.shrinkage
+        power, towards, _ = fit_all(parts, shape, values.power, values.towards, shrinkage)
+        return self._measured(shape, replace(values, power=power, towards=towards), parts)
 
-    def _worth(self, shape: Shape, offset: Tensor) -> float:
+    def _worth(self, shape: Shape, values: Values) -> float:
         """What the terms beside the isotropic field must gain [nats]."""
-        parameters = len(shape.names) - 2 + shape.direct + 3 * bool(offset.any())
+        parameters = len(shape.names) - 2 + shape.direct + 3 * bool(values.offset.any()) + len(values.towards)
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
@@ -343,6 +351,27 @@ class _Search:
         power, _ = fit_powers(parts, shape, values.power, self.settings.shrinkage, 2 * SHORT)
         found = self._fitted(*_strongest(shape, replace(values, power=power)))
         return replace(found, errors=np.maximum(found.errors, errors))
+
+    def _of_all_ends(self, before: Candidate, known: bool, notes: list[str]) -> Candidate:
+        """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
+        wide = replace(self, groups=thinned(self.every, self.settings.ends, self.settings.rows))
+        best = wide._moved(wide._fitted(before.shape, before.values))
+        wanted = self.settings.directions
+        if known and wanted is not False:
+            best = wide._step(best, wide._with_tied(best), wanted, "directions by angles to ends", notes)
+        return best
+
+    def _with_tied(self, before: Candidate) -> Candidate:
+        """With powers of directions that depend on room and angle to the end, all equal at first."""
+        group, old, wanted = max(self.groups, key=len), before.shape, self.settings
+        angles = directions(group.places, group.slot.wavenumber, wanted.tied)
+        shape = replace(old, angles=angles, concentration=wanted.narrow)
+        power = before.values.power
+        level = float(power[: 1 + len(old.angles)].sum())
+        fresh = torch.tensor([0.3 * level] + [0.7 * level / len(angles)] * len(angles)).double()
+        power = torch.cat([fresh, power[1 + len(old.angles) :]])
+        towards = torch.zeros(wanted.knots, dtype=torch.float64)
+        return self._fitted(shape, replace(before.values, power=power, towards=towards))
 
     def _crossed(self, parts: tuple[Compressed, ...], shape: Shape, values: Values) -> np.ndarray:
         """Errors as `Candidate`'s, of rows that had no part in the powers they are predicted with."""

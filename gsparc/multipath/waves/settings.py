@@ -21,7 +21,11 @@ class ChannelSettings(Checked):
         concentration: of each direction, that of a von Mises-Fisher density.
         shrinkage: of directions' powers towards their mean, in rows of the inverse Gamma prior.
         rows: measurements that powers are learned on at most.
-        columns: static ends, antennas or bands of tones that powers are learned on at most.
+        columns: static ends, antennas or bands of tones that terms are decided on at most.
+        ends: of several static ends, those that powers are learned on in the end.
+        tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
+        narrow: concentration of each of these.
+        knots: in that angle.
     """
 
     constant: bool | str = setting("auto", switch("auto"))
@@ -34,3 +38,7 @@ class ChannelSettings(Checked):
     shrinkage: float = setting(0.5, number(0))
     rows: int = setting(400, whole(8))
     columns: int = setting(8, whole(1))
+    ends: int = setting(64, whole(1))
+    tied: int = setting(64, whole(4, 500))
+    narrow: float = setting(16.0, POSITIVE)
+    knots: int = setting(9, whole(2, 100))

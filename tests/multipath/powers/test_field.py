@@ -104,10 +104,20 @@ def test_walls_are_found_where_they_pay(blocked):
     assert np.std(explained - truth) < 0.7 * np.std(truth), notes
 
 
+def test_objects_are_what_paths_lose_power_in(blocked):
+    data, field, _ = blocked
+    found = field.objects()
+    assert len(found.means) == field.count and not len(found.planes)
+    strongest = int(np.argmax(found.losses))
+    x, y = (found.means[strongest] + data.site.origin)[:2]
+    assert found.losses[strongest] > 4 and 15 < x < 45 and y > 12, vars(found)
+
+
 def test_no_walls_are_found_where_there_are_none():
     data, rows = town(120, walls=False), np.arange(120)
     field, notes = initialise(data, rows, PowerSettings(), seed=0)
     assert field.count == 0 and any(note.startswith("no Gaussians") for note in notes)
+    assert not len(field.objects())
 
 
 def test_far_away_the_variance_is_the_priors(blocked):

@@ -1,0 +1,134 @@
+"""What a field found in a site, from above, beside what is known to stand there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.collections import PatchCollection
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.patches import Ellipse, Polygon, Rectangle
+
+from gsparc.data.schema import Measurements
+from gsparc.data.walls import SceneWalls
+from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.site_plan import still_ends
+from gsparc.field.site_objects import SiteObjects
+
+INCHES = 6.5  # longer side of the map
+UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall
+LEAST_DB = 0.5  # of a Gaussian that is drawn
+AROUND = 0.5  # of the extent of the places, that is drawn around them where walls were found
+
+
+def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None) -> None:
+    """Save a map of mirror planes, boxes and Gaussians over the measured places.
+
+    Args:
+        data: measurements of the site.
+        objects: of it, local coordinates.
+        path: PNG file.
+        known: walls and boxes, in the coordinates of the measurements.
+    """
+    origin = data.site.origin
+    places = np.unique(data.moving[:, -3:], axis=0) + origin
+    ends = still_ends(data)
+    low, high = _view(np.concatenate([places[:, :2], ends]), objects, origin[:2])
+    width, height = (high - low) / (high - low).max() * INCHES
+    figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
+    axis = axes[0, 0]
+    axis.scatter(*places[:, :2].T, s=3, c="0.75", linewidths=0, label="measured places")
+    if known is not None:
+        _draw_known(axis, known, float(np.median(places[:, 2])))
+    drawn = _draw_gaussians(axis, objects, origin)
+    if drawn is not None:
+        figure.colorbar(drawn, ax=axis, label="loss of a path through the middle [dB]", shrink=0.85, pad=0.02)
+    for number, box in enumerate(objects.boxes + origin):
+        label = f"boxes found ({len(objects.boxes)})" if not number else None
+        axis.add_patch(
+            Rectangle(box[0, :2], *(box[1] - box[0])[:2], fill=False, hatch="///", ec="tab:blue", label=label)
+        )
+    level = _draw_planes(axis, objects.planes, origin, low, high)
+    if len(ends):
+        axis.plot(*ends.T, "k^", markersize=9, markeredgecolor="white", linestyle="", label="ends that stand")
+    axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    axis.ticklabel_format(useOffset=False, style="plain")
+    figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
+    title = f"{data.site.name}: what the field found"
+    figure.suptitle(title if not level else f"{title}\n{level}", fontsize="medium")
+    save(figure, path)
+
+
+def _view(shown: np.ndarray, objects: SiteObjects, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,) of the map."""
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    margin = max(float((high - low).max()), 1e-3) * (AROUND if len(objects.planes) else 0.06)
+    return low - margin, high + margin
+
+
+def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+    """Upright planes as lines; returns where the others are, in words."""
+    middle, reach = (low + high) / 2, float(np.linalg.norm(high - low))
+    first = True
+    for normal, offset in zip(planes[:, :3], planes[:, 3] + planes[:, :3] @ origin, strict=True):
+        flat = np.linalg.norm(normal[:2])
+        if abs(normal[2]) > UPRIGHT:
+            continue
+        across = normal[:2] / flat
+        foot = middle + (offset / flat - across @ middle) * across
+        ends = foot + np.array([[-1.0], [1.0]]) * reach * np.array([-across[1], across[0]])
+        axis.plot(*ends.T, "-", color="tab:red", lw=1.5, label="mirror planes found" if first else None)
+        first = False
+    lying = [n for n in range(len(planes)) if abs(planes[n, 2]) > 1 - UPRIGHT]
+    heights = sorted((planes[n, 3] + planes[n, :3] @ origin) / planes[n, 2] for n in lying)
+    said = ", ".join(f"{height:.2f}" for height in heights)
+    return f"horizontal planes at z = {said} m" if said else ""
+
+
+def _draw_gaussians(axis: Any, objects: SiteObjects, origin: np.ndarray) -> PatchCollection | None:
+    """Ellipses at one standard deviation, coloured by what they take."""
+    kept = np.flatnonzero(np.abs(objects.losses) >= LEAST_DB)
+    if not len(kept):
+        return None
+    kept = kept[np.argsort(np.abs(objects.losses[kept]))]  # the strongest above
+    patches = [
+        Ellipse(
+            (objects.means[i] + origin)[:2], *(2 * objects.scales[i, :2]), angle=np.degrees(objects.turns[i])
+        )
+        for i in kept
+    ]
+    most = float(np.abs(objects.losses[kept]).max())
+    drawn = PatchCollection(
+        patches, cmap="PuOr_r", norm=TwoSlopeNorm(0.0, -most, most), alpha=0.6, edgecolor="0.3", linewidth=0.3
+    )
+    drawn.set_array(objects.losses[kept])
+    axis.add_collection(drawn)
+    return drawn
+
+
+def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:
+    """Known walls where they cut a height, and boxes."""
+    how = {"color": "0.25", "lw": 3.0, "alpha": 0.5, "solid_capstyle": "butt"}
+    label: str | None = "known walls"
+    for face in known.faces:
+        cut = _cut(face, height)
+        if len(cut) >= 2:
+            axis.plot(*cut[:2, :2].T, label=label, **how)
+            label = None
+    for number, box in enumerate(known.boxes):
+        axis.add_patch(
+            Polygon(
+                [box[0, :2], (box[1, 0], box[0, 1]), box[1, :2], (box[0, 0], box[1, 1])], fc="0.8", ec="0.5",
+                label=None if number else "known boxes", zorder=0,
+            )
+        )  # fmt: skip
+
+
+def _cut(face: np.ndarray, height: float) -> np.ndarray:
+    """Points (m, 3) where the edges of a polygon (C, 3) pass a height [m]."""
+    start, end = face, np.roll(face, -1, axis=0)
+    passing = (start[:, 2] <= height) != (end[:, 2] <= height)
+    start, end = start[passing], end[passing]
+    share = (height - start[:, 2]) / (end[:, 2] - start[:, 2])
+    return start + share[:, None] * (end - start)

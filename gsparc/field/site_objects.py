@@ -1,0 +1,49 @@
+"""What a field found to stand in a site: mirror planes, boxes, and Gaussians that paths lose power in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SiteObjects:
+    """In the local coordinates of a site, float64.
+
+    Attributes:
+        planes: (P, 4) of mirrors, see `gsparc.physics.mirror_planes` [unit normal; m].
+        boxes: (B, 2, 3) lower and upper corners of what lets nothing through [m].
+        means: (N, 3) of Gaussians in the way [m].
+        scales: (N, 3) their standard deviations along their own axes, the third upwards [m].
+        turns: (N,) angles from x to their first axes [rad].
+        losses: (N,) what the straight path through the middle of each loses [dB]; negative: gains.
+    """
+
+    planes: np.ndarray
+    boxes: np.ndarray
+    means: np.ndarray
+    scales: np.ndarray
+    turns: np.ndarray
+    losses: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        planes: np.ndarray | None = None,
+        boxes: np.ndarray | None = None,
+        gaussians: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None = None,
+    ) -> SiteObjects:
+        """Planes (P, 4), boxes (B, 2, 3), Gaussians as means, scales, turns, losses; None: there are none."""
+        flat = np.zeros(0)
+        planes = np.zeros((0, 4)) if planes is None else planes
+        boxes = np.zeros((0, 2, 3)) if boxes is None else boxes
+        return cls(planes, boxes, *(gaussians or (flat.reshape(0, 3), flat.reshape(0, 3), flat, flat)))
+
+    def __len__(self) -> int:
+        return len(self.planes) + len(self.boxes) + len(self.means)
+
+    def joined(self, other: SiteObjects) -> SiteObjects:
+        """These and others."""
+        both = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return SiteObjects(*(np.concatenate(pair) for pair in both))

@@ -1,0 +1,65 @@
+"""The map of what a field found: everything on it is named, and stands where it is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from gsparc.data.own import from_arrays
+from gsparc.data.walls import SceneWalls
+from gsparc.evaluation import found_plan
+from gsparc.evaluation.found_plan import draw_found
+from gsparc.field.site_objects import SiteObjects
+
+STATION = np.array([101.0, 204.0, 2.0])
+HALF = np.sqrt(0.5)
+PLANES = np.array([[1.0, 0, 0, 5.0], [HALF, HALF, 0, 2.0], [0, 0, 1.0, -1.0]])  # two walls, and a floor
+BOX = np.array([[[1.0, 1.0, -1.0], [2.0, 3.0, 0.0]]])
+CLOUDS = (np.array([[2.0, 1.0, 0], [3.0, 3.0, 0]]), np.ones((2, 3)), np.zeros(2), np.array([6.0, 0.1]))
+
+
+@pytest.fixture
+def room():
+    """Powers of a room far from the origin of its coordinates."""
+    places = np.random.default_rng(0).uniform([100, 200, 1], [108, 206, 1.1], (60, 3))
+    arrays = {"rx_position": places, "tx_position": STATION, "rssi_db": np.linspace(-60, -40, 60)}
+    return from_arrays(arrays, {"name": "room"})
+
+
+def drawn(monkeypatch, data, objects, known=None) -> Figure:
+    kept: list[Figure] = []
+    monkeypatch.setattr(found_plan, "save", lambda figure, path: kept.append(figure))
+    draw_found(data, objects, "unused.png", known)
+    kept[0].draw_without_rendering()
+    return kept[0]
+
+
+def test_walls_boxes_and_gaussians_are_drawn_where_they_are(room, monkeypatch):
+    corners = np.array([[100.0, 200, 0], [108, 200, 0], [108, 200, 3], [100, 200, 3]])
+    known = SceneWalls((corners,), BOX + room.site.origin)
+    figure = drawn(monkeypatch, room, SiteObjects.of(PLANES, BOX, CLOUDS), known)
+    lines = {line.get_label(): line.get_xydata() for line in figure.axes[0].lines}
+    np.testing.assert_allclose(lines["mirror planes found"][:, 0], 5.0 + room.site.origin[0])
+    np.testing.assert_allclose(lines["known walls"], [[108, 200], [100, 200]])
+    np.testing.assert_allclose(lines["ends that stand"], STATION[None, :2])
+    assert {text.get_text() for text in figure.legends[0].get_texts()} == {
+        "measured places", "known walls", "known boxes", "mirror planes found", "boxes found (1)",
+        "ends that stand",
+    }  # fmt: skip
+    assert f"z = {room.site.origin[2] - 1.0:.2f} m" in figure.get_suptitle()
+    ellipses = figure.axes[0].collections[-1]
+    assert len(ellipses.get_paths()) == 1  # that of 0.1 dB is not worth a mark
+    assert "loss" in figure.axes[1].get_ylabel()
+
+
+def test_a_slanted_plane_is_where_its_equation_holds(room, monkeypatch):
+    figure = drawn(monkeypatch, room, SiteObjects.of(PLANES[1:2]))
+    points = next(line.get_xydata() for line in figure.axes[0].lines if "mirror" in line.get_label())
+    np.testing.assert_allclose((points - room.site.origin[:2]) @ [HALF, HALF], 2.0)
+    assert len(figure.axes) == 1
+
+
+def test_objects_of_two_stations_stand_in_one_site():
+    both = SiteObjects.of(PLANES).joined(SiteObjects.of(boxes=BOX, gaussians=CLOUDS))
+    assert len(both) == 3 + 1 + 2 and len(both.losses) == 2
