@@ -21,8 +21,8 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, or_null, whole
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods import stacking
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
 from gsparc.methods.registry import METHODS, method_class

@@ -11,10 +11,10 @@ from matplotlib.colors import TwoSlopeNorm
 from matplotlib.patches import Ellipse, Polygon, Rectangle
 
 from gsparc.data.schema import Measurements
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.site_plan import still_ends
-from gsparc.field.site_objects import SiteObjects
 
 INCHES = 6.5  # longer side of the map
 UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
-from gsparc.field.site_objects import SiteObjects
+from gsparc.data.site_objects import SiteObjects
 from gsparc.ops import Pose
 
 

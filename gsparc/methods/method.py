@@ -14,8 +14,8 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.time_budget import NOTHING, Clock, Spent, TimeBudget
 from gsparc.ops import Pose
 

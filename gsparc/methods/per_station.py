@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.censored import heard
 from gsparc.methods.label import common_label
 from gsparc.methods.method import FitContext, FitReport, Method, Prediction

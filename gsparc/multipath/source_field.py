@@ -15,9 +15,9 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior, leave_one_out_density
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.method import FitContext
 from gsparc.multipath.diffraction import subtract_edges
 from gsparc.multipath.directional_gp import DirectionalGP

@@ -20,11 +20,11 @@ from torch import Tensor
 
 from gsparc.data.inner_folds import NOT_TESTED, InnerFolds, cut_inside
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
 from gsparc.field.initial import InitSettings
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
 from gsparc.methods.reduced import View, contributions, knobs, reduced

@@ -7,10 +7,10 @@ import pytest
 from matplotlib.figure import Figure
 
 from gsparc.data.own import from_arrays
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation import found_plan
 from gsparc.evaluation.found_plan import draw_found
-from gsparc.field.site_objects import SiteObjects
 
 STATION = np.array([101.0, 204.0, 2.0])
 HALF = np.sqrt(0.5)

@@ -20,8 +20,8 @@ from torch import Tensor, nn
 
 from gsparc.data.limits import Checked, choice, number, setting, switch, whole
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.censored import silent
 from gsparc.methods.distance_law import Law, Rows
 from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of

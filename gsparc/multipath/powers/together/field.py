@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
-from gsparc.field.site_objects import SiteObjects
 from gsparc.methods.per_station import SAME_PLACE_M
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real
 from gsparc.methods.time_budget import TimeBudget
