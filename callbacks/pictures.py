@@ -12,6 +12,7 @@ import torch
 from gsparc.callbacks.ledger import CostLedger
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.pictures import draw_spectra
+from gsparc.training.tracking import picture
 
 
 @dataclass(eq=False)
@@ -44,4 +45,6 @@ class Pictures(Checked, L.Callback):
             seconds = CostLedger.seconds_in(trainer)
             title = f"validation, step {step}" + ("" if seconds is None else f", {seconds:.0f} s of training")
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
-            draw_spectra(batch.target.cpu().numpy(), predicted.cpu().numpy(), rows, title, path)
+            true, found = batch.target.cpu().numpy(), predicted.cpu().numpy()
+            draw_spectra(true, found, rows, title, path, edges=module.site.grid.edges())
+            picture(trainer.loggers, "predictions", path, step)

@@ -20,6 +20,7 @@ _PUBLIC = {
     "Predictor": "gsparc.methods.predictor",
     "Pose": "gsparc.ops",
     "SphereGrid": "gsparc.ops",
+    "load_ipython_extension": "gsparc.commands.notebook",  # what `%load_ext gsparc` asks for
 }
 __all__ = ["Pose", "Predictor", "SphereGrid", "load"]
 

@@ -162,6 +162,12 @@ class SphereGrid:
         lower = (elevation - half).clamp(-math.pi / 2, math.pi / 2).sin()
         return ((upper - lower) * self.azimuth_step)[:, None].expand(self.height, self.width).to(dtype)
 
+    def edges(self) -> tuple[float, float, float, float]:
+        """Least and largest azimuth, least and largest elevation of the pixels' edges [degrees]."""
+        across, up = math.degrees(self.azimuth_step), math.degrees(self.elevation_step)
+        left, low = math.degrees(self.first_azimuth) - across / 2, math.degrees(self.first_elevation) - up / 2
+        return left, left + self.width * across, low, low + self.height * up
+
     @staticmethod
     def hemisphere(height: int = 90, width: int = 360) -> SphereGrid:
         """The RFID release's grid: row i at i steps above the horizon, column j at j steps of azimuth."""

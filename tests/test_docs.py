@@ -15,10 +15,12 @@ from gsparc.methods.registry import METHODS
 ROOT = Path(__file__).parents[1]
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
 TOP = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG")]
-PAGES = [*TOP, *sorted((ROOT / "docs").glob("*.md"))]
+SITE = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+FOLDERS = ("docs", "docs/tutorials", "docs/reference")
+PAGES = [*TOP, *(page for folder in FOLDERS for page in sorted((ROOT / folder).glob("*.md")))]
 PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also speaks of names that are gone
-PER_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-TODAY = pytest.mark.parametrize("page", PRESENT, ids=lambda page: page.name)
+PER_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: f"{page.parent.name}/{page.name}")
+TODAY = pytest.mark.parametrize("page", PRESENT, ids=lambda page: f"{page.parent.name}/{page.name}")
 README_LINES = 150
 GONE = ("vsgp", "directed", "model=bearings", "committee", "trainer.budget_s", "trainer.val_every")
 
@@ -114,6 +116,12 @@ def test_names_that_are_gone_are_not_used(page):
     code = "\n".join(said(page))
     assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
     assert "python -m gsparc." not in code and "gsparc.commands" not in code, "name the command"
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_the_site_has_every_page(folder):
+    files = [f for kind in ("md", "ipynb") for f in (ROOT / folder).glob(f"*.{kind}")]
+    assert not [f.name for f in files if str(f.relative_to(ROOT / "docs")) not in SITE]
 
 
 def test_the_readme_is_short():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib.util
 import os
 import subprocess
 import sys
@@ -12,7 +13,6 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
-from campaigns import brief, spectra
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "physics", "data", "simulate", "field", "methods", "training", "array", "multipath"]
@@ -148,8 +148,7 @@ def test_importing_the_package_is_free():
 
 @pytest.mark.slow
 def test_a_wheel_installed_elsewhere_trains(tmp_path):
-    """Built, installed without the source tree in sight, run as a user would."""
-    file = spectra(tmp_path / "own.npz")
+    """Built, installed without the source tree, a compiler or data in sight, run as a user would."""
     wheels, home = tmp_path / "wheels", tmp_path / "home"
     home.mkdir()
     pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet"]
@@ -165,14 +164,33 @@ def test_a_wheel_installed_elsewhere_trains(tmp_path):
     (site,) = (tmp_path / "venv").glob("lib/python*/site-packages")
     subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(wheel)], check=True)
     # A path in a .pth file brings this environment's packages without its .pth files (an editable gsparc).
-    (site / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    where = "import gsparc, gsparc.ops, gsparc.conf; print(gsparc.__file__, *gsparc.conf.__path__)"
-    found = subprocess.run(
-        [python, "-c", where], cwd=home, env=environment, capture_output=True, text=True, check=True
-    )
-    assert all(part.startswith(str(site)) for part in found.stdout.split()), found.stdout
-    run = [python, "-m", "gsparc", "train", *brief(file), f"hydra.run.dir={home / 'run'}"]
-    done = subprocess.run(run, cwd=home, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout + done.stderr
+    torch = importlib.util.find_spec("torch")
+    places = (sysconfig.get_path("purelib"), Path(torch.origin).parents[1])
+    (site / "dependencies.pth").write_text("".join(f"{place}\n" for place in places))
+    nothing = tmp_path / "nothing"  # on the path: no compiler, no command of this environment
+    nothing.mkdir()
+    environment = {"HOME": str(home), "PATH": str(nothing), "OMP_NUM_THREADS": "1"}
+
+    def say(*words: str) -> str:
+        done = subprocess.run([python, *words], cwd=home, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    where = say("-c", "import gsparc, gsparc.ops, gsparc.conf; print(gsparc.__file__, *gsparc.conf.__path__)")
+    assert all(part.startswith(str(site)) for part in where.split()), where
+    small = ["dataset.count=60", "trainer.max_steps=20", "baselines=[mean]"]
+    say("-m", "gsparc", "train", "experiment=demo", *small, f"hydra.run.dir={home / 'run'}")
     assert (home / "run" / "summary.json").exists()
+    load = "import gsparc; predictor = gsparc.load('run/model.ckpt')"
+    queries = f"{load}; print(predictor.spectrum(tx=[[0, -0.1, 0.1 * i] for i in range(5)]).shape)"
+    assert say("-c", queries).strip() == "(5, 90, 360)"
+
+
+def test_the_wheel_is_marked_for_other_linux_systems(tmp_path):
+    """`make wheel` relies on it: nothing but the C and C++ libraries is linked."""
+    auditwheel = pytest.importorskip("auditwheel.elfutils", reason="auditwheel is not installed")
+    from gsparc.ops import _native
+
+    needed = set(auditwheel.elf_read_dt_needed(Path(_native.__file__)))
+    allowed = {"libc.so.6", "libm.so.6", "libstdc++.so.6", "libgcc_s.so.1", "libpthread.so.0"}
+    assert not {name for name in needed if not name.startswith("ld-linux")} - allowed

@@ -85,11 +85,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--column", action="append", default=[], metavar="NAME=HEAD", help="of a table: which column is what"
     )
     parser.add_argument("--stations-file", help="of a table: a second one that lists the stations")
-    parser.add_argument("--draw", metavar="FILE.png", help="a map of places, stations and suspicious levels")
+    parser.add_argument("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
+    parser.add_argument(
+        "--no-draw", action="store_true", help="no map of places, levels and what looks wrong"
+    )
     given = parser.parse_args(arguments)
     if given.draw is not None and (len(given.path) > 1 or not given.draw.lower().endswith(".png")):
         parser.error("--draw takes the name of a PNG file, and goes with one file of measurements")
     columns = dict(text.partition("=")[::2] for text in given.column)
     console = Console()
-    good = [check(path, console, columns, given.stations_file, given.draw) for path in given.path]
+
+    def picture(path: str) -> str | None:
+        return None if given.no_draw else given.draw or f"outputs/check/{Path(path).resolve().stem}.png"
+
+    good = [check(path, console, columns, given.stations_file, picture(path)) for path in given.path]
     return 0 if all(good) else 1

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
-from gsparc.methods.registry import METHODS, build
+from gsparc.methods.registry import build, known
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,11 @@ class RunSettings(Checked):
 def _methods(names: Any) -> tuple[str, ...] | None:
     if names is None:
         return None
-    if isinstance(names, list) and all(name in METHODS for name in names):
+    methods = known()
+    if isinstance(names, list) and all(name in methods for name in names):
         return tuple(names)
-    wrong = next((b for b in names if b not in METHODS), names) if isinstance(names, list) else names
-    hint = suggest(str(wrong), METHODS)
+    wrong = next((b for b in names if b not in methods), names) if isinstance(names, list) else names
+    hint = suggest(str(wrong), methods)
     raise SettingError(f"baselines={names}: a list of methods is needed, {wrong!r} is none{hint}")
 
 

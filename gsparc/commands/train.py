@@ -34,10 +34,18 @@ from gsparc.evaluation.found_plan import draw_found
 from gsparc.evaluation.metrics import figure_names
 from gsparc.evaluation.open_runs import aligned
 from gsparc.evaluation.pictures import draw_predictions
-from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
+from gsparc.evaluation.summary import (
+    provenance,
+    remarks,
+    result_rows,
+    results_table,
+    write_samples,
+    write_summary,
+)
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, FitReport, Method, TrainsByGradient
 from gsparc.methods.registry import build
+from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
 
@@ -109,13 +117,20 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         )  # fmt: skip
         run = {"seed": int(config.seed), "model/limited_by_clock": fitted.limited_by}
         facts = {**found.facts, **provenance(), **run}
+        # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
+        numbers = {k: v for k, v in facts.items() if isinstance(v, (int, float))}
+        own = {k: v for k, v in numbers.items() if not k.startswith(("baseline/", "paired/"))}
         for logger in loggers:
-            logger.log_metrics({k: v for k, v in facts.items() if isinstance(v, (int, float))})
-    title = f"{data.site.name}: test rows of {methods[0].label}"
-    draw_predictions(methods[0], data, split.folds[0], title, run_dir / "test.png")
-    objects = methods[0].objects()
-    if len(objects):
-        draw_found(data, objects, run_dir / "found.png", known)
+            logger.log_metrics({f"final/{k}": v for k, v in own.items()})
+        title = f"{data.site.name}: test rows of {methods[0].label}"
+        draw_predictions(methods[0], data, split.folds[0], title, run_dir / "test.png")
+        tracking.picture(loggers, "test rows", run_dir / "test.png", 0)
+        label = str(facts["model/label"])
+        tracking.table(loggers, "results", *result_rows(facts, label, config.eval_on))
+        objects = methods[0].objects()
+        if len(objects):
+            draw_found(data, objects, run_dir / "found.png", known)
+            tracking.picture(loggers, "found", run_dir / "found.png", 0)
     write_samples(run_dir / "per_sample.csv", found.columns)
     write_summary(run_dir / "summary.json", facts)
     return facts, Objects(methods, files, data, split, found)

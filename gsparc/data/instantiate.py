@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any
 
 from gsparc.data.errors import DataError
+from gsparc.data.plugins import GROUPS, plugins
 
 
 def suggest(name: str, known: Iterable[str]) -> str:
@@ -50,13 +51,15 @@ def find(path: str) -> Any:
 
 
 def refuse_foreign(path: Any) -> None:
-    """Refuse a `_target_` that is not a class of gsparc, for text out of a file.
+    """Refuse a `_target_` that is not a class of gsparc or of an installed plugin, for text out of a file.
 
     `gsparc.x.os.system` starts with gsparc too: what counts is where the class was defined.
 
     Raises:
         ValueError: it is none.
     """
+    if any(path in plugins(group).values() for group in GROUPS):
+        return
     ours = isinstance(path, str) and path.startswith("gsparc.")
     found = find(path) if ours else None
     if not (isinstance(found, type) and found.__module__.startswith("gsparc.")):

@@ -1,4 +1,4 @@
-"""Pictures of measured beside predicted targets."""
+"""Pictures of measured beside predicted targets, in the units of the measurements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.methods.method import Method
 
 SPECTRA = 4  # test rows drawn
@@ -31,37 +31,44 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     found = method.answer(batch)
     true, predicted = batch.target.numpy(), found.mean.numpy()
     if not spectra:
-        return draw_points(true, predicted, title, path)
+        scale = data.site.target_scale
+        unit = data.provenance.get("level_unit", "dB") if data.site.kind == "rssi" else "dB"
+        return draw_points(true * scale, predicted * scale, title, path, unit)
+    assert data.site.grid is not None
     confidence = None if found.confidence is None else found.confidence.numpy()
-    return draw_spectra(true, predicted, rows, title, path, confidence)
+    return draw_spectra(true, predicted, rows, title, path, confidence, data.site.grid.edges())
 
 
-def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path) -> None:
+def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
     """Save a figure of predicted against measured strength, and of the error of the phase where there is one.
 
     Args:
-        target, predicted: (B, ...) complex channels or real powers, in stored units.
+        target, predicted: (B, ...) complex channels or real powers, in physical units.
         title: above everything.
         path: PNG file.
+        unit: of their levels.
     """
     channels = np.iscomplexobj(target)
-    figure, (axes,) = panels(11 if channels else 5.5, 4.6, 1, 2 if channels else 1, grid=False)
+    figure, (axes,) = panels(8 if channels else 4.6, 4.2, 1, 2 if channels else 1)
     tiny, factor = np.finfo(np.float32).tiny, 20 if channels else 10
     true_db, guess_db = (factor * np.log10(np.maximum(np.abs(x).ravel(), tiny)) for x in (target, predicted))
     low, high = np.percentile(true_db, [0.5, 100])
+    what = "channel gain" if channels else "received power"
     axes[0].plot([low, high], [low, high], color="grey", linewidth=1)
-    axes[0].scatter(true_db, guess_db, s=6, alpha=0.5)
-    axes[0].set(
-        xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), xlabel="measured [dB]", ylabel="predicted [dB]"
-    )
-    axes[0].set_title("strength, relative to unit power")
+    axes[0].scatter(true_db, guess_db, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
+    axes[0].set(xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), aspect="equal")
+    axes[0].set(xlabel=f"measured {what} [{unit}]", ylabel=f"predicted [{unit}]")
+    heard = np.isfinite(guess_db) & (true_db > low)
+    error = np.median(np.abs(guess_db - true_db)[heard]) if heard.any() else np.nan
+    axes[0].set_title(f"{what}, median error {error:.1f} dB")
     if channels:
         turn = np.degrees(np.angle(predicted.ravel() * target.ravel().conj()))
-        axes[1].scatter(true_db, turn, s=6, alpha=0.5)
-        axes[1].set(xlabel="measured strength [dB]", ylabel="phase error [degrees]", ylim=(-180, 180))
-        axes[1].set_title(f"phase error, median {np.median(np.abs(turn)):.1f} degrees")
+        axes[1].scatter(true_db, turn, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
+        axes[1].set(xlim=(low - 3, high + 3), ylim=(-180, 180), yticks=range(-180, 181, 90))
+        axes[1].set(xlabel="measured channel gain [dB]", ylabel="phase error [degrees]")
+        axes[1].set_title(f"phase, median error {np.median(np.abs(turn)):.1f} degrees")
     figure.suptitle(title)
-    save(figure, path, 90)
+    save(figure, path)
 
 
 def draw_spectra(
@@ -71,6 +78,7 @@ def draw_spectra(
     title: str,
     path: Path,
     confidence: np.ndarray | None = None,
+    edges: tuple[float, float, float, float] = (0.0, 360.0, 0.0, 90.0),
 ) -> None:
     """Save a figure: a line per sample, with measured, predicted and difference beside each other.
 
@@ -80,17 +88,18 @@ def draw_spectra(
         title: above everything.
         path: PNG file.
         confidence: (B,) in [0, 1], written into the predictions.
+        edges: least and largest azimuth, least and largest elevation [degrees].
     """
-    height = 1.6 * len(target) + 0.9
-    figure, axes = panels(13, height, len(target), 3, grid=False, sharex=True, sharey=True)
-    options: dict[str, Any] = {"origin": "lower", "aspect": "auto"}
-    options["extent"] = (0, target.shape[2], 0, target.shape[1])
+    how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
+    figure, axes = panels(8.5, 1.35 * len(target) + 1.2, len(target), 3, **how)
+    options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}
     for number, (line, true, guess, row) in enumerate(zip(axes, target, predicted, rows, strict=True)):
         power = line[0].imshow(true, vmin=0, vmax=1, cmap="inferno", **options)
         line[1].imshow(guess, vmin=0, vmax=1, cmap="inferno", **options)
         error = line[2].imshow(guess - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
-        line[0].set_ylabel(f"sample {row}\nelevation row")
-        corner = {"x": 0.99, "y": 0.95, "ha": "right", "va": "top"}
+        line[0].set_yticks(np.arange(30 * np.ceil(edges[2] / 30), edges[3] + 1, 30))
+        line[0].set_ylabel(f"row {row}\nelevation [°]")
+        corner = {"x": 0.99, "y": 0.95, "ha": "right", "va": "top", "fontsize": "small"}
         if confidence is not None:
             said = f"confidence {confidence[number]:.2f}"
             line[1].text(s=said, color="white", transform=line[1].transAxes, **corner)
@@ -99,8 +108,10 @@ def draw_spectra(
     for axis, name in zip(axes[0], ("measured", "predicted", "predicted - measured"), strict=True):
         axis.set_title(name)
     for axis in axes[-1]:
-        axis.set_xlabel("azimuth column")
-    figure.colorbar(power, ax=axes[:, 1], label="relative strength")
-    figure.colorbar(error, ax=axes[:, 2], label="difference")
+        axis.set_xlabel("azimuth [°]")
+        axis.set_xticks(np.arange(90 * np.ceil(edges[0] / 90), edges[1] + 1, 90))
+    below: dict[str, Any] = {"location": "bottom", "shrink": 0.8, "aspect": 40}
+    figure.colorbar(power, ax=axes[:, :2], label="relative strength", **below)
+    figure.colorbar(error, ax=axes[:, 2], label="difference", **{**below, "aspect": 20})
     figure.suptitle(title)
-    save(figure, path, 80)
+    save(figure, path, 100)

@@ -12,10 +12,12 @@ import numpy as np
 from matplotlib.patheffects import withStroke
 from scipy.spatial import cKDTree
 
+from gsparc.data.checks.describe import neighbours, places_of
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import LinkLevels
 from gsparc.data.checks.outliers import outliers, too_far
 from gsparc.data.checks.plausibility import wild_of
+from gsparc.data.checks.proposal import held_out, side_of_squares
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.drawing import panels, save
 
@@ -86,7 +88,8 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     total, number = (np.bincount(which[row], w, minlength=count) for w in (value, None))
     mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
     if data.site.kind == "rssi":
-        return mean, "received power" + (", mean of the stations heard" if several else "") + " [dB]"
+        unit = data.provenance.get("level_unit", "dB")
+        return mean, "received power" + (", mean of the stations heard" if several else "") + f" [{unit}]"
     with np.errstate(divide="ignore"):
         return 10 * np.log10(mean), "mean channel power" + (" of all stations" if several else "") + " [dB]"
 
@@ -142,7 +145,8 @@ def _title(data: Measurements, found: Spots) -> str:
     kind = {"spectrum": "spectra", "csi": "channels", "rssi": "powers"}[data.site.kind]
     stations = data.site.stations
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
-    return f"{data.site.name}: {len(data)} {kind} at {len(found.place)} places{at}"
+    apart = neighbours(places_of(data), data.site.wavelength).partition(";")[0]
+    return f"{data.site.name}: {len(data)} {kind} at {len(found.place)} places{at}\n{apart}"
 
 
 def still_ends(data: Measurements) -> np.ndarray:
@@ -188,6 +192,12 @@ def _draw_map(
         )
         assert axis.figure is not None
         axis.figure.colorbar(drawn, ax=axis, label=found.label, extend="both", shrink=0.85, pad=0.02)
+    side = side_of_squares(data)
+    test = np.zeros(0, np.int64) if side is None else held_out(data, side)
+    if len(test):
+        ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
+        how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
+        axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
     axis.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", **_labels(data))
     axis.ticklabel_format(useOffset=False, style="plain")
     _draw_stations(axis, data, jumping)
@@ -205,7 +215,7 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     if not len(place):
         return
     what = "transmitter" if site.static_end == "tx" else "receiver"
-    label = f"the {what}" if site.stations is None else f"{len(place)} stations ({what}s)"
+    label = f"the {what}" if len(place) == 1 else f"{len(place)} stations ({what}s)"
     how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}
     axis.plot(*place.T, "k^", label=label, **how)
     if jumping:

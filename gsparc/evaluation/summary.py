@@ -56,12 +56,21 @@ def provenance() -> dict[str, str | None]:
 
 
 def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str = "test") -> Table:
-    """Every method a row, accuracy beside its seconds and milliseconds.
+    """`result_rows` as a table for a terminal; the last row is `method`'s."""
+    heads, rows = result_rows(facts, method, prefix)
+    found = table(title, heads[:1], heads[1:], rows)
+    found.rows[-1].style = "bold"
+    return found
+
+
+def result_rows(
+    facts: Mapping[str, Any], method: str, prefix: str = "test"
+) -> tuple[list[str], list[list[str]]]:
+    """Heads and cells: every method a row, accuracy beside its seconds and milliseconds.
 
     Args:
         facts: flat facts as in `summary.json`.
         method: name of the row with `facts[prefix/...]`.
-        title: what was measured.
         prefix: `test`, `train` or `val`.
     """
     wanted = [(name, form_of(name)) for name in (*TABLES[facts["dataset/kind"]], "skill")]
@@ -72,9 +81,7 @@ def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str
         cells = [shown(facts.get(f"{figures}/{figure}"), form) for figure, form in wanted]
         cells += [shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
         rows.append([name, *cells])
-    found = table(title, ["method"], [*(name for name, _ in wanted), "train s", "query ms p50"], rows)
-    found.rows[-1].style = "bold"
-    return found
+    return ["method", *(name for name, _ in wanted), "train s", "query ms p50"], rows
 
 
 def table(title: str, words: Sequence[str], numbers: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:

@@ -23,7 +23,7 @@ from gsparc.data.schema import Site, Stations
 from gsparc.methods.method import Method
 from gsparc.methods.old_names import OLD_NAMES, renamed
 from gsparc.methods.per_station import PerStation
-from gsparc.methods.registry import METHODS, build, method_class
+from gsparc.methods.registry import build, known, method_class
 from gsparc.ops import SphereGrid
 
 SCHEMA_VERSION = 1
@@ -252,9 +252,11 @@ def load(path: str | Path) -> tuple[Method, Stored]:
 
 
 def _registered(stored: Stored) -> str:
-    names = [name for name, target in METHODS.items() if target == stored.target]
+    names = [name for name, target in known().items() if target == stored.target]
     if not names:
-        raise CheckpointError(f"{stored.path}: made by {stored.target!r}, which this gsparc does not know")
+        raise CheckpointError(
+            f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
+        )
     return names[0]
 
 

@@ -9,6 +9,7 @@ from hydra.utils import get_class, get_method, instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.data.instantiate import refuse_foreign, suggest, targets
+from gsparc.data.plugins import plugins
 from gsparc.methods.method import Method
 
 METHODS = {
@@ -71,11 +72,17 @@ def field_restored(name: str) -> Any:
     return get_method(FIELDS[name][1])
 
 
+def known() -> dict[str, str]:
+    """Import paths of all methods by name: `METHODS` and what plugins bring."""
+    return plugins("model") | METHODS
+
+
 def method_class(name: str) -> type[Method]:
     """The class called `name`; `ValueError` with the nearest right name when there is none."""
-    if name not in METHODS:
-        raise ValueError(f"no method is called {name!r}{suggest(name, METHODS)}")
-    return get_class(METHODS[name])
+    there = known()
+    if name not in there:
+        raise ValueError(f"no method is called {name!r}{suggest(name, there)}")
+    return get_class(there[name])
 
 
 def build(config: Mapping[str, Any], *, trusted: bool = True) -> Method:

@@ -133,6 +133,9 @@ class GaussianModule(L.LightningModule):
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
         if (self.global_step + 1) % self.log_every == 0:
             self.log("train/task_loss", task.detach().mean())
+            self.log("train/loss", loss.detach())  # weighted by the confidence, where there is one
+            for group in self.trainer.optimizers[0].param_groups:
+                self.log(f"rate/{group['name']}", group["lr"])
             self.log("model/num_gaussians", float(self.count))
         return loss
 

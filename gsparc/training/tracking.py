@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 if TYPE_CHECKING:
     from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
@@ -38,3 +42,25 @@ def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardL
         raise ValueError(
             'logger=tensorboard: TensorBoard is not installed; say pip install "gsparc[tensorboard]"'
         ) from None
+
+
+def picture(loggers: Iterable[Any], name: str, path: Path, step: int) -> None:
+    """Give a PNG file to the dashboards that show pictures."""
+    for logger in loggers:
+        if hasattr(logger, "log_image"):  # Weights & Biases
+            logger.log_image(name, [str(path)], step=step)
+        elif hasattr(getattr(logger, "experiment", None), "add_image"):  # TensorBoard
+            from PIL import Image
+
+            with Image.open(path) as image:
+                logger.experiment.add_image(name, np.asarray(image.convert("RGB")), step, dataformats="HWC")
+
+
+def table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Give a table to the dashboards that show tables."""
+    for logger in loggers:
+        if hasattr(logger, "log_table"):
+            logger.log_table(name, list(heads), [list(row) for row in rows])
+        elif hasattr(getattr(logger, "experiment", None), "add_text"):
+            lines = [heads, ["---"] * len(heads), *rows]
+            logger.experiment.add_text(name, "\n".join(f"| {' | '.join(line)} |" for line in lines))

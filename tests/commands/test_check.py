@@ -129,3 +129,10 @@ def test_a_map_only_where_it_is_asked_for(tmp_path, arrays, capsys):
         with pytest.raises(SystemExit):
             main(wrong)
         assert "--draw takes the name of a PNG file" in capsys.readouterr().err
+
+
+def test_a_file_is_drawn_unless_said_otherwise(tmp_path, arrays, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write_own(tmp_path / "hall.npz", arrays)
+    assert main(["hall.npz", "--no-draw"]) == 0 and not (tmp_path / "outputs").exists()
+    assert main(["hall.npz"]) == 0 and (tmp_path / "outputs" / "check" / "hall.png").exists()

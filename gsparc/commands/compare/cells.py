@@ -13,8 +13,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from hydra.core.config_store import ConfigStore
+
 from gsparc.commands.compare.problem import Problem
 from gsparc.data.instantiate import find, targets
+from gsparc.data.plugins import plugins
+from gsparc.methods.registry import METHODS
 
 ANY = "any"  # stands for the budget or seed of a method that has none
 
@@ -86,6 +90,17 @@ def contenders(config: Mapping[str, Any]) -> dict[str, Contender]:
             found[str(name)] = Contender(str(name), **lists)
         except TypeError as error:
             raise ValueError(f"methods.{name}: {str(error).partition('() ')[2]}") from None
+    return found
+
+
+def plugged() -> dict[str, Contender]:
+    """Methods that are plugins; a class may name the `kinds` of data that it serves."""
+    offered, found = ConfigStore.instance().repo.get("model", {}), {}
+    for name, path in plugins("model").items():
+        if name not in METHODS and f"{name}.yaml" in offered:
+            kind = find(path)
+            budget = ("budget_s={budget_s}",) if kind.takes_budget else ()
+            found[name] = Contender(name, (f"model={name}",), budget, tuple(getattr(kind, "kinds", ())))
     return found
 
 
@@ -178,7 +193,8 @@ def code_version(model: Mapping[str, Any]) -> str:
     ground (rasterizer, loaders, metrics) is not part of it: having changed that, start with an empty folder.
     """
     named = {base.__module__ for path in targets(model) for base in find(path).__mro__}
-    open_ends = {name for name in named if name.startswith("gsparc.")} - {"gsparc.methods.method"}
+    own = {"gsparc", *(str(path).partition(".")[0] for path in targets(model))}  # plugins have texts too
+    open_ends = {name for name in named if name.partition(".")[0] in own} - {"gsparc.methods.method"}
     sources: dict[str, str] = {}
     while open_ends:
         name = open_ends.pop()
@@ -188,7 +204,7 @@ def code_version(model: Mapping[str, Any]) -> str:
         file = Path(spec.origin)
         sources[name], imported = _program(file, file.stat().st_mtime_ns)
         package = name.rpartition(".")[0]
-        open_ends |= {m for m in imported if m.rpartition(".")[0] == package}
+        open_ends |= {m for m in imported if package and m.rpartition(".")[0] == package}
     return hashlib.sha256(json.dumps(sources, sort_keys=True).encode()).hexdigest()[:12]
 
 

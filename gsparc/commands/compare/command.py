@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from rich.markdown import Markdown
 
 from gsparc.commands.compare import draws_figure, figure, table
-from gsparc.commands.compare.cells import Budget, contenders, plan
+from gsparc.commands.compare.cells import Budget, contenders, plan, plugged
 from gsparc.commands.compare.fitting import (
     Filled,
     Prepared,
@@ -40,7 +40,7 @@ def task(config: DictConfig) -> list[table.Row]:
     RunSettings.of(config)
     run_dir = run_directory()
     settings = plain(config)
-    methods = contenders(settings["methods"])
+    methods = plugged() | contenders(settings["methods"])
     folder = settings["cells"]
     kept = Path(os.path.expanduser(folder)) if folder else platform_cache() / "comparison"
     problems = _problems(settings, kept)
@@ -70,10 +70,11 @@ def _problems(settings: Mapping[str, Any], kept: Path) -> list[Problem]:
     splits = split_choices(settings["splits"])
     problems: list[Problem] = []
     absent: dict[str, list[str]] = {"here as far as results were kept": [], "left out": []}
-    here = {
-        name: bool((of or {}).get("root") or (of or {}).get("file"))
+    paths = {
+        name: [path for key, path in (of or {}).items() if key in ("root", "file")]
         for name, of in settings["datasets"].items()
     }
+    here = {name: not of or any(of) for name, of in paths.items()}  # a plugin's dataset may need no path
     for name, own in settings["datasets"].items():
         meant = [
             split

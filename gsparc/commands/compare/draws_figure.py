@@ -9,7 +9,7 @@ import numpy as np
 
 from gsparc.commands.compare.overview import mean_behind
 from gsparc.commands.compare.table import Row
-from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.drawing import look, panels, save
 
 LABEL = {"nmse": "NMSE", "rmse_db": "RMSE [dB]", "psnr_db": "PSNR [dB]"}
 LINE = 0.34  # height of a method [inch]
@@ -38,7 +38,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 number,
                 row.value,
                 xerr=row.value_error or 0.0,
-                color="C0" if row is best else "0.75",
+                color=look(name)[0],
+                alpha=1.0 if row is best else 0.45,
                 capsize=2.5,
             )
             axis.text(
@@ -51,7 +52,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
-    figure.suptitle(f"{rows[0].dataset}: mean and standard error over draws of the split; the best is blue")
+    figure.suptitle(f"{rows[0].dataset}: mean and standard error over draws of the split; the best is dark")
     save(figure, path)
 
 

@@ -1,54 +1,65 @@
-"""Accuracy against what it costs: processor time of training on the left, one query on the right.
+"""Accuracy against what it costs: a line of panels per dataset, a panel per split, queries at the end.
 
-Processor time, because a busy machine stretches the clock and not the work.
+Processor time of training, because a busy machine stretches the clock and not the work.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-import matplotlib
 from matplotlib.artist import Artist
 
 from gsparc.commands.compare.table import SCORE, Row
-from gsparc.evaluation.drawing import logarithmic, panels, save
+from gsparc.evaluation.drawing import logarithmic, look, panels, save
 
 LEAST_S = 1e-3  # faster fits are drawn here
-MARKS = "osD^vP*X<>ph"
+PANEL = 2.4  # inches
 
 
 def draw(rows: Sequence[Row], path: Path, ours: str) -> None:
-    """A line of panels per dataset and split; a method keeps its colour, a line joins its budgets."""
-    problems = list(dict.fromkeys((r.dataset, r.split) for r in rows))
-    names = list(dict.fromkeys(r.method for r in rows))
-    palette = matplotlib.colormaps["tab20"]
-    styles = {name: (palette((2 * i + i // 10) % 20), MARKS[i % len(MARKS)]) for i, name in enumerate(names)}
-    figure, grid = panels(11, 3.4 * len(problems) + 0.6, len(problems), 2, sharey="row")
-    for line, (dataset, split) in zip(grid, problems, strict=True):
-        here = [r for r in rows if (r.dataset, r.split) == (dataset, split)]
-        for name in names:
-            colour, mark = styles[name]
-            own = sorted((r for r in here if r.method == name), key=lambda r: r.budget_s or 0)
-            style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 7, "capsize": 2}
-            for axis, horizontal in zip(line, ("train_cpu_s", "query_ms"), strict=True):
-                points = [
-                    (max(x, LEAST_S), r.score_db, r.spread_db or 0.0)
-                    for r in own
-                    if (x := getattr(r, horizontal)) is not None
-                ]
-                if points:
-                    axis.errorbar(*zip(*points, strict=True), label=name, **style)
+    """A method looks the same in all panels; a line joins its budgets.
+
+    Args:
+        rows: of the splits that are not drawn several times.
+        path: PNG file.
+        ours: the method with the largest mark.
+    """
+    datasets = list(dict.fromkeys(row.dataset for row in rows))
+    splits = {name: list(dict.fromkeys(r.split for r in rows if r.dataset == name)) for name in datasets}
+    columns = max(map(len, splits.values())) + any(row.query_ms for row in rows)
+    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(datasets) + 0.9)
+    figure, grid = panels(*size, len(datasets), columns, sharey="row")
+    for line, dataset in zip(grid, datasets, strict=True):
+        here = [row for row in rows if row.dataset == dataset]
+        for axis, split in zip(line, splits[dataset], strict=False):
+            _panel(axis, [row for row in here if row.split == split], "train_cpu_s", ours)
+            axis.set(title=f"{dataset}, {split}", xlabel="training, CPU [s]")
         line[0].set_ylabel(SCORE[here[0].figure])
-        line[0].set_title(f"{dataset}, split {split}", loc="left", fontsize=10)
-        line[0].set_xlabel("training of one model, processor time [s]")
-        line[1].set_xlabel("one query, median [ms]")
-        for axis in line:
-            logarithmic(axis)
-        if not any(r.query_ms for r in here):
-            line[1].set_visible(False)
+        free = line[len(splits[dataset]) :]
+        timed = [row for row in here if row.split == splits[dataset][0] and row.query_ms is not None]
+        if timed:
+            _panel(free[0], timed, "query_ms", ours)
+            free[0].set(title=f"{dataset}, {splits[dataset][0]}", xlabel="one query [ms]")
+        for axis in free[1 if timed else 0 :]:
+            axis.set_visible(False)
     handles: dict[str, Artist] = {}
     for axis in grid.flat:
         handles |= dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
-    figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=7, fontsize=9)
+    figure.legend(
+        list(handles.values()), list(handles), loc="outside lower center", ncols=min(6, 2 * columns)
+    )
     save(figure, path)
+
+
+def _panel(axis: Any, rows: Sequence[Row], horizontal: str, ours: str) -> None:
+    for name in dict.fromkeys(row.method for row in rows):
+        own: Iterable[Row] = sorted((r for r in rows if r.method == name), key=lambda r: r.budget_s or 0)
+        known = [(getattr(r, horizontal), r.score_db, r.spread_db or 0.0) for r in own]
+        points = [(max(x, LEAST_S), *rest) for x, *rest in known if x is not None]
+        if points:
+            colour, mark = look(name)
+            style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 6, "capsize": 2}
+            axis.errorbar(*zip(*points, strict=True), label=name, **style)
+    logarithmic(axis, fine=False)

@@ -13,6 +13,7 @@ from gsparc.data.campaigns.newrf import is_newrf, read_newrf
 from gsparc.data.campaigns.recognise import LOADERS, campaign_of
 from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.checks import outliers
+from gsparc.data.checks.proposal import proposal
 from gsparc.data.errors import DataError
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
@@ -76,13 +77,13 @@ def raw_of(
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """(topic, sentence) pairs about a dataset."""
     site = data.site
-    places = data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
+    places = places_of(data)
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
-        ("neighbours", _neighbours(places, site.wavelength)),
+        ("neighbours", neighbours(places, site.wavelength)),
     ]
     lines += [("units?", hint) for hint in suspicious_values(data)]
     lines += [("outliers?", said) for said in outliers.warnings(data)]
@@ -110,10 +111,16 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     if data.release_split is not None:
         train, test = data.release_split
         lines.append(("split", f"its own: {len(train)} rows to train, {len(test)} to test"))
+    lines.append(("split?", proposal(data)))
     if site.convergence_error is not None:
         lines.append(("convergence", f"solver error (NMSE between two seeds) {site.convergence_error:.3g}"))
     lines.append(("sha256", site.sha256))
     return lines
+
+
+def places_of(data: Measurements) -> np.ndarray:
+    """Places (n, 3) or (n, 6) [m], one of each visit."""
+    return data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
 
 
 def _targets(data: Measurements) -> str:
@@ -126,7 +133,8 @@ def _targets(data: Measurements) -> str:
     return f"{count} received powers"
 
 
-def _neighbours(positions: np.ndarray, wavelength: float | None) -> str:
+def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
+    """How far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
     distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
     text = f"the nearest one is {np.median(distance):.3g} m away (median)"
     if wavelength is not None:
@@ -140,6 +148,9 @@ def _static(site: Site) -> str:
     if site.static_end is None:
         return "neither end"
     end = ENDS[site.static_end]
+    if site.stations is not None and len(site.stations) == 1:
+        place = site.stations.position[0] + site.origin
+        return f"the {end}, {site.stations.name[0]}, at ({', '.join(f'{x:.3f}' for x in place)}) m"
     if site.stations is not None:
         extent = " x ".join(f"{e:.2f}" for e in np.ptp(site.stations.position, axis=0))
         return f"the {end}, {len(site.stations)} stations in a box of {extent} m: {_some(site.stations.name)}"

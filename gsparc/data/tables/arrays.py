@@ -151,6 +151,8 @@ class Builder:
             return self._wide(labels, where)
         column = self.chosen.get("station", (None,))[0]
         if column is None:
+            if self.listed is not None and len(self.listed.names) == 1:
+                return self._by_list(np.array(self.listed.names * len(self.sheet.rows)))
             if self.listed is not None:
                 fault = "no column says which station a row is of; say dataset.columns.station=COLUMN"
                 return self.problems.add(self.sheet.source, fault)

@@ -71,7 +71,9 @@ def understand_table(
     builder = Builder(sheet, chosen, listed, problems)
     arrays = builder.build()
     problems.raise_if_any()
-    return Table(Raw(arrays), (*notes, *guessed, *builder.notes))
+    unit = chosen["rssi_db"][0].unit if "rssi_db" in chosen else None
+    about = {} if unit is None else {"level_unit": unit.name}
+    return Table(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 
 def sheet_of(path: str | Path) -> tuple[Sheet, list[str]]:

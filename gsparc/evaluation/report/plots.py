@@ -16,7 +16,7 @@ from matplotlib.ticker import NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
-from gsparc.evaluation.drawing import logarithmic, panels, save
+from gsparc.evaluation.drawing import PALETTE, logarithmic, look, panels, save
 from gsparc.evaluation.figures import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.intervals import interval, over_seeds
 from gsparc.evaluation.report.learning import curve, validation_figure
@@ -44,7 +44,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
     name, axes = runs[0].figure, _axes()
     points: list[tuple[float, float]] = []
-    for number, (setting, group) in enumerate(grouped(runs).items()):
+    for (setting, group), color in _coloured(runs):
         for run in group:
             p50, p95 = run.latency
             found = interval(run, name)
@@ -54,19 +54,20 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
             axes.errorbar(
                 [p50], [found.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
                 yerr=[[max(found.value - low, 0.0)], [max(high - found.value, 0.0)]],
-                fmt="o", ms=4, lw=0.7, color=f"C{number % 10}",
+                fmt="o", ms=4, lw=0.7, color=color,
                 label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, found.value))
     for base in BASELINES:
         value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
         if value is not None and ms is not None:
-            axes.scatter([ms], [value], marker="s", s=16, c="0.5")
+            colour, mark = look(base)
+            axes.scatter([ms], [value], marker=mark, s=16, color=colour)
             how: dict[str, Any] = {
                 "xytext": (4, -3),
                 "textcoords": "offset points",
                 "fontsize": 7,
-                "color": "0.4",
+                "color": colour,
             }
             axes.annotate(base, (ms, value), **how)
             points.append((float(ms), float(value)))
@@ -90,14 +91,16 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].kind], _axes()
-    for number, (setting, group) in enumerate(grouped(runs).items()):
+    for (setting, group), color in _coloured(runs):
         values = [sizes(run, name) for run in group if name in run.samples]
         if values:
             pooled = np.concatenate(values)
-            _cdf(axes, pooled[np.isfinite(pooled)], setting, number, samples=len(values[0]))
+            _cdf(axes, pooled[np.isfinite(pooled)], setting, color, samples=len(values[0]))
     rival = runs[0].samples.get(f"baseline/gp/{name}")
     if rival is not None:
-        axes.step(np.sort(rival), np.arange(1, len(rival) + 1) / len(rival), c="k", lw=0.8, label="gp")
+        axes.step(
+            np.sort(rival), np.arange(1, len(rival) + 1) / len(rival), c=look("gp")[0], lw=0.8, label="gp"
+        )
     axes.set_ylabel("share of samples")
     title = "How the accuracy is distributed (95 % bands)"
     return _finished(axes, title, f"{heading_of(name)} of a test sample")
@@ -111,17 +114,17 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     names = [name for name in CDFS[runs[0].kind] if name in runs[0].samples]
     timed = any(len(run.render_ms) for run in runs)
     figure, ((*line,),) = panels(4.2 * (len(names) + timed), 3.9, 1, len(names) + timed)
-    for number, (setting, group) in enumerate(grouped(runs).items()):
+    for (setting, group), color in _coloured(runs):
         seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
         ms = [p50 for p50, _ in (run.latency for run in group) if p50 is not None]
         label = f"{short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
         for axes, name in zip(line, names, strict=False):
             values = np.abs(np.concatenate([run.samples[name] for run in group]))
-            _cdf(axes, values[np.isfinite(values)], label, number, samples=len(group[0].samples[name]))
+            _cdf(axes, values[np.isfinite(values)], label, color, samples=len(group[0].samples[name]))
             axes.set_xlabel(heading_of(name))
         if timed:
             every = [run.render_ms for run in group if len(run.render_ms)]
-            _cdf(line[-1], np.concatenate(every), label, number)
+            _cdf(line[-1], np.concatenate(every), label, color)
             line[-1].set_xlabel("one query, alone [ms]")
             logarithmic(line[-1], fine=True)
     for axes, name in zip(line, names, strict=False):
@@ -137,23 +140,22 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
 
 def latency_cdf(runs: Sequence[Run]) -> Figure | None:
     """Share of single queries that take at most so long; None where none were timed one by one."""
-    timed = {k: g for k, g in grouped(runs).items() if any(len(run.render_ms) for run in g)}
+    timed = [run for run in runs if len(run.render_ms)]
     if not timed:
         return None
     axes = _axes()
-    for number, (setting, group) in enumerate(timed.items()):
-        _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, number)
+    for (setting, group), color in _coloured(timed):
+        _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, color)
     axes.set_xscale("log")
     axes.set_ylabel("share of queries")
     title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
     return _finished(axes, title, "one query, end to end [ms]")
 
 
-def _cdf(axes: Axes, values: np.ndarray, label: str, number: int, samples: int | None = None) -> None:
+def _cdf(axes: Axes, values: np.ndarray, label: str, color: str, samples: int | None = None) -> None:
     """With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart)."""
     share = np.arange(1, len(values) + 1) / len(values)
     half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * (samples or len(values))))
-    color = f"C{number % 10}"
     axes.step(np.sort(values), share, where="post", color=color, lw=1.2, label=label)
     low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
     axes.fill_between(np.sort(values), low, high, step="post", color=color, alpha=0.08, lw=0)
@@ -162,8 +164,8 @@ def _cdf(axes: Axes, values: np.ndarray, label: str, number: int, samples: int |
 def learning(runs: Sequence[Run]) -> Figure:
     """Validation accuracy against seconds of learning; settings of several seeds as a band."""
     name, axes = validation_figure(runs[0]), _axes()
-    for number, (setting, group) in enumerate(grouped(runs).items()):
-        color, curves = f"C{number % 10}", [curve(run) for run in group]
+    for (setting, group), color in _coloured(runs):
+        curves = [curve(run) for run in group]
         for run, (seconds, values) in zip(group, curves, strict=True):
             label = setting if run is group[0] else None
             axes.plot(
@@ -191,7 +193,7 @@ def costs(runs: Sequence[Run]) -> Figure:
         heading_of(name): lambda run: run.figure_of(name),
     }
     for panel, (title, value) in zip(line, columns.items(), strict=True):
-        for row, group in enumerate(groups.values()):
+        for row, ((_, group), color) in enumerate(_coloured(runs)):
             known = [float(v) for v in map(value, group) if v is not None]
             if not known:
                 panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
@@ -199,7 +201,7 @@ def costs(runs: Sequence[Run]) -> Figure:
             found = over_seeds(known)
             low, high = found.low or found.value, found.high or found.value
             reach = [[found.value - low], [high - found.value]]
-            panel.barh(row, found.value, color=f"C{row % 10}", alpha=0.8)
+            panel.barh(row, found.value, color=color, alpha=0.8)
             panel.errorbar([found.value], [row], xerr=reach, c="k", lw=0.8)
             panel.text(found.value, row, f" {found.value:.3g}", va="center", fontsize=7)
         panel.set_title(title, fontsize=8)
@@ -223,8 +225,8 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
         for method, value in found.items():
             if value is not None:
                 series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
-    for number, (method, by_count) in enumerate(series.items()):
-        counts, color = sorted(by_count), f"C{number % 10}"
+    for method, by_count in series.items():
+        counts, color = sorted(by_count), look(method)[0]
         mean, low, high = ([float(of(by_count[n])) for n in counts] for of in (np.mean, min, max))
         axes.plot(counts, mean, "o-", ms=3, lw=1, color=color, label=method)
         axes.fill_between(counts, low, high, color=color, alpha=0.15, lw=0)
@@ -247,7 +249,7 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
         stated, value = stated[known], value[known]
         if len(stated) < 3 or np.ptp(stated) == 0:
             continue
-        rank, color = spearmanr(stated, value).statistic, f"C{number % 10}"
+        rank, color = spearmanr(stated, value).statistic, PALETTE[number]
         order, count = np.argsort(-stated, kind="stable"), np.arange(1, len(stated) + 1)
         share, mean = count / len(count), np.cumsum(value[order]) / count
         error = value.std(ddof=1) / np.sqrt(count)
@@ -259,6 +261,15 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     kept.set_title("mean over the answers used (95 % band)", fontsize=8)
     _legend(points)
     return figure
+
+
+def _coloured(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], str]]:
+    """Settings with their runs and a colour: a method's own where each has one setting, else one by one."""
+    groups = grouped(runs)
+    names = [str(group[0].facts.get("model/name")) for group in groups.values()]
+    alone = len(set(names)) == len(names)
+    colours = [look(name)[0] if alone else PALETTE[i % len(PALETTE)] for i, name in enumerate(names)]
+    return list(zip(groups.items(), colours, strict=True))
 
 
 def _axes() -> Axes:

@@ -1,0 +1,42 @@
+"""What the site takes from elsewhere: pages beside the README, and notebooks as they were executed."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[2]
+EXECUTED = ROOT / "build" / "executed"
+TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages of `TAKEN`; show executed notebooks where there are."""
+    for file in files:
+        if file.src_uri.endswith(".ipynb") and (EXECUTED / file.src_uri).exists():
+            file.src_dir = str(EXECUTED)
+    for name in TAKEN:
+        text = (ROOT / name).read_text(encoding="utf-8").replace("](docs/", "](")
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, **unused: Any) -> str:
+    """Links to the README lead to the start page, those to taken pages to these."""
+    markdown = re.sub(r"\]\((?:\.\./)+README\.md(#[\w-]*)?\)", "](index.md)", markdown)
+    return re.sub(r"\]\(\.\./(ARCHITECTURE|CONTRIBUTING|CHANGELOG)\.md", r"](\1.md", markdown)
+
+
+def on_post_page(output: str, page: Any, config: Any) -> str:
+    """Links of notebooks lead to pages; the theme's search takes its script from here, not from a network."""
+    if page.file.src_uri.endswith(".ipynb"):
+        output = re.sub(r'href="(?!\w+:)([^"#]+)\.md(#[^"]*)?"', r'href="\1.html\2"', output)
+        name = page.file.src_uri.rpartition("/")[2]
+        output = output.replace(
+            "</h1>", f'</h1><p><a href="{name}" download>Download this notebook</a></p>', 1
+        )
+    up = "../" * page.url.count("/")
+    return output.replace("https://unpkg.com/iframe-worker/shim", f"{up}site/iframe-worker.js")

@@ -1,0 +1,28 @@
+"""Plugins as choices of `model=` and `dataset=`."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+from hydra.core.config_store import ConfigStore
+from hydra.utils import get_class
+
+from gsparc.data.plugins import GROUPS, plugins, settings_of
+
+
+def offer() -> None:
+    """Make every plugin a choice of its config group, with its settings and their defaults.
+
+    One that cannot be imported is warned of and left out.
+    """
+    for group in GROUPS:
+        for name, path in plugins(group).items():
+            try:
+                own = settings_of(get_class(path))
+            except Exception as error:  # whatever another package does when it is imported
+                warnings.warn(f"plugin {name} ({path}) is left out: {error}", stacklevel=1)
+                continue
+            shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
+            node = {"_target_": path, **own, **shared}
+            ConfigStore.instance().store(name=name, group=group, node=node, provider="plugin")

@@ -1,0 +1,37 @@
+"""`%gsparc` in a notebook: what a command says, without times, and an error where it fails."""
+
+from __future__ import annotations
+
+import pytest
+
+import gsparc
+from gsparc.commands import notebook
+
+
+def test_a_command_says_what_it_says_in_a_shell(capsys):
+    notebook.run("--help")
+    assert "train a method on a dataset" in capsys.readouterr().out
+
+
+def test_settings_may_stand_on_lines_and_a_failure_is_raised(capsys):
+    with pytest.raises(RuntimeError, match="no command is called 'trian'; did you mean 'train'"):
+        notebook.run("trian", "model=gp  # a comment\ndataset=own")
+
+
+@pytest.mark.parametrize(
+    ("line", "shown"),
+    [
+        ("[2026-11-21 22:39:04,835][gsparc.x][INFO] - said", "said"),
+        ("[2026-11-21 22:39:04,835][gsparc.x][WARNING] - said", "WARNING: said"),
+    ],
+)
+def test_times_are_left_out(line, shown, monkeypatch, capsys):
+    monkeypatch.setattr(notebook.sys, "executable", "/bin/echo")  # says its arguments
+    notebook.run(f"'{line}'")
+    text = capsys.readouterr().out.removeprefix("-m gsparc ")
+    found = notebook.STAMP.match(text)
+    assert found and notebook.STAMP.sub("" if found[1] == "INFO" else r"\1: ", text).strip() == shown
+
+
+def test_the_extension_is_found_by_its_package():
+    assert gsparc.load_ipython_extension is notebook.load_ipython_extension

@@ -1,0 +1,33 @@
+"""The split that `gsparc check` proposes can be cut, and asks about holes wider than the places are apart."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsparc.data.checks.proposal import held_out, proposal, side_of_squares
+from gsparc.data.own import load_own, write_own
+
+
+def powers(file, places):
+    write_own(
+        file,
+        {"rx_position": places, "tx_position": np.zeros(3), "rssi_db": np.linspace(-80, -40, len(places))},
+    )
+    return load_own(file)
+
+
+def test_squares_are_a_tenth_of_the_site_or_several_neighbours_wide(tmp_path):
+    rng = np.random.default_rng(0)
+    data = powers(tmp_path / "a.npz", rng.uniform([0, 0, 1], [270, 200, 1], (400, 3)))
+    assert side_of_squares(data) == 30.0
+    assert 0.15 < len(held_out(data, 30.0)) / 400 < 0.5
+    assert "split=blocks split.side_m=30 " in proposal(data)
+    sparse = powers(
+        tmp_path / "b.npz", np.array([[x, y, 1.0] for x in range(0, 60, 10) for y in range(0, 60, 10)])
+    )
+    assert side_of_squares(sparse) is None and "too few places" in proposal(sparse)
+
+
+def test_one_place_alone_has_no_squares(tmp_path):
+    data = powers(tmp_path / "a.npz", np.tile([1.0, 2.0, 3.0], (5, 1)) + [[0, 0, 0.1 * i] for i in range(5)])
+    assert side_of_squares(data) is None

@@ -1,0 +1,118 @@
+"""Methods and datasets of other packages: found, trained, stored, compared; a broken one disturbs nobody."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from campaigns import compose, spectra
+from hydra.core.config_store import ConfigStore
+
+import gsparc
+from gsparc.commands.compare.cells import code_version, plugged
+from gsparc.commands.plugins import offer
+from gsparc.commands.train import train
+from gsparc.data.load import datamodule
+from gsparc.methods.registry import build, method_class
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """Makes a project's entry points known as an installation would."""
+
+    def install(project: Path) -> None:
+        declared = tomllib.loads((project / "pyproject.toml").read_text())["project"]
+        info = tmp_path / "site" / f"{declared['name'].replace('-', '_')}-{declared['version']}.dist-info"
+        info.mkdir(parents=True)
+        (info / "METADATA").write_text(f"Name: {declared['name']}\nVersion: {declared['version']}\n")
+        groups = declared["entry-points"].items()
+        lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in of.items()) for group, of in groups]
+        (info / "entry_points.txt").write_text("\n".join(lines))
+        monkeypatch.syspath_prepend(str(project))
+        monkeypatch.syspath_prepend(str(info.parent))
+        importlib.invalidate_caches()
+        offer()
+
+    monkeypatch.setattr(ConfigStore.instance(), "repo", {**ConfigStore.instance().repo})
+    for group in ("model", "dataset"):
+        ConfigStore.instance().repo[group] = {**ConfigStore.instance().repo.get(group, {})}
+    return install
+
+
+def test_the_template_is_short():
+    assert len((EXAMPLES / "own-method" / "own_method.py").read_text().splitlines()) < 60
+
+
+def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
+    installed(EXAMPLES / "own-method")
+    config = compose(
+        "dataset=corridor",
+        "dataset.count=60",
+        "model=nearest_k",
+        "model.k=2",
+        "baselines=[mean]",
+        "logger=none",
+    )
+    facts, objects = train(config, tmp_path)
+    assert facts["model/name"] == "nearest_k" and objects.methods[0].k == 2
+    assert facts["test/rmse_db"] < facts["baseline/mean/rmse_db"]
+    predictor = gsparc.load(objects.checkpoints[0])  # its class is out of a file, and of a plugin: trusted
+    assert predictor.rssi(rx=[30.0, 1.0, 1.5]).shape == (1,)
+    assert datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name == "corridor"
+    assert plugged()["nearest_k"].overrides(None) == ["model=nearest_k"]
+
+
+def test_without_the_plugin_its_checkpoint_is_refused(installed, tmp_path):
+    with pytest.raises(ValueError, match="refused"):
+        build({"_target_": "own_method.NearestK"}, trusted=False)
+    with pytest.raises(ValueError, match="no method is called 'nearest_k'"):
+        method_class("nearest_k")
+
+
+def test_another_text_of_a_plugin_is_another_method(installed, tmp_path, monkeypatch):
+    """A kept result of a comparison is not taken for that of changed code."""
+    (tmp_path / "my_plugin").mkdir()
+    (tmp_path / "my_plugin" / "__init__.py").write_text("")
+    file = tmp_path / "my_plugin" / "method.py"
+    monkeypatch.syspath_prepend(str(tmp_path))
+    before = []
+    for number in (1, 22):
+        file.write_text(f"class Own:\n    depth = {number}\n")
+        sys.modules.pop("my_plugin.method", None)
+        importlib.invalidate_caches()
+        before.append(code_version({"_target_": "my_plugin.method.Own"}))
+    assert before[0] != before[1]
+
+
+def test_a_broken_plugin_is_warned_of(installed, tmp_path):
+    project = tmp_path / "broken"
+    project.mkdir()
+    entry = '[project.entry-points."gsparc.methods"]\nbroken = "no_such_module:Nothing"\n'
+    (project / "pyproject.toml").write_text(f'[project]\nname = "broken"\nversion = "1"\n{entry}')
+    with pytest.warns(UserWarning, match=r"plugin broken \(no_such_module.Nothing\) is left out"):
+        installed(project)
+
+
+def test_a_third_party_library_as_a_plugin(installed, tmp_path):
+    pytest.importorskip("gpytorch", reason="GPyTorch is not installed: pip install gpytorch")
+    installed(EXAMPLES / "gpytorch-method")
+    file = spectra(tmp_path / "own.npz")
+    config = compose(
+        "dataset=own",
+        f"dataset.file={file}",
+        "model=gpytorch",
+        "model.steps=5",
+        "baselines=[mean]",
+        "logger=none",
+    )
+    facts, objects = train(config, tmp_path)
+    assert facts["test/mse"] < facts["baseline/mean/mse"]
+    place = objects.data.moving[0] + objects.data.site.origin
+    predictor = gsparc.load(objects.checkpoints[0])
+    again = predictor.spectrum(**{objects.data.site.moving_end: place})
+    assert again.shape == objects.data.target.shape[1:]

@@ -1,0 +1,63 @@
+"""The documentation site: notebooks run, the build is strict, links lead somewhere, nothing is fetched."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+MOST_S = 240  # of processor time, of all notebooks
+
+
+class Links(HTMLParser):
+    """Addresses that a page leads to, and those that it fetches to be shown."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.leads: list[str] = []
+        self.fetches: list[str] = []
+        self.feed(page.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag, attributes):
+        found = dict(attributes)
+        if tag == "a" and found.get("href"):
+            self.leads.append(found["href"])
+        shown = tag == "link" and found.get("rel") in ("stylesheet", "icon", "preload")
+        self.fetches += [
+            found[key]
+            for key in ("src", "href")
+            if found.get(key) and (tag != "a") and (key == "src" or shown)
+        ]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_site_builds_strictly_and_its_notebooks_run(tmp_path):
+    for needed in ("mkdocs", "mkdocs_jupyter", "mkdocstrings", "material", "nbclient", "ipykernel"):
+        pytest.importorskip(needed, reason="the site needs the extra docs: make docs")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1"}
+    run = {"cwd": ROOT, "env": environment, "capture_output": True, "text": True}
+    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **run)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert int(re.search(r"5 notebooks: .* (\d+) s of processor", done.stderr)[1]) < MOST_S, done.stderr
+    subprocess.run(["make", "named"], check=True, **run)
+    site = tmp_path / "site"
+    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(site)], **run)
+    assert done.returncode == 0, done.stdout + done.stderr
+    pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
+    assert len(pages) > 30 and "rasterize" in (site / "search" / "search_index.js").read_text()
+    for page in pages:
+        links = Links(page)
+        assert not [a for a in links.fetches if re.match(r"(https?:)?//", a)], page
+        assert "unpkg.com" not in page.read_text(), "the theme's search fetches a script"
+        for address in {*links.leads, *links.fetches}:
+            path = unquote(address.partition("#")[0].partition("?")[0])
+            if path and not re.match(r"[a-z]+:", path):
+                assert (page.parent / path).exists(), f"{page.relative_to(site)}: {address}"
