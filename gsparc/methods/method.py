@@ -195,6 +195,14 @@ class LeaveOneOut(Protocol):
 
 
 @runtime_checkable
+class Reconditions(Protocol):
+    """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """A method of rows (n,) alone; None where more than settings would remember the others."""
+
+
+@runtime_checkable
 class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 

@@ -367,6 +367,15 @@ class Gsparc(LearnedField):
         mean = self._lean.predict(tx, rx).mean
         return replace(own, mean=own.mean.lerp_(mean, self._beside[1]))
 
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
+        if self.field is None or not self.field.forgets:
+            return None
+        found = copy.copy(self)
+        found.field = copy.deepcopy(self.field)
+        found.field.condition(data, rows)
+        return found
+
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `Differentiable`; of rasterized Gaussians, without a process beside them."""
         if self.field is not None:
