@@ -46,11 +46,15 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
         return found
     config = stored.configuration
     if "model" not in config:
-        raise DataError(f"{path}: does not say how it was trained; say promised=false for a map without promise")
+        raise DataError(
+            f"{path}: does not say how it was trained; say promised=false for a map without promise"
+        )
     try:
         run = open_files([path], dataset)
     except (ValueError, OSError) as error:
-        raise DataError(f"{error}; a promise needs the training data: dataset.file=..., or promised=false") from None
+        raise DataError(
+            f"{error}; a promise needs the training data: dataset.file=..., or promised=false"
+        ) from None
     if run.learned != 0 or run.foreign is not None:
         raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
     context = FitContext(
@@ -83,6 +87,11 @@ def plan_of(config: DictConfig) -> FloorPlan | None:
             raise DataError("plan_points: goes with an image, plan=FILE")
         return None
     return read_plan(settings["plan"], settings["plan_points"])
+
+
+def settings_of(config: DictConfig) -> RunSettings:
+    """The settings of a run, of which `stations` is not one here: it holds names."""
+    return RunSettings.of(OmegaConf.masked_copy(config, [key for key in config if key != "stations"]))
 
 
 def stations_of(given: Any) -> list[str | int] | None:
@@ -127,13 +136,15 @@ def lines_of(found: FieldMap, kept: Kept | None) -> list[str]:
         f"deviations: {kept.own_share:.1%}, {kept.own_width_db:.1f} dB)"
     )
     if refused:
-        said.append(f"{refused} of {int(found.grid.inside.sum())} cells are refused: too far from what was measured")
+        said.append(
+            f"{refused} of {int(found.grid.inside.sum())} cells are refused: too far from what was measured"
+        )
     return said
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Map, draw and write; returns the facts of `summary.json`."""
-    RunSettings.of(OmegaConf.masked_copy(config, [key for key in config if key != "stations"]))  # here: names
+    settings_of(config)
     run_dir, settings = run_directory(), plain(config)
     floor = plan_of(config)
     predictor = load(config.ckpt)

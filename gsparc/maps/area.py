@@ -19,6 +19,7 @@ from gsparc.maps.geojson import read_shapes
 from gsparc.methods.predictor import usual_heights
 
 CELLS = 20_000  # of a map whose step nobody chose, about
+HEIGHT = 1.5  # of a hand, where nothing says another [m]
 BYTES = 4 * 4  # of a cell and station: power, both ends of the interval, expected error
 BYTES_MORE = 8 * 8  # of a cell besides: what pictures and files hold for a while
 SHARE_OF_MEMORY = 0.5  # of the machine's, that a map may take
@@ -62,7 +63,7 @@ class Grid:
 
 
 def grid_of(
-    site: Site,
+    site: Site | None,
     area: Any = None,
     height_m: float | None = None,
     step_m: float | None = None,
@@ -72,7 +73,7 @@ def grid_of(
     """The cells of a map.
 
     Args:
-        site: of the model.
+        site: of the model; None before there is one: then an area or a plan says where.
         area: (x0, y0, x1, y1) [m], world; a GeoJSON file of polygons; None: the plan's extent, or where was
             measured.
         height_m: of all cells, world; None: the height at which the moving end was, the middle of several.
@@ -107,18 +108,20 @@ def grid_of(
     return Grid(x, y, height, step, inside)
 
 
-def _outline(site: Site, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:
+def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:
     """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
     if isinstance(area, str | Path):
         if Path(area).suffix.lower() not in (".geojson", ".json"):
             raise DataError(f"area={area}: expected [x0,y0,x1,y1] in metres, or a *.geojson file")
-        shapes = read_shapes(area, "area", site.georeference)
+        shapes = read_shapes(area, "area", None if site is None else site.georeference)
         return *shapes.bounds(), shapes.contains
     if area is not None:
         return *_rectangle(area), None
     if plan is not None:
         corners = plan.corners()
         return corners.min(axis=0), corners.max(axis=0), Outline(corners).contains_points
+    if site is None:
+        raise DataError("area: nothing says where; give ckpt=FILE, area=[x0,y0,x1,y1] or plan=IMAGE")
     if site.moving_box is None:
         raise DataError("area: this model, of an earlier version, does not say where was measured; give it")
     low, high = site.moving_box[:, -3:][:, :2] + site.origin[:2]
@@ -145,11 +148,13 @@ def _said(area: Any) -> str:
     return str(list(area)) if isinstance(area, Sequence) and not isinstance(area, str) else str(area)
 
 
-def _height(site: Site, given: float | None) -> float:
+def _height(site: Site | None, given: float | None) -> float:
     if given is not None:
         if not (np.isfinite(given) and abs(given) < FARTHEST):
             raise DataError(f"height_m={given}: a finite number of metres is needed")
         return float(given)
+    if site is None:
+        return HEIGHT
     known = usual_heights(site).get(site.moving_end)
     if known is not None:
         return known

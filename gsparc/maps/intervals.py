@@ -8,7 +8,7 @@ distance). Farther than any held-out row nothing is known, and nothing is said.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from sklearn.isotonic import IsotonicRegression
 LEAST_ROWS = 40  # held out, for any promise
 ROWS_OF_A_BIN = 150
 MOST_BINS = 8
+ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
 TAIL = np.concatenate([[0.001, 0.002, 0.005], np.linspace(0.01, 0.99, 99), [0.995, 0.998, 0.999]])
 
@@ -83,6 +84,7 @@ class Calibration:
         rms: (K,) expected error, in deviations.
         tail: (Q,) quantiles `TAIL` of errors in expected errors; None where silent rows hide some of them.
         reach: beyond this distance nothing is said [m].
+        station: (T,) what deviations of each are multiplied with before; of those not among them, 1.
     """
 
     share: float
@@ -91,14 +93,15 @@ class Calibration:
     rms: np.ndarray
     tail: np.ndarray | None
     reach: float
+    station: np.ndarray
 
-    def interval(self, spread_db: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        """Half the interval (n,) [dB]; NaN out of reach."""
-        return self._of(self.half, spread_db, distance)
+    def interval(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
+        """Half the interval (n,) [dB] at places of stations (n,); NaN out of reach."""
+        return self._of(self.half, spread_db, distance, station)
 
-    def expected_error(self, spread_db: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    def expected_error(self, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray) -> np.ndarray:
         """Root mean square error (n,) [dB]; NaN out of reach."""
-        return self._of(self.rms, spread_db, distance)
+        return self._of(self.rms, spread_db, distance, station)
 
     def below(self, level_db: float, mean_db: np.ndarray, expected_db: np.ndarray) -> np.ndarray:
         """Probability (n,) that the truth lies below a level; NaN where it is not known."""
@@ -108,8 +111,11 @@ class Calibration:
         chance = np.interp(standard, self.tail, TAIL)
         return np.where(np.isfinite(standard), chance, np.nan)
 
-    def _of(self, factor: np.ndarray, spread_db: np.ndarray, distance: np.ndarray) -> np.ndarray:
-        scaled = spread_db * np.interp(distance, self.distance, factor)
+    def _of(
+        self, factor: np.ndarray, spread_db: np.ndarray, distance: np.ndarray, station: np.ndarray
+    ) -> np.ndarray:
+        own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
+        scaled = own * spread_db * np.interp(distance, self.distance, factor)
         return np.where(distance <= self.reach, scaled, np.nan)
 
 
@@ -128,12 +134,16 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
         raise ValueError(
             f"{len(used)} held-out rows are too few for a promise about a map; {LEAST_ROWS} at least are needed"
         )
+    blocks = len(np.unique(used.block))
+    level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
+    station = _of_stations(used, level)
+    used = replace(used, spread_db=used.spread_db * station[used.station])
     order = np.argsort(used.distance, kind="stable")
     count = int(np.clip(len(used) // ROWS_OF_A_BIN, 1, MOST_BINS))
     bins = [used.at(rows) for rows in np.array_split(order, count)]
     size = np.abs(used.error)
     middle = np.array([float(np.median(one.distance)) for one in bins])
-    half = np.array([_quantile(np.abs(one.error), one.block, share) for one in bins])
+    half = np.array([float(np.quantile(np.abs(one.error), level)) for one in bins])
     rms = np.array([float(np.sqrt(np.mean(one.error**2))) for one in bins])
     typical = np.array([float(np.median(one.spread_db)) for one in bins])
     weight = np.array([len(one) for one in bins], float)
@@ -143,20 +153,30 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
         standard = used.error / np.interp(used.distance, middle, rms)
         tail = np.quantile(standard, TAIL)
         tail = tail + np.arange(len(tail)) * 1e-9 * max(float(size.max()), 1.0)  # no two are equal
-    return Calibration(share, middle, half, rms, tail, float(np.quantile(used.distance, REACH)))
+    return Calibration(share, middle, half, rms, tail, float(np.quantile(used.distance, REACH)), station)
 
 
-def _quantile(size: np.ndarray, block: np.ndarray, share: float) -> float:
-    """Of errors (n,), with the correction of conformal prediction for so many blocks."""
-    blocks = len(np.unique(block))
-    return float(np.quantile(size, min(share * (1 + 1 / max(blocks, 1)), 1.0)))
+def _of_stations(used: Evidence, level: float) -> np.ndarray:
+    """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
+    size = np.abs(used.error)
+    whole = float(np.quantile(size, level))
+    found = np.ones(int(used.station.max()) + 1)
+    for number in np.unique(used.station) if len(found) > 1 and whole > 0 else ():
+        own = used.station == number
+        if own.sum() >= LEAST_ROWS:
+            blocks = len(np.unique(used.block[own]))
+            ratio = max(float(np.quantile(size[own], level)), 1e-3 * whole) / whole
+            found[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
+    return found
 
 
 def _rising(distance: np.ndarray, width: np.ndarray, weight: np.ndarray) -> np.ndarray:
     if len(distance) == 1:
         return width
-    return IsotonicRegression().fit(np.arange(len(distance)), width, sample_weight=weight).predict(
-        np.arange(len(distance))
+    return (
+        IsotonicRegression()
+        .fit(np.arange(len(distance)), width, sample_weight=weight)
+        .predict(np.arange(len(distance)))
     )
 
 
@@ -165,7 +185,7 @@ def held(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.n
 
     A silent row is in an interval that reaches below its level.
     """
-    half = calibration.interval(evidence.spread_db, evidence.distance)
+    half = calibration.interval(evidence.spread_db, evidence.distance, evidence.station)
     inside = np.abs(evidence.error * evidence.spread_db) <= half
     return inside & np.isfinite(half), 2 * half
 

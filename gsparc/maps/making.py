@@ -68,7 +68,7 @@ def map_of(
     site = predictor.site
     if site.kind not in MAPPED:
         raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
-    names, notes = _answering(predictor, stations)
+    names, notes = answering(predictor, stations)
     grid = grid_of(site, area, height_m, step_m, plan, len(names))
     share_of = loads(load, names)
     if dry:
@@ -105,12 +105,14 @@ def map_of(
     )  # fmt: skip
 
 
-def _answering(predictor: Predictor, wanted: Sequence[str | int] | None) -> tuple[list[str], list[str]]:
+def answering(predictor: Predictor, wanted: Sequence[str | int] | None) -> tuple[list[str], list[str]]:
     """Names of the stations that are mapped, and what must be said of the others."""
     stations = predictor.site.stations
     if stations is None:
         if wanted is not None:
-            raise DataError(f"stations={list(wanted)}: the model of {predictor.site.name} has one; leave it out")
+            raise DataError(
+                f"stations={list(wanted)}: the model of {predictor.site.name} has one; leave it out"
+            )
         return [""], []
     names: list[str] = []
     for one in wanted if wanted is not None else stations.name:
@@ -144,11 +146,11 @@ def _ask(
     predictor: Predictor, places: np.ndarray, other: Sequence[float] | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Level and deviation (n,) [dB] at world places (n, 3)."""
-    ends = _ends(predictor.site, places, other)
+    ends = ends_of(predictor.site, places, other)
     return predicted(predictor.predict(**ends), predictor.site.kind)
 
 
-def _ends(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
+def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
     if site.static_end is not None:
         if other is not None:
             raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
@@ -180,7 +182,8 @@ def _described(
         if site.static_end is None and other is not None:
             local = np.hstack([np.broadcast_to(np.asarray(other) - site.origin, local.shape), local])
         far = promise.distance(local, station)
-        half, error = calibration.interval(spread, far), calibration.expected_error(spread, far)
+        own = np.full(len(far), station)
+        half, error = calibration.interval(spread, far, own), calibration.expected_error(spread, far, own)
     mean = np.where(np.isfinite(half), mean, np.nan)
     return mean, mean - half, mean + half, np.where(np.isfinite(mean), error, np.nan)
 
@@ -222,7 +225,7 @@ def _path_layers(
     for start in range(0, len(told), CHUNK):
         cells = told[start : start + CHUNK]
         try:
-            found = predictor.paths(**_ends(predictor.site, grid.places(cells), None))
+            found = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
         except ValueError:  # what was fitted has none
             return {}
         power = np.abs(found.gain).astype(np.float64) ** 2

@@ -26,7 +26,12 @@ PLAN_PIXELS = 1600  # of a plan's longer side
 
 
 def write_page(
-    path: Path, found: FieldMap, drawn: Sequence[Layer], title: str, lines: Sequence[str], plan: FloorPlan | None
+    path: Path,
+    found: FieldMap,
+    drawn: Sequence[Layer],
+    title: str,
+    lines: Sequence[str],
+    plan: FloorPlan | None,
 ) -> None:
     """Write a page that needs nothing but itself.
 

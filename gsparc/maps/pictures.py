@@ -16,6 +16,9 @@ from matplotlib.transforms import Affine2D
 from gsparc.evaluation.drawing import panels, save
 from gsparc.maps.field_map import REFUSED, FieldMap
 from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.planning import Plan
+from gsparc.maps.promise import Promise
+from gsparc.methods.predictor import Predictor
 
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
@@ -60,8 +63,8 @@ def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
         unit: of powers: `dBm` where they are.
     """
     several = len(found.stations) > 1
-    of = "strongest station, " if several else ""
-    yield Layer("power", f"received power, {of}[{unit}]", found.strongest(found.power_db))
+    of = " of the strongest station" if several else ""
+    yield Layer("power", f"received power{of} [{unit}]", found.strongest(found.power_db))
     if several:
         values = np.where(found.best_server == REFUSED, np.nan, found.best_server.astype(float))
         yield Layer("best_server", "strongest station", values, words=found.stations)
@@ -118,7 +121,9 @@ def draw_layer(
     if layer.words:
         count = len(layer.words)
         colours = ListedColormap(colormaps["tab20"](np.arange(count) % 20))
-        drawn = axis.imshow(layer.values, cmap=colours, norm=BoundaryNorm(np.arange(count + 1) - 0.5, count), **how)
+        drawn = axis.imshow(
+            layer.values, cmap=colours, norm=BoundaryNorm(np.arange(count + 1) - 0.5, count), **how
+        )
         bar = figure.colorbar(drawn, ax=axis, ticks=np.arange(count), shrink=0.85, pad=0.02)
         bar.ax.set_yticklabels(layer.words)
     else:
@@ -129,7 +134,9 @@ def draw_layer(
         bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
     bar.set_label(layer.label)
     draw_places(axis, found)
-    axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
+    axis.set(
+        xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title
+    )
     axis.ticklabel_format(useOffset=False, style="plain")
     scale_bar(axis, right - left)
     if more is not None:
@@ -139,6 +146,8 @@ def draw_layer(
     handles, _ = axis.get_legend_handles_labels()
     if handles:
         figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=0.12, h_pad=0.1)  # axes of equal scales take more than their share
     save(figure, path, 110)
 
 
@@ -173,6 +182,47 @@ def draw_places(axis: Any, found: FieldMap) -> None:
             note.set_in_layout(False)
 
 
+def draw_plan_picture(
+    found: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
+) -> None:
+    """Expected error before and after, the chosen places, and how it falls."""
+    left, right, low, high = found.grid.extent
+    wide = (right - left) / max(right - left, high - low)
+    tall = (high - low) / max(right - left, high - low)
+    figure, ((before, after, curve),) = panels(
+        11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
+    )
+    errors = np.concatenate([found.error_before, found.error_after])
+    limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
+    for axis, values, title in ((before, found.error_before, "before"), (after, found.error_after, "after")):
+        if plan is not None:
+            draw_plan(axis, plan)
+        image = np.full(found.grid.shape, np.nan)
+        image[found.grid.inside] = values
+        drawn = axis.imshow(
+            image, origin="lower", extent=found.grid.extent, cmap="cividis", alpha=1 if plan is None else 0.65,
+            zorder=1, **limits,
+        )  # fmt: skip
+        axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", title=title)
+        scale_bar(axis, right - left)
+    if promise is not None and predictor is not None:
+        places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
+        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        before.plot(*few.T, "k.", markersize=float(np.clip(2500 / len(few), 0.3, 6.0)), alpha=0.5, zorder=2)
+    after.plot(*found.places[:, :2].T, "-" if found.length_m and (np.diff(found.chosen) != 1).any() else "",
+               marker="o", color="red", markeredgecolor="white", markersize=6, linewidth=1, zorder=3)  # fmt: skip
+    for number, place in enumerate(found.places[:60], 1):
+        after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
+                       path_effects=OUTLINE, zorder=4)  # fmt: skip
+    figure.colorbar(drawn, ax=[before, after], label="expected error [dB]", shrink=0.8)
+    curve.plot(np.append(found.before_db, found.expected_db[np.argsort(found.chosen)]), ".-")
+    curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
+    curve.grid(alpha=0.3)
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=0.12, h_pad=0.1)
+    save(figure, path, 100)
+
+
 def scale_bar(axis: Any, width: float) -> None:
     """A bar of a round length, about a fifth of the map wide."""
     wanted = width / 5
@@ -183,6 +233,12 @@ def scale_bar(axis: Any, width: float) -> None:
     x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
     axis.plot([x, x + length], [y, y], color="black", linewidth=4, solid_capstyle="butt", zorder=6,
               path_effects=[withStroke(linewidth=6, foreground="white")])  # fmt: skip
-    said = f"{length / 1000:g} km" if length >= 1000 else f"{length:g} m" if length >= 1 else f"{length * 100:g} cm"
+    said = (
+        f"{length / 1000:g} km"
+        if length >= 1000
+        else f"{length:g} m"
+        if length >= 1
+        else f"{length * 100:g} cm"
+    )
     axis.annotate(said, (x + length / 2, y), xytext=(0, 5), textcoords="offset points", ha="center",
                   fontsize="small", path_effects=OUTLINE, zorder=6)  # fmt: skip

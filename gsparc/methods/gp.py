@@ -211,6 +211,10 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
+    def process(self) -> PowerProcess | None:
+        """See `HasProcess`."""
+        return self.powers
+
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
         if self.powers is None:

@@ -20,6 +20,7 @@ from gsparc.ops import Pose
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
+    from gsparc.methods.power_process import PowerProcess
 
 StationModels = Literal["each", "together"]
 
@@ -200,6 +201,14 @@ class Reconditions(Protocol):
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """A method of rows (n,) alone; None where more than settings would remember the others."""
+
+
+@runtime_checkable
+class HasProcess(Protocol):
+    """A Gaussian process on powers says what it does not know."""
+
+    def process(self) -> PowerProcess | None:
+        """The process; None where what was fitted has none."""
 
 
 @runtime_checkable

@@ -101,7 +101,6 @@ class PerStation(Method):
         if together and not self.wrapped.both_ends:
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
-        self._shape = tuple(data.target.shape[1:])
         known, unheard = trained_stations(self.wrapped, data, fold)
         numbers = [int(t) for t in np.flatnonzero(known)]
         if together:
@@ -132,7 +131,7 @@ class PerStation(Method):
         """See `Reconditions`; stations without rows among these are then as if never heard."""
         assert data.station is not None
         found = PerStation(self._make)
-        found.site, found._shape = data.site, self._shape
+        found.site = data.site
         for number, copy in self._copies.items():
             own = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
             chosen = np.flatnonzero(np.isin(own, rows))
