@@ -91,7 +91,7 @@ def plan_of(config: DictConfig) -> FloorPlan | None:
 
 def settings_of(config: DictConfig) -> RunSettings:
     """The settings of a run, of which `stations` is not one here: it holds names."""
-    return RunSettings.of(OmegaConf.masked_copy(config, [key for key in config if key != "stations"]))
+    return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
 
 
 def stations_of(given: Any) -> list[str | int] | None:
@@ -132,8 +132,8 @@ def lines_of(found: FieldMap, kept: Kept | None) -> list[str]:
     refused = found.figures()["map/refused"]
     said.append(
         f"{found.share:.0%} of the cells are promised to lie in their interval: of {kept.rows} rows in "
-        f"{kept.blocks} held-out blocks {kept.share:.1%} did (mean width {kept.width_db:.1f} dB; the model's own "
-        f"deviations: {kept.own_share:.1%}, {kept.own_width_db:.1f} dB)"
+        f"{kept.blocks} held-out blocks {kept.share:.1%} did (mean width {kept.width_db:.1f} dB; the "
+        f"model's own deviations: {kept.own_share:.1%}, {kept.own_width_db:.1f} dB)"
     )
     if refused:
         said.append(

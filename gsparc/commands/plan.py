@@ -47,7 +47,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         start=settings["start"], route_m=config.route_m, length_m=config.length_m,
     )  # fmt: skip
     write_places(run_dir / "plan.csv", found, predictor)
-    draw_plan_picture(found, run_dir / "plan.png", None if promise is None else promise, predictor, floor)
+    draw_plan_picture(found, run_dir / "plan.png", promise, predictor, floor)
     facts = {
         "plan/places": len(found.places), "plan/before_db": found.before_db, "plan/after_db": found.after_db,
         "plan/length_m": found.length_m, "plan/stopped": found.stopped or None,

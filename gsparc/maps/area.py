@@ -94,8 +94,8 @@ def grid_of(
     needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
     if needed > SHARE_OF_MEMORY * _memory():
         raise DataError(
-            f"step_m={step:g}: {count.prod():.3g} cells of {stations} station(s) need {needed / 2**30:.3g} GiB, "
-            f"more than half of this machine's memory; take a larger step or a smaller area"
+            f"step_m={step:g}: {count.prod():.3g} cells of {stations} station(s) need {needed / 2**30:.3g} "
+            f"GiB, more than half of this machine's memory; take a larger step or a smaller area"
         )
     nx, ny = (max(int(n), 1) for n in count)
     x, y = (low[i] + step * (0.5 + np.arange(n)) for i, n in enumerate((nx, ny)))

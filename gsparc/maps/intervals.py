@@ -17,7 +17,7 @@ from scipy.stats import norm
 from sklearn.isotonic import IsotonicRegression
 
 LEAST_ROWS = 40  # held out, for any promise
-ROWS_OF_A_BIN = 150
+ROWS_OF_A_BIN, BLOCKS_OF_A_BIN = 150, 8
 MOST_BINS = 8
 ENOUGH_BLOCKS = 10  # from which a station's own errors count more than those of all
 REACH = 0.99  # quantile of the held-out rows' distances that is the farthest anything is said of
@@ -132,14 +132,14 @@ def calibrate(evidence: Evidence, share: float = 0.9) -> Calibration:
     used = evidence.at(np.flatnonzero(evidence.tells & np.isfinite(evidence.error)))
     if len(used) < LEAST_ROWS:
         raise ValueError(
-            f"{len(used)} held-out rows are too few for a promise about a map; {LEAST_ROWS} at least are needed"
+            f"{len(used)} held-out rows are too few for a promise; {LEAST_ROWS} at least are needed"
         )
     blocks = len(np.unique(used.block))
     level = min(share * (1 + 1 / blocks), 1.0)  # conformal prediction's correction for so many blocks
     station = _of_stations(used, level)
     used = replace(used, spread_db=used.spread_db * station[used.station])
     order = np.argsort(used.distance, kind="stable")
-    count = int(np.clip(len(used) // ROWS_OF_A_BIN, 1, MOST_BINS))
+    count = int(np.clip(min(len(used) // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
     bins = [used.at(rows) for rows in np.array_split(order, count)]
     size = np.abs(used.error)
     middle = np.array([float(np.median(one.distance)) for one in bins])
@@ -239,7 +239,7 @@ def of_held(
 def distances(
     known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
 ) -> np.ndarray:
-    """From places (n, D) to the nearest of `known` (m, D) of the same station, or of any where it has none [m]."""
+    """From places (n, D) to the nearest of `known` (m, D) of their station, of any where it has none [m]."""
     found = np.full(len(places), np.inf)
     for number in np.unique(station):
         own = known[known_station == number]

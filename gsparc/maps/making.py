@@ -18,7 +18,7 @@ from gsparc.maps.field_map import FieldMap, best_server, loads, sinr
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.intervals import Calibration
 from gsparc.maps.levels import MAPPED, predicted
-from gsparc.maps.promise import Promise
+from gsparc.maps.promise import Promise, stored_promise
 from gsparc.methods.method import HasPaths
 from gsparc.methods.predictor import Predictor
 
@@ -85,8 +85,8 @@ def map_of(
         for cells in _chunks(grid):
             places = grid.places(cells)
             told = _ask(asking, places, other_end)
-            known = site, promise, calibration, number, share
-            for array, values in zip(arrays, _described(*told, places, other_end, *known), strict=True):
+            said = _described(*told, places, other_end, site, promise, calibration, number, share)
+            for array, values in zip(arrays, said, strict=True):
                 array[layer].reshape(-1)[cells] = values
             done += len(cells)
             asked(done, count * len(names))
@@ -103,6 +103,11 @@ def map_of(
         np.zeros((0, 2)) if promise is None else _measured_places(promise, site), _still(site, names),
         tuple(notes),
     )  # fmt: skip
+
+
+def mapped(predictor: Predictor, area: Any = None, **how: Any) -> FieldMap:
+    """`map_of` with the evidence that the model's checkpoint holds, where it does."""
+    return map_of(predictor, area, **{"promise": stored_promise(predictor.extra), **how})
 
 
 def answering(predictor: Predictor, wanted: Sequence[str | int] | None) -> tuple[list[str], list[str]]:
@@ -151,6 +156,11 @@ def _ask(
 
 
 def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
+    """World places (n, 3) of the ends that a predictor is to be told.
+
+    Raises:
+        DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
+    """
     if site.static_end is not None:
         if other is not None:
             raise DataError(f"other_end: the {site.static_end} stood still; leave it out")

@@ -200,8 +200,8 @@ def draw_plan_picture(
         image = np.full(found.grid.shape, np.nan)
         image[found.grid.inside] = values
         drawn = axis.imshow(
-            image, origin="lower", extent=found.grid.extent, cmap="cividis", alpha=1 if plan is None else 0.65,
-            zorder=1, **limits,
+            image, origin="lower", extent=found.grid.extent, cmap="cividis", zorder=1,
+            alpha=1 if plan is None else 0.65, **limits,
         )  # fmt: skip
         axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", title=title)
         scale_bar(axis, right - left)
@@ -209,8 +209,8 @@ def draw_plan_picture(
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
         few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
         before.plot(*few.T, "k.", markersize=float(np.clip(2500 / len(few), 0.3, 6.0)), alpha=0.5, zorder=2)
-    after.plot(*found.places[:, :2].T, "-" if found.length_m and (np.diff(found.chosen) != 1).any() else "",
-               marker="o", color="red", markeredgecolor="white", markersize=6, linewidth=1, zorder=3)  # fmt: skip
+    how: dict[str, Any] = {"marker": "o", "color": "red", "markeredgecolor": "white", "markersize": 6}
+    after.plot(*found.places[:, :2].T, linestyle="-" if found.walk else "", linewidth=1, zorder=3, **how)
     for number, place in enumerate(found.places[:60], 1):
         after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
                        path_effects=OUTLINE, zorder=4)  # fmt: skip

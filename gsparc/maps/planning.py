@@ -41,6 +41,7 @@ class Plan:
         grid: the area.
         error_before, error_after: (S,) expected error at `at` [dB].
         at: (S, 3) places that errors were averaged over [m].
+        walk: whether the order is one.
         stopped: why there are fewer than were asked for; "" where there are not.
     """
 
@@ -53,6 +54,7 @@ class Plan:
     error_before: np.ndarray
     error_after: np.ndarray
     at: np.ndarray
+    walk: bool = False
     stopped: str = ""
 
     @property
@@ -123,12 +125,13 @@ def plan_next(
     before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     chosen, expected, stopped = _greedy(unknown, free, wanted, places, count, least_gain_db, tour)
     after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
-    order = tour.order() if route or route_m is not None else np.arange(len(chosen))
+    walk = route or route_m is not None
+    order = tour.order() if walk else np.arange(len(chosen))
     picked = places[chosen] if len(chosen) else np.zeros((0, 3))
     first = _mean_db(before, wanted)
     return Plan(
         picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
-        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted], stopped,
+        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted], walk, stopped,
     )  # fmt: skip
 
 

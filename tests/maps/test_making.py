@@ -1,0 +1,82 @@
+"""A map is what the model predicts cell by cell, with its layers over stations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from towns import MASTS, town_model
+
+import gsparc
+from gsparc.data.errors import DataError
+from gsparc.maps.field_map import REFUSED, best_server, loads, sinr
+from gsparc.maps.making import map_of
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return gsparc.load(town_model())
+
+
+def test_cells_hold_what_the_model_predicts(predictor):
+    found = predictor.map([0, 0, 80, 60], step_m=4.0, threshold_db=-90)
+    assert found.power_db.shape == (2, 15, 20) and found.power_db.dtype == np.float32
+    place = [found.grid.x[3], found.grid.y[5], 1.5]
+    for number, name in enumerate(found.stations):
+        assert found.power_db[number, 5, 3] == pytest.approx(
+            10 * np.log10(float(predictor.at(name).rssi(rx=place)[0])), abs=1e-3
+        )
+    assert (found.lower_db < found.power_db).all() and (found.power_db < found.upper_db).all()
+    west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]
+    assert (west, east) == (0, 1)
+    assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
+
+
+def test_chunks_do_not_change_a_map(predictor, monkeypatch):
+    whole = predictor.map(step_m=5.0)
+    monkeypatch.setattr("gsparc.maps.making.CHUNK", 7)
+    monkeypatch.setattr("gsparc.maps.making.BANDS", 13)
+    assert np.allclose(predictor.map(step_m=5.0).power_db, whole.power_db, atol=1e-4)
+
+
+def test_an_interrupt_is_heeded_between_chunks(predictor):
+    def stop(done, of):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        map_of(predictor, step_m=1.0, asked=stop)
+
+
+def test_stations_by_name_or_number_in_the_order_asked_for(predictor):
+    found = predictor.map(step_m=10.0, stations=["east", 0])
+    both = predictor.map(step_m=10.0)
+    assert found.stations == ("east", "west")
+    assert np.array_equal(found.power_db[::-1], both.power_db)
+    assert predictor.map(step_m=10.0, stations=["east"]).power_db.shape[0] == 1
+
+
+def test_ratio_of_signal_to_interference_by_hand():
+    power = np.array([[-50.0, np.nan, np.nan], [-60.0, -60.0, np.nan]])
+    assert sinr(power, np.array([1.0, 1.0]), None)[0] == pytest.approx(10)
+    assert sinr(power, np.array([1.0, 0.1]), None)[0] == pytest.approx(20)
+    assert sinr(power, np.ones(2), -60.0)[0] == pytest.approx(10 - 10 * np.log10(2))
+    assert sinr(power, np.ones(2), -80.0)[1] == pytest.approx(20)
+    assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
+    assert best_server(power).tolist() == [0, 1, REFUSED]
+    assert loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
+
+
+def test_saved_and_read_back(predictor, tmp_path):
+    found = predictor.map(step_m=10.0)
+    found.save(tmp_path / "map.npz")
+    with np.load(tmp_path / "map.npz") as stored:
+        assert np.array_equal(stored["power_db"], found.power_db)
+        assert stored["stations"].tolist() == ["west", "east"] and stored["x"].shape == (found.grid.shape[1],)
+    assert found.figures()["map/cells"] == found.grid.inside.sum()
+
+
+def test_spectra_have_no_power(predictor, monkeypatch):
+    from dataclasses import replace
+
+    monkeypatch.setattr(predictor, "site", replace(predictor.site, kind="spectrum"))
+    with pytest.raises(DataError, match="no received power"):
+        map_of(predictor)
