@@ -18,6 +18,7 @@ from gsparc.data.errors import DataError
 from gsparc.evaluation.console import open_console
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.maps import geotiff
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan, read_plan
 from gsparc.maps.intervals import Kept
@@ -156,6 +157,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan": floor, "share": how.share,
     }  # fmt: skip
     check_map(predictor, asked)
+    geotiff.wanted(config.geotiff, predictor.site.georeference)
     promise = None
     if config.promised:
         promise = promise_of(str(config.ckpt), settings["dataset"], how, bool(config.renew))
@@ -167,6 +169,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     found.save(run_dir / "map.npz")
     if config.pictures:
         draw(found, predictor, run_dir, config.unit, floor)
+    origin = predictor.site.georeference
+    if origin is not None and geotiff.wanted(config.geotiff, origin):
+        geotiff.write_geotiff(run_dir / "map.tif", found, origin)
     write_page(run_dir / "map.html", found, drawn, title_of(found, predictor), lines, floor)
     facts = {
         **found.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,

@@ -131,7 +131,8 @@ def plan_next(
     first = _mean_db(before, wanted)
     return Plan(
         picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
-        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted], walk, stopped,
+        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted], walk,
+        stopped,
     )  # fmt: skip
 
 
