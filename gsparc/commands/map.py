@@ -72,12 +72,12 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
 
 
 @contextmanager
-def progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A bar with the time that is left, as a function of what is done and all that will be."""
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """A bar with the time that is left, as a function of the share that is done."""
     columns = TextColumn(what), BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeElapsedColumn()
     with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=open_console()) as bars:
-        bar = bars.add_task(what)
-        yield lambda done, of: bars.update(bar, completed=done, total=of)
+        bar = bars.add_task(what, total=1.0)
+        yield lambda share: bars.update(bar, completed=share)
 
 
 def plan_of(config: DictConfig) -> FloorPlan | None:
@@ -154,7 +154,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "area": settings["area"], "height_m": config.height_m, "step_m": config.step_m,
         "threshold_db": float(config.threshold_db), "stations": stations_of(settings["stations"]),
         "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
-        "plan": floor, "share": how.share,
+        "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db),
     }  # fmt: skip
     check_map(predictor, asked)
     geotiff.wanted(config.geotiff, predictor.site.georeference)

@@ -53,8 +53,8 @@ def write_geotiff(path: str | Path, found: FieldMap, origin: Georeference) -> No
     )
     profile = {
         "driver": "GTiff", "width": len(found.grid.x), "height": len(found.grid.y), "count": len(bands),
-        "dtype": "float32", "crs": place, "transform": from_origin(left, high, found.grid.step, found.grid.step),
-        "nodata": float("nan"), "compress": "deflate", "tiled": True,
+        "dtype": "float32", "crs": place, "nodata": float("nan"), "compress": "deflate", "tiled": True,
+        "transform": from_origin(left, high, found.grid.step, found.grid.step),
     }  # fmt: skip
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         for number, (name, values) in enumerate(bands.items(), 1):

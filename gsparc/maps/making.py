@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import torch
+from scipy.spatial import cKDTree
 from scipy.stats import norm
 
 from gsparc.data.errors import DataError
@@ -19,10 +22,12 @@ from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.intervals import Calibration
 from gsparc.maps.levels import MAPPED, predicted
 from gsparc.maps.promise import Promise, stored_promise
+from gsparc.maps.refining import refined
 from gsparc.methods.method import HasPaths
 from gsparc.methods.predictor import Predictor
 
 CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
+ALL_CELLS = 40_000  # of a map that are all asked about
 BANDS = 1 << 16  # cells at a time of what follows from predictions
 
 
@@ -40,7 +45,8 @@ def map_of(
     plan: FloorPlan | None = None,
     promise: Promise | None = None,
     share: float = 0.9,
-    asked: Callable[[int, int], None] = lambda done, of: None,
+    tolerance_db: float = 0.1,
+    asked: Callable[[float], None] = lambda share: None,
     dry: bool = False,
 ) -> FieldMap:
     """Predict every cell of an area; `predictor.map(...)` is this.
@@ -59,7 +65,9 @@ def map_of(
         promise: evidence of held-out blocks; None: intervals are the model's own deviations, and nothing is
             refused.
         share: of the truth that intervals are to hold.
-        asked: called with predictions made, and all that will be.
+        tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
+            every cell. Known places must be stored with the model.
+        asked: called with the share of the work that is done.
         dry: predict one cell of each station alone: whether everything asked for is possible.
 
     Raises:
@@ -76,20 +84,29 @@ def map_of(
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
     calibration = None if promise is None else promise.calibration(share)
-    count = int(grid.inside.sum())
     arrays = [np.full((len(names), *grid.shape), np.nan, np.float32) for _ in range(4)]
-    done = 0
+    stride = _stride(grid, promise, tolerance_db)
+    told = 0
     for layer, name in enumerate(names):
         asking = predictor if site.stations is None else predictor.at(name)
         number = 0 if site.stations is None else site.stations.name.index(name)
-        for cells in _chunks(grid):
-            places = grid.places(cells)
-            told = _ask(asking, places, other_end)
-            said = _described(*told, places, other_end, site, promise, calibration, number, share)
+        report = _reporter(
+            asked, layer, len(names), int(grid.inside.sum()) / stride**2 * (1.3 if stride > 1 else 1)
+        )
+        ask = _asker(asking, grid, other_end, report)
+        (mean, spread), count = refined(ask, grid.inside, stride, tolerance_db)
+        told += count
+        for cells in _chunks(grid, BANDS):
+            pair = (values.reshape(-1)[cells].astype(np.float64) for values in (mean, spread))
+            said = _described(*pair, grid.places(cells), other_end, site, promise, calibration, number, share)
             for array, values in zip(arrays, said, strict=True):
                 array[layer].reshape(-1)[cells] = values
-            done += len(cells)
-            asked(done, count * len(names))
+    asked(1.0)
+    if told < len(names) * int(grid.inside.sum()):
+        notes.append(
+            f"{told} of {len(names) * int(grid.inside.sum())} predictions were made, the others interpolated "
+            f"within about {tolerance_db:g} dB"
+        )
     power, lower, upper, error = arrays
     best, ratio, outage = _over_stations(power, error, share_of, noise_db, threshold_db, calibration)
     if calibration is not None and not np.isfinite(power).any():
@@ -141,18 +158,60 @@ def answering(predictor: Predictor, wanted: Sequence[str | int] | None) -> tuple
     return list(dict.fromkeys(names)), notes
 
 
-def _chunks(grid: Grid) -> Iterator[np.ndarray]:
+def _chunks(grid: Grid, size: int) -> Iterator[np.ndarray]:
     every = np.flatnonzero(grid.inside)
-    for start in range(0, len(every), CHUNK):
-        yield every[start : start + CHUNK]
+    for start in range(0, len(every), size):
+        yield every[start : start + size]
 
 
-def _ask(
-    predictor: Predictor, places: np.ndarray, other: Sequence[float] | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Level and deviation (n,) [dB] at world places (n, 3)."""
-    ends = ends_of(predictor.site, places, other)
-    return predicted(predictor.predict(**ends), predictor.site.kind)
+def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
+    """Cells between those that are asked about everywhere: no farther apart than what was measured."""
+    if tolerance_db <= 0 or grid.inside.sum() <= ALL_CELLS or promise is None:
+        return 1
+    places = np.unique(promise.known[:, -3:-1], axis=0)
+    if len(places) < 2:
+        return 1
+    apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    return 1 << max(int(np.log2(max(apart / grid.step, 1.0))) - 1, 0)
+
+
+def _reporter(
+    asked: Callable[[float], None], layer: int, layers: int, expected: float
+) -> Callable[[int], None]:
+    """Says the share of all work after so many more predictions; the last percent is not known before."""
+    done = 0
+
+    def report(more: int) -> None:
+        nonlocal done
+        done += more
+        asked((layer + min(done / max(expected, 1.0), 0.99)) / layers)
+
+    return report
+
+
+def _asker(
+    predictor: Predictor, grid: Grid, other: Sequence[float] | None, report: Callable[[int], None]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Level and deviation (n, 2) [dB] of cells (n,), in chunks, as many at once as torch has threads."""
+    site, workers = predictor.site, torch.get_num_threads()
+
+    def one(cells: np.ndarray) -> np.ndarray:
+        said = predictor.predict(**ends_of(site, grid.places(cells), other))
+        return np.column_stack(predicted(said, site.kind))
+
+    def ask(cells: np.ndarray) -> np.ndarray:
+        parts = [cells[start : start + CHUNK] for start in range(0, len(cells), CHUNK)]
+        found = []
+        pool = ThreadPoolExecutor(workers)
+        try:
+            for part, values in zip(parts, pool.map(one, parts), strict=True):
+                found.append(values)
+                report(len(part))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)  # an interrupt waits for a chunk, not for all
+        return np.concatenate(found) if found else np.zeros((0, 2))
+
+    return ask
 
 
 def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:

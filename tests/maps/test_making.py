@@ -10,6 +10,7 @@ import gsparc
 from gsparc.data.errors import DataError
 from gsparc.maps.field_map import REFUSED, best_server, loads, sinr
 from gsparc.maps.making import map_of
+from gsparc.maps.refining import refined
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_chunks_do_not_change_a_map(predictor, monkeypatch):
 
 
 def test_an_interrupt_is_heeded_between_chunks(predictor):
-    def stop(done, of):
+    def stop(share):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -80,3 +81,19 @@ def test_spectra_have_no_power(predictor, monkeypatch):
     monkeypatch.setattr(predictor, "site", replace(predictor.site, kind="spectrum"))
     with pytest.raises(DataError, match="no received power"):
         map_of(predictor)
+
+
+def test_interpolated_cells_are_as_exact_as_asked_for():
+    def ask(cells):
+        row, column = np.divmod(cells, 200)
+        x, y = column / 10, row / 10
+        return np.column_stack(
+            [-20 * np.log10(1 + np.hypot(x - 5, y - 4)), 2 + np.sin(x / 3) * np.cos(y / 4)]
+        )
+
+    inside = np.ones((150, 200), bool)
+    inside[100:, :60] = False
+    every, count = refined(ask, inside, 1, 0.1)
+    few, asked = refined(ask, inside, 4, 0.1)
+    assert count == inside.sum() and asked < 0.2 * count
+    assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.15
