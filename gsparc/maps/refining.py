@@ -1,7 +1,7 @@
 """Large maps from fewer predictions: cells between others are interpolated where that is exact enough.
 
-A lattice of every 2^k-th cell is asked about and halved. A new point is asked about where interpolation missed
-its neighbours by more than four times what is tolerated: its error falls fourfold with each halving.
+A lattice of every 2^k-th cell is asked about and halved. A new point is asked about where interpolation
+missed its neighbours by more than four times what is tolerated: its error falls fourfold with each halving.
 """
 
 from __future__ import annotations
