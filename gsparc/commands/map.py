@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -16,7 +16,7 @@ from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.data.errors import DataError
 from gsparc.evaluation.console import open_console
-from gsparc.evaluation.open_runs import open_files
+from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.maps import geotiff
 from gsparc.maps.field_map import FieldMap
@@ -50,18 +50,7 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
         raise DataError(
             f"{path}: does not say how it was trained; say promised=false for a map without promise"
         )
-    try:
-        run = open_files([path], dataset)
-    except (ValueError, OSError) as error:
-        raise DataError(
-            f"{error}; a promise needs the training data: dataset.file=..., or promised=false"
-        ) from None
-    if run.learned != 0 or run.foreign is not None:
-        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
-    context = FitContext(
-        seed=int(config.get("seed", 0)), budget_s=config.get("budget_s"),
-        budget_clock=config.get("budget_clock", "wall"), stations=config.get("stations", "each"),
-    )  # fmt: skip
+    run, context = opened(path, dataset), context_of_stored(config)
     make = partial(build, config["model"], trusted=False)
     fold = run.split.folds[0]
     log.info("a promise for this map: %d fits without blocks of places", settings.folds)
@@ -69,6 +58,31 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
     found.kept(settings.share)  # too little evidence is said before anything is stored
     found.keep(path)
     return found
+
+
+def opened(path: str, dataset: dict[str, Any]) -> Opened:
+    """A model with the very data that it was trained on.
+
+    Raises:
+        DataError: they are gone, or are others.
+    """
+    try:
+        run = open_files([path], dataset)
+    except (ValueError, OSError) as error:
+        raise DataError(
+            f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
+        ) from None
+    if run.learned != 0 or run.foreign is not None:
+        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
+    return run
+
+
+def context_of_stored(config: Mapping[str, Any]) -> FitContext:
+    """That of the fit which a checkpoint's configuration describes."""
+    return FitContext(
+        seed=int(config.get("seed", 0)), budget_s=config.get("budget_s"),
+        budget_clock=config.get("budget_clock", "wall"), stations=config.get("stations", "each"),
+    )  # fmt: skip
 
 
 @contextmanager

@@ -6,9 +6,10 @@ from typing import Any
 _PUBLIC = {
     "FieldMap": "gsparc.maps.field_map",
     "plan_next": "gsparc.maps.planning",
+    "place_next": "gsparc.maps.placing",
     "map_of": "gsparc.maps.making",
 }
-__all__ = ["FieldMap", "map_of", "plan_next"]
+__all__ = ["FieldMap", "map_of", "place_next", "plan_next"]
 
 
 def __getattr__(name: str) -> Any:

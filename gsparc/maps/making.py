@@ -97,8 +97,10 @@ def map_of(
         (mean, spread), count = refined(ask, grid.inside, stride, tolerance_db)
         told += count
         for cells in _chunks(grid, BANDS):
-            pair = (values.reshape(-1)[cells].astype(np.float64) for values in (mean, spread))
-            said = _described(*pair, grid.places(cells), other_end, site, promise, calibration, number, share)
+            level, wide = (values.reshape(-1)[cells].astype(np.float64) for values in (mean, spread))
+            said = _described(
+                level, wide, grid.places(cells), other_end, site, promise, calibration, number, share
+            )
             for array, values in zip(arrays, said, strict=True):
                 array[layer].reshape(-1)[cells] = values
     asked(1.0)

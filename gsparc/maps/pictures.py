@@ -16,6 +16,7 @@ from matplotlib.transforms import Affine2D
 from gsparc.evaluation.drawing import panels, save
 from gsparc.maps.field_map import REFUSED, FieldMap
 from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.placing import Placing
 from gsparc.maps.planning import Plan
 from gsparc.maps.promise import Promise
 from gsparc.methods.predictor import Predictor
@@ -220,6 +221,23 @@ def draw_plan_picture(
     curve.grid(alpha=0.3)
     engine: Any = figure.get_layout_engine()
     engine.set(w_pad=0.12, h_pad=0.1)
+    save(figure, path, 100)
+
+
+def draw_placing(found: Placing, path: Path, threshold_db: float) -> None:
+    """The goal at every candidate, the stations that stand, and the best place."""
+    left, right, low, high = found.grid.extent
+    figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
+    label = f"share of the area with {threshold_db:g} dB or more"
+    label = label if found.what == "coverage" else "power that nine tenths of the area exceed [dB]"
+    drawn = axis.scatter(*found.places[:, :2].T, c=found.goal, s=60, marker="s", cmap="viridis")
+    figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
+    how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}
+    axis.plot(*found.stations.T, "k^", label="station", **how)
+    axis.plot(*found.places[0, :2], "r*", label="best", markersize=18, markeredgecolor="white", linestyle="")
+    axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    scale_bar(axis, right - left)
+    figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
     save(figure, path, 100)
 
 

@@ -111,9 +111,9 @@ def plan_next(
     if length_m is not None and not (np.isfinite(length_m) and length_m > 0):
         raise DataError(f"length_m={length_m}: metres above 0 are needed")
     origin = None if predictor is None else predictor.site.georeference
-    grid = _grid(predictor, area, height_m, plan)
+    grid = coarse_grid(predictor, area, height_m, plan)
     targets = grid.places()
-    allowed = targets if walkable is None else _walkable(walkable, grid, origin)
+    allowed = targets if walkable is None else walkable_places(walkable, grid, origin)
     places, free, wanted = _joined(targets, allowed)
     if predictor is None:
         unknown = before_measuring(places, length_m)
@@ -136,7 +136,9 @@ def plan_next(
     )  # fmt: skip
 
 
-def _grid(predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None) -> Grid:
+def coarse_grid(
+    predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None
+) -> Grid:
     """About `TARGETS` cells."""
     fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
     left, right, low, high = fine.extent
@@ -151,9 +153,9 @@ def _grid(predictor: Predictor | None, area: Any, height_m: float | None, plan: 
     return replace(fine, x=x, y=y, step=step, inside=inside)
 
 
-def _walkable(path: Any, grid: Grid, origin: Georeference | None) -> np.ndarray:
+def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
     """Places (n, 3) in polygons or along lines of a file."""
-    shapes: Shapes = read_shapes(path, "walkable", origin, "either")
+    shapes: Shapes = read_shapes(path, key, origin, "either")
     found = [np.zeros((0, 2))]
     if shapes.polygons:
         low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())
@@ -167,7 +169,7 @@ def _walkable(path: Any, grid: Grid, origin: Georeference | None) -> np.ndarray:
         found.append(np.column_stack([np.interp(at, along, line[:, k]) for k in range(2)]))
     places = np.unique(np.concatenate(found), axis=0)
     if not len(places):
-        raise DataError(f"walkable={path}: its polygons are too small for any place to measure")
+        raise DataError(f"{key}={path}: its polygons are too small for any place")
     if len(places) > CANDIDATES:
         places = places[np.random.default_rng(0).permutation(len(places))[:CANDIDATES]]
     return np.column_stack([places, np.full(len(places), grid.height)])
