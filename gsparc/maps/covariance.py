@@ -83,12 +83,12 @@ def unknown_of(
         if process is None:
             process = _stand_in(asking, promise, number)
         local = _queries(asking, places, other_end, process.places.shape[1])
-        posterior = _posterior(process, local)
+        covariance = posterior(process, local)
         noise = process.kernel.amplitude * process.kernel.noise
         weight = np.ones(len(places))
         if promise is not None:
-            weight = _scaled(asking, promise, places, local, number, posterior, noise, other_end)
-        found.append(Unknown(posterior, noise, weight))
+            weight = _scaled(asking, promise, places, local, number, covariance, noise, other_end)
+        found.append(Unknown(covariance, noise, weight))
     return found
 
 
@@ -105,7 +105,7 @@ def before_measuring(places: np.ndarray, length_m: float | None) -> list[Unknown
     return [Unknown(prior, variance * NOISE, np.ones(len(places)))]
 
 
-def _posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:
+def posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:
     """Covariance (S, S) [dB^2] of the power at places (S, D), given what the process knows."""
     terms = process.trend.terms(torch.from_numpy(places)).numpy()
     known = process.trend.terms(torch.from_numpy(process.places)).numpy()

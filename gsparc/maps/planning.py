@@ -123,7 +123,7 @@ def plan_next(
     begin = None if start is None else _start(start)
     tour = Tour(begin, route_m)
     before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
-    chosen, expected, stopped = _greedy(unknown, free, wanted, places, count, least_gain_db, tour)
+    chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
     after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
     walk = route or route_m is not None
     order = tour.order() if walk else np.arange(len(chosen))
@@ -185,7 +185,7 @@ def _joined(targets: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.nd
     return places, ~wanted, wanted
 
 
-def _greedy(
+def greedy(
     unknown: list[Unknown],
     free: np.ndarray,
     wanted: np.ndarray,
