@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -127,16 +127,16 @@ def place_next(
     old_outage = np.nan_to_num(now.outage.reshape(-1)[flat], nan=1.0)
     error = error or NewStation()
     found = np.empty((len(candidates), 3))
-    for number, place in enumerate(candidates):
+    for row, place in enumerate(candidates):
         level, spread = _new(predictor, place, cells)
         for k, shift in enumerate((0.0, -SURE * error.offset_db, SURE * error.offset_db)):
             if goal == "worst":
-                found[number, k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
+                found[row, k] = np.quantile(np.maximum(old_power, level + shift), DECILE)
                 continue
             wide = np.hypot(spread * error.within, error.offset_db if k == 0 else 0.0)
             outage = norm.cdf((threshold_db - level - shift) / np.maximum(wide, 1e-9))
-            found[number, k] = np.mean(1 - np.minimum(old_outage, outage))
-        asked((number + 1) / len(candidates))
+            found[row, k] = np.mean(1 - np.minimum(old_outage, outage))
+        asked((row + 1) / len(candidates))
     before = float(np.quantile(old_power, DECILE) if goal == "worst" else np.mean(1 - old_outage))
     order = np.argsort(-found[:, 0], kind="stable")
     value, low, high = found[order].T
@@ -159,11 +159,11 @@ def new_station_error(
         return NewStation()
     chosen = np.random.default_rng(context.seed).permutation(heard)[:most]
     parts: list[Evidence] = []
-    for number in chosen:
-        own = data.station[known] == number
+    for one in chosen:
+        own = data.station[known] == one
         inner = Fold(known[~own], known[:0], known[own])
         learned, _ = without(method, make, data, inner, context)
-        parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), number)))
+        parts.append(evidence_of(learned, data, inner, np.full(int(own.sum()), one)))
     errors = [(one.level_db - one.mean_db)[~one.silent] for one in parts]
     means = np.array([error.mean() for error in errors if len(error)])
     pairs = zip(errors, means, parts, strict=False)
@@ -207,13 +207,13 @@ def _refuse_unheard(predictor: Predictor, place: np.ndarray, cell: np.ndarray) -
         ) from None
 
 
+def number(what: Goal, value: float) -> str:
+    """A goal's value with its unit."""
+    return f"{value:.1%}" if what == "coverage" else f"{value:.1f} dB"
+
+
 def said(what: Goal, value: float, threshold_db: float) -> str:
     """A goal's value in words."""
     if what == "coverage":
-        return f"{value:.1%} of the area with {threshold_db:g} dB or more"
-    return f"nine tenths of the area have {value:.1f} dB or more"
-
-
-def best(found: Placing) -> Sequence[float]:
-    """World place (3,) of the best candidate."""
-    return [float(value) for value in found.places[0]]
+        return f"{number(what, value)} of the area with {threshold_db:g} dB or more"
+    return f"nine tenths of the area have {number(what, value)} or more"

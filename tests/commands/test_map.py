@@ -81,6 +81,7 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
         ("map", ["promise.share=1.5"], "share=1.5"),
         ("map", ["dataset.file=gone.npz", "renew=true"], "gone.npz"),
         ("plan", ["count=0"], "at least 1"),
+        ("place", [], "train with stations=together"),
     ],
 )
 def test_errors_are_one_line(model, tmp_path, command, settings, said):
