@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from campaigns import channels
 from towns import MASTS, town_model
 
 import gsparc
 from gsparc.data.errors import DataError
+from gsparc.data.own import load_own
+from gsparc.data.splits import Fold
 from gsparc.maps.field_map import REFUSED, best_server, loads, sinr
 from gsparc.maps.making import map_of
 from gsparc.maps.refining import refined
+from gsparc.methods.method import FitContext
+from gsparc.methods.predictor import Predictor
+from gsparc.methods.registry import method_class
 
 
 @pytest.fixture(scope="module")
@@ -97,3 +103,16 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
     few, asked = refined(ask, inside, 4, 0.1)
     assert count == inside.sum() and asked < 0.2 * count
     assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.15
+
+
+def test_channels_have_a_power_and_paths(tmp_path):
+    data = load_own(channels(tmp_path / "own.npz"))
+    method, rows = method_class("image_source_gp")(budget_s=3.0), np.arange(len(data))
+    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path))
+    found = map_of(Predictor(method, data.site), step_m=0.5, height_m=1.2)
+    assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
+    assert (found.expected_error_db > 0).all() and set(found.extra) == {"delay_spread_ns", "direction_deg"}
+    assert (found.extra["delay_spread_ns"] >= 0).all() and (found.extra["delay_spread_ns"] < 100).all()
+    near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
+    place = found.grid.places(np.array([near]))[0, :2]
+    assert np.linalg.norm(place - [1, 1]) < 1.0
