@@ -76,7 +76,7 @@ def map_of(
     site = predictor.site
     if site.kind not in MAPPED:
         raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
-    names, notes = answering(predictor, stations)
+    names, notes = answering(predictor, stations, promise)
     grid = grid_of(site, area, height_m, step_m, plan, len(names))
     share_of = loads(load, names)
     if dry:
@@ -129,8 +129,17 @@ def mapped(predictor: Predictor, area: Any = None, **how: Any) -> FieldMap:
     return map_of(predictor, area, **{"promise": stored_promise(predictor.extra), **how})
 
 
-def answering(predictor: Predictor, wanted: Sequence[str | int] | None) -> tuple[list[str], list[str]]:
-    """Names of the stations that are mapped, and what must be said of the others."""
+def answering(
+    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None
+) -> tuple[list[str], list[str]]:
+    """Names of the stations that are mapped, and what must be said of the others.
+
+    Those are stations that the model does not answer for, and, where something is promised, stations that it
+    never heard: what was held out tells nothing of them.
+
+    Raises:
+        DataError: one of them was asked for, or none is left.
+    """
     stations = predictor.site.stations
     if stations is None:
         if wanted is not None:
@@ -150,6 +159,8 @@ def answering(predictor: Predictor, wanted: Sequence[str | int] | None) -> tuple
     for name in dict.fromkeys(names):
         try:
             predictor.at(name)
+            if promise is not None and not (promise.station == stations.name.index(name)).any():
+                raise DataError(f"station {name} was never heard, so that nothing can be promised of its map")
         except ValueError as error:
             if wanted is not None:
                 raise DataError(str(error)) from None

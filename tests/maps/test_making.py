@@ -12,7 +12,9 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.maps.field_map import REFUSED, best_server, loads, sinr
-from gsparc.maps.making import map_of
+from gsparc.maps.intervals import Evidence
+from gsparc.maps.making import answering, map_of
+from gsparc.maps.promise import Promise
 from gsparc.maps.refining import refined
 from gsparc.methods.method import FitContext
 from gsparc.methods.predictor import Predictor
@@ -116,3 +118,12 @@ def test_channels_have_a_power_and_paths(tmp_path):
     near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
     place = found.grid.places(np.array([near]))[0, :2]
     assert np.linalg.norm(place - [1, 1]) < 1.0
+
+
+def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
+    nothing = Evidence(*(np.zeros(0) for _ in range(7)))
+    promise = Promise(nothing, np.zeros((4, 3)), np.zeros(4, np.int64), 1.0)
+    names, notes = answering(predictor, None, promise)
+    assert names == ["west"] and "east was never heard" in notes[0]
+    with pytest.raises(DataError, match="never heard"):
+        answering(predictor, ["east"], promise)
