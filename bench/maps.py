@@ -2,12 +2,14 @@
 
 python bench/maps.py promise plane FILE gsparc 0 1 2 >> promise.csv    # draws 0, 1 and 2
 python bench/maps.py campaign plane FILE 0 1 2 >> campaign.csv; room - 0 1 2 for a simulated room
+python bench/maps.py table campaign.csv
 """
 
 from __future__ import annotations
 
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -63,7 +65,7 @@ def promise(name: str, file: str, method: str, draws: list[int], folds: int = 4)
         began = time.perf_counter()
         split = {"name": "blocks", "side_m": side, "seed": draw, "share": 0.2}
         fold = split_for(split, data).folds[0]
-        context = FitContext(budget_s=60.0, split=SplitSettings("blocks", side_m=side))
+        context = FitContext(budget_s=30.0, split=SplitSettings("blocks", side_m=side))
         fitted = for_links(lambda: make(method), data)
         fitted.fit(data, fold, context)
         fold = answerable(fitted, data, fold)
@@ -191,10 +193,45 @@ def _lattice(places: np.ndarray, count: int) -> list[np.ndarray]:
     return list(np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)[:count])
 
 
+def table(file: str) -> None:
+    """Of a campaign's lines: mean rmse by number measured, and how many fewer than at random do as well."""
+    found: dict[tuple[str, str], dict[int, dict[int, float]]] = {}
+    for line in Path(file).read_text().split():
+        name, strategy, draw, count, rmse = line.split(",")
+        found.setdefault((name, strategy), {}).setdefault(int(draw), {})[int(count)] = float(rmse)
+    for name in sorted({name for name, _ in found}):
+        whole = {strategy: draws for (of, strategy), draws in found.items() if of == name}
+        most = max(len(curve) for draws in whole.values() for curve in draws.values())
+        full = [{d for d, curve in draws.items() if len(curve) == most} for draws in whole.values()]
+        common = sorted(set.intersection(*full))
+        if not common:
+            continue
+        counts = np.array(sorted(whole["random"][common[0]]))
+        mean = {
+            s: np.mean([[draws[d][n] for n in counts] for d in common], axis=0) for s, draws in whole.items()
+        }
+        for strategy, curve in mean.items():
+            saved = []
+            for last in (most // 2, most - 1):  # numbers that random needs for its rmse there
+                reached = np.flatnonzero(curve <= mean["random"][last])
+                if not len(reached):
+                    saved.append("never")
+                    continue
+                k = max(int(reached[0]), 1)
+                pair = slice(k - 1, k + 1)
+                needed = np.interp(-mean["random"][last], -curve[pair], counts[pair])
+                saved.append(f"{1 - needed / counts[last]:+.0%}")
+            rmse = " ".join(f"{value:.2f}" for value in curve)
+            sys.stdout.write(f"{name} {strategy}, {len(common)} draws: {rmse}; fewer {' and '.join(saved)}\n")
+
+
 if __name__ == "__main__":
-    kind, which, where, *rest = sys.argv[1:]
+    kind, which, where, *rest = [*sys.argv[1:], ""]
+    rest = [one for one in rest if one]
     if kind == "promise":
         promise(which, where, rest[0], [int(one) for one in rest[1:]])
+    elif kind == "table":
+        table(which)
     elif kind == "campaign":
         for one in map(int, rest):
             campaign(which, room(one) if which == "room" else load(which, where), [one])
