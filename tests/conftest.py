@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,3 +39,21 @@ def campaign() -> Callable[..., Measurements]:
 def folds() -> Callable[..., Split]:
     """`folds(rows, folds)`: a split of it."""
     return divide
+
+
+@pytest.fixture
+def browser():
+    """Debian's chromium without a window, driven by selenium."""
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
+    if chromium is None or driver is None:
+        pytest.skip("no chromium and chromedriver here: `make browser` installs Debian's")
+    options = webdriver.ChromeOptions()
+    options.binary_location = chromium
+    for switch in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
+        options.add_argument(switch)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    service = webdriver.ChromeService(executable_path=driver)  # never looked for or fetched elsewhere
+    running = webdriver.Chrome(options=options, service=service)
+    yield running
+    running.quit()

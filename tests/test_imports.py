@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "physics", "data", "simulate", "field", "methods", "training", "array", "multipath"]
-ROOMS += ["peers", "auto", "evaluation", "commands", "callbacks", "conf"]
+ROOMS += ["peers", "auto", "evaluation", "maps", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -31,8 +31,9 @@ ARROWS = {
     "peers": "data field methods ops physics training",
     "auto": "data methods ops",
     "evaluation": "data methods",
+    "maps": "data evaluation methods",
     "callbacks": "data evaluation field training",
-    "commands": "data evaluation field methods multipath ops simulate training",
+    "commands": "data evaluation field maps methods multipath ops simulate training",
     "conf": "",
 }
 FILES = [

@@ -73,6 +73,11 @@ COMMANDS = {
             "compare confidences; a threshold with a bounded risk: ckpt=FILE",
         ),
         Command("link", f"{ROOM}link.command", "rates and block errors with predicted channels: ckpt=FILE"),
+        Command("map", f"{ROOM}map", "received power over an area with a promised error: ckpt=FILE"),
+        Command(
+            "plan", f"{ROOM}plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"
+        ),
+        Command("place", f"{ROOM}place", "where one more station serves an area best: ckpt=FILE"),
         Command("llvm", "gsparc.simulate.llvm", "fetch the LLVM that ray tracing needs", configured=False),
         Command("report", f"{ROOM}report", "one page about many runs: RUN...", "runs"),
         Command("bench", f"{ROOM}bench.command", "timings of kernels as ratios to the machine's limit"),

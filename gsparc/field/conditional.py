@@ -78,6 +78,11 @@ class ConditionalField(nn.Module, ABC):
         """Number of Gaussians; 0 where the residual process is all there is."""
 
     @property
+    def forgets(self) -> bool:
+        """Whether `condition` on other rows leaves nothing of earlier ones but a few parameters."""
+        return False
+
+    @property
     @abstractmethod
     def terms(self) -> tuple[str, ...]:
         """Terms that are computed, as in `model.effects`: `phase`, `power`, `residual` and so on."""

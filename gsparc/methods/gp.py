@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -15,6 +16,7 @@ from sklearn.gaussian_process.kernels import Matern
 from torch import Tensor
 
 from gsparc.data.schema import Kind, Measurements
+from gsparc.methods.censored import silent
 from gsparc.methods.coarse_grid import Filled
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.interpolation import Interpolator
@@ -26,12 +28,13 @@ from gsparc.methods.power_process import (
     MOST_ROWS,
     MeanName,
     PowerProcess,
+    conditioned,
     draw,
     fit_powers,
     restored,
 )
 from gsparc.methods.reduced import View
-from gsparc.methods.target_rows import entry_variance, from_real, to_real
+from gsparc.methods.target_rows import entry_variance, from_real, to_real, training_targets
 from gsparc.ops import Pose
 
 
@@ -207,6 +210,21 @@ class GaussianProcess(Interpolator, PredictsVariance):
         rows = Rows(positions, to_real(targets, self.kind)[:, 0].astype(np.float64), silent)
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
+
+    def process(self) -> PowerProcess | None:
+        """See `HasProcess`."""
+        return self.powers
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; of powers alone."""
+        if self.powers is None:
+            return None
+        rows = rows[draw(silent(data, rows), MOST_ROWS, 0)]
+        decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
+        found = copy.copy(self)
+        seen = Rows(data.moving[rows], decibels, silent(data, rows))
+        found.powers, _ = conditioned(seen, self.powers.trend, self.powers.kernel, 0)
+        return found
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         if self.powers is not None:

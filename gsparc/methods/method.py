@@ -21,6 +21,7 @@ from gsparc.ops import Pose
 
 if TYPE_CHECKING:
     from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
+    from gsparc.methods.power_process import PowerProcess
 
 StationModels = Literal["each", "together"]
 
@@ -201,6 +202,22 @@ class LeaveOneOut(Protocol):
 
     def leave_one_out(self) -> LeftOut:
         """Residuals of the rows it was fitted on."""
+
+
+@runtime_checkable
+class Reconditions(Protocol):
+    """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """A method of rows (n,) alone; None where more than settings would remember the others."""
+
+
+@runtime_checkable
+class HasProcess(Protocol):
+    """A Gaussian process on powers says what it does not know."""
+
+    def process(self) -> PowerProcess | None:
+        """The process; None where what was fitted has none."""
 
 
 @runtime_checkable

@@ -21,7 +21,7 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.methods.censored import heard
 from gsparc.methods.label import common_label
-from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, Method, Prediction, Reconditions
 from gsparc.methods.reduced import View
 from gsparc.methods.time_budget import Clock, less_repeatable
 from gsparc.ops import Pose
@@ -109,7 +109,6 @@ class PerStation(Method):
         if together and not (joint or self.wrapped.both_ends):
             raise ValueError(f"{self.name}: knows one static end; say stations=each")
         self.site = data.site
-        self._shape = tuple(data.target.shape[1:])
         known, unheard = trained_stations(self.wrapped, data, fold)
         numbers = [int(t) for t in np.flatnonzero(known)]
         if together:
@@ -135,6 +134,23 @@ class PerStation(Method):
             name = all_or_new if number == UNHEARD else data.site.stations.name[number]
             notes += [f"{name}: {note}" for note in report.notes]
         return FitReport(seconds, tuple(notes), limited)
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; stations without rows among these are then as if never heard."""
+        assert data.station is not None
+        found = PerStation(self._make)
+        found.site, found._shared = data.site, self._shared
+        for number, copy in self._copies.items():
+            own = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
+            chosen = np.flatnonzero(np.isin(own, rows))
+            if len(chosen) < LEAST_ROWS:
+                continue
+            part = data.subset(own, self._site_of(data.site, number))
+            learned = copy.reconditioned(part, chosen) if isinstance(copy, Reconditions) else None
+            if learned is None:
+                return None
+            found._copies[number] = learned
+        return found if found._copies else None
 
     def answer(self, batch: Batch) -> Prediction:
         """Each row by its station's copy."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +41,7 @@ class Predictor:
         site: the dataset's fixed facts.
         whole: asked for the confidence, where `method` spares it; None asks `method`.
         point: the operating point `method` answers at, if one was chosen.
+        extra: what else the checkpoint holds.
         trusted: which confidence is answered, and from when on a prediction is accepted.
         kind: of the confidence; None: as `trusted` says.
     """
@@ -51,7 +54,9 @@ class Predictor:
         point: Operating | None = None,
         trusted: Trusted | None = None,
         kind: str | None = None,
+        extra: Mapping[str, Any] | None = None,
     ) -> None:
+        self.extra = extra or {}
         self.trusted, self.kind = trusted or Trusted(), kind
         self.method, self.site, self.point = method, site, point
         self._whole = whole or method
@@ -83,7 +88,7 @@ class Predictor:
             one.of(number) if isinstance(one, PerStation) else one for one in (self.method, self._whole)
         )
         site = of_station(self.site, number)
-        return Predictor(method, site, whole, self.point, self.trusted, self.kind)
+        return Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra)
 
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
         """World positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.
@@ -147,6 +152,17 @@ class Predictor:
         # In float64: squares of powers in watts are beyond float32.
         variance = None if said.variance is None else said.variance.double() * scale**2
         return Prediction(said.mean * scale, sure, variance)
+
+    def map(self, area: Any = None, **how: Any) -> Any:
+        """A `gsparc.maps.FieldMap` of received power over an area: see `gsparc.maps.map_of`.
+
+        >>> gsparc.load("model.ckpt").map([0, 0, 20, 12], step_m=0.25, threshold_db=-80).power_db
+
+        The intervals are those that held-out blocks promise where `gsparc map` was run on the checkpoint
+        before, and the model's own deviations else (`FieldMap.calibrated` says which).
+        """
+        # A room above this one, found by its name as methods are.
+        return import_module("gsparc.maps.making").mapped(self, area, **how)
 
     def cycling(self, places: np.ndarray) -> Call:
         """Calls for a clock: one place of the moving end (n, 3) [m, world] each, another one every time."""
@@ -349,11 +365,13 @@ def load(path: str | Path, budget_ms: float | None = None, confidence: str | Non
     if confidence is not None:
         trusted.check(confidence)
     if budget_ms is None:
-        return Predictor(method, stored.site, trusted=trusted, kind=confidence)
+        return Predictor(method, stored.site, trusted=trusted, kind=confidence, extra=stored.extra)
     from gsparc.methods.operating_point import within
 
     chosen, point = within(method, stored, budget_ms)
-    return Predictor(chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence)
+    return Predictor(
+        chosen, stored.site, whole=method, point=point, trusted=trusted, kind=confidence, extra=stored.extra
+    )
 
 
 def usual_heights(site: Site) -> dict[End, float]:

@@ -27,6 +27,7 @@ from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRo
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
 from gsparc.methods.pareto import Settings
+from gsparc.methods.power_process import PowerProcess
 from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import field_initialiser, method_class
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
@@ -384,6 +385,19 @@ class Gsparc(LearnedField):
             self._lean = mean_alone(self._beside[0])
         mean = self._lean.predict(tx, rx).mean
         return replace(own, mean=own.mean.lerp_(mean, self._beside[1]))
+
+    def process(self) -> PowerProcess | None:
+        """See `HasProcess`."""
+        return getattr(self.field, "process", None)
+
+    def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
+        if self.field is None or not self.field.forgets:
+            return None
+        found = copy.copy(self)
+        found.field = copy.deepcopy(self.field)
+        found.field.condition(data, rows)
+        return found
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """See `Differentiable`; of rasterized Gaussians, without a process beside them."""

@@ -123,6 +123,11 @@ class PowerField(ConditionalField):
         return len(self.means) + (0 if self.fringes is None else len(self.fringes.weights))
 
     @property
+    def forgets(self) -> bool:
+        """See `ConditionalField`; coherent waves keep what they were fitted to."""
+        return self.fringes is None
+
+    @property
     def terms(self) -> tuple[str, ...]:
         """`power` where Gaussians are, `phase` where coherent waves are, `residual` always."""
         named = {"power": len(self.means) > 0, "phase": self.fringes is not None, "residual": True}

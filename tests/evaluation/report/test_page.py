@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from xml.etree import ElementTree
 
 import pytest
@@ -127,23 +126,6 @@ def test_a_real_browser_opens_sorts_and_fits(written, width, browser):
     assert browser.execute_script(size) >= 12
     shown = "return [...document.querySelectorAll('figure svg, figure img')].map(e => e.clientWidth)"
     assert min(browser.execute_script(shown)) >= 280
-
-
-@pytest.fixture
-def browser():
-    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
-    chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
-    if chromium is None or driver is None:
-        pytest.skip("no chromium and chromedriver here: `make browser` installs Debian's")
-    options = webdriver.ChromeOptions()
-    options.binary_location = chromium
-    for switch in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
-        options.add_argument(switch)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    service = webdriver.ChromeService(executable_path=driver)  # never looked for or fetched elsewhere
-    running = webdriver.Chrome(options=options, service=service)
-    yield running
-    running.quit()
 
 
 def test_no_baseline_is_the_better_choice_than_a_run_that_beats_it(run_dir, tmp_path):

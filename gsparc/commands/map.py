@@ -1,0 +1,210 @@
+"""`gsparc map ckpt=FILE`: received power over an area with a promised error."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from gsparc.commands.output import run_directory, show
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.errors import DataError
+from gsparc.evaluation.console import open_console
+from gsparc.evaluation.open_runs import Opened, open_files
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.maps import geotiff
+from gsparc.maps.field_map import FieldMap
+from gsparc.maps.floor_plan import FloorPlan, read_plan
+from gsparc.maps.intervals import Kept
+from gsparc.maps.making import map_of
+from gsparc.maps.page import write_page
+from gsparc.maps.pictures import draw_layer, file_name, layers
+from gsparc.maps.promise import Promise, PromiseSettings, gather, stored_promise
+from gsparc.methods import checkpoint
+from gsparc.methods.method import FitContext
+from gsparc.methods.predictor import Predictor, load
+from gsparc.methods.registry import build
+from gsparc.methods.timing import machine_facts, peak_memory
+
+log = logging.getLogger(__name__)
+
+
+def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, renew: bool) -> Promise:
+    """The evidence stored with a model, or gathered from its training data and then stored.
+
+    Raises:
+        DataError: the training data are gone, or are others.
+    """
+    stored = checkpoint.read(path)
+    found = None if renew else stored_promise(stored.extra)
+    if found is not None and (settings.block_m is None or settings.block_m == found.block_m):
+        return found
+    config = stored.configuration
+    if "model" not in config:
+        raise DataError(
+            f"{path}: does not say how it was trained; say promised=false for a map without promise"
+        )
+    run, context = opened(path, dataset), context_of_stored(config)
+    make = partial(build, config["model"], trusted=False)
+    fold = run.split.folds[0]
+    log.info("a promise for this map: %d fits without blocks of places", settings.folds)
+    found = gather(run.methods[0], make, run.data, fold, settings, context, log.info)
+    found.kept(settings.share)  # too little evidence is said before anything is stored
+    found.keep(path)
+    return found
+
+
+def opened(path: str, dataset: dict[str, Any]) -> Opened:
+    """A model with the very data that it was trained on.
+
+    Raises:
+        DataError: they are gone, or are others.
+    """
+    try:
+        run = open_files([path], dataset)
+    except (ValueError, OSError) as error:
+        raise DataError(
+            f"{error}; held-out blocks need the training data: dataset.file=..., or promised=false"
+        ) from None
+    if run.learned != 0 or run.foreign is not None:
+        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
+    return run
+
+
+def context_of_stored(config: Mapping[str, Any]) -> FitContext:
+    """That of the fit which a checkpoint's configuration describes."""
+    return FitContext(
+        seed=int(config.get("seed", 0)), budget_s=config.get("budget_s"),
+        budget_clock=config.get("budget_clock", "wall"), stations=config.get("stations", "each"),
+    )  # fmt: skip
+
+
+@contextmanager
+def progress(what: str) -> Iterator[Callable[[float], None]]:
+    """A bar with the time that is left, as a function of the share that is done."""
+    columns = TextColumn(what), BarColumn(), TextColumn("{task.percentage:.0f} %"), TimeElapsedColumn()
+    with Progress(*columns, TextColumn("left"), TimeRemainingColumn(), console=open_console()) as bars:
+        bar = bars.add_task(what, total=1.0)
+        yield lambda share: bars.update(bar, completed=share)
+
+
+def plan_of(config: DictConfig) -> FloorPlan | None:
+    """The floor plan that a configuration names."""
+    settings = plain(config)
+    if settings["plan"] is None:
+        if settings["plan_points"] is not None:
+            raise DataError("plan_points: goes with an image, plan=FILE")
+        return None
+    return read_plan(settings["plan"], settings["plan_points"])
+
+
+def settings_of(config: DictConfig) -> RunSettings:
+    """The settings of a run, of which `stations` is not one here: it holds names."""
+    return RunSettings.of(OmegaConf.masked_copy(config, [str(key) for key in config if key != "stations"]))
+
+
+def stations_of(given: Any) -> list[str | int] | None:
+    """Names or numbers; None for `all`.
+
+    Raises:
+        DataError: neither.
+    """
+    if given is None or given == "all":
+        return None
+    if isinstance(given, str | int):
+        return [given]
+    if not isinstance(given, list):
+        raise DataError(f"stations={given}: all, a name or a list of names is needed")
+    return given
+
+
+def draw(found: FieldMap, predictor: Predictor, folder: Path, unit: str, floor: FloorPlan | None) -> None:
+    """A PNG of every layer."""
+    for layer in layers(found, unit):
+        draw_layer(found, layer, folder / file_name(layer), title_of(found, predictor), floor)
+
+
+def title_of(found: FieldMap, predictor: Predictor) -> str:
+    """Of pictures and the page."""
+    height = f"height {found.grid.height:g} m, cells of {found.grid.step:.3g} m"
+    return f"{predictor.site.name}, {predictor.method.label}: {height}"
+
+
+def lines_of(found: FieldMap, kept: Kept | None) -> list[str]:
+    """What a reader of the map must know."""
+    said = [*found.notes]
+    if kept is None:
+        said.append(
+            "no promise: intervals are the model's own deviations, and places far from data are not refused"
+        )
+        return said
+    refused = found.figures()["map/refused"]
+    said.append(
+        f"{found.share:.0%} of the cells are promised to lie in their interval: of {kept.rows} rows in "
+        f"{kept.blocks} held-out blocks {kept.share:.1%} did (mean width {kept.width_db:.1f} dB; the "
+        f"model's own deviations: {kept.own_share:.1%}, {kept.own_width_db:.1f} dB)"
+    )
+    if refused:
+        said.append(
+            f"{refused} of {int(found.grid.inside.sum())} cells are refused: too far from what was measured"
+        )
+    return said
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Map, draw and write; returns the facts of `summary.json`."""
+    settings_of(config)
+    run_dir, settings = run_directory(), plain(config)
+    floor = plan_of(config)
+    predictor = load(config.ckpt)
+    how = PromiseSettings(**settings["promise"])
+    asked = {
+        "area": settings["area"], "height_m": config.height_m, "step_m": config.step_m,
+        "threshold_db": float(config.threshold_db), "stations": stations_of(settings["stations"]),
+        "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
+        "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db),
+    }  # fmt: skip
+    check_map(predictor, asked)
+    geotiff.wanted(config.geotiff, predictor.site.georeference)
+    promise = None
+    if config.promised:
+        promise = promise_of(str(config.ckpt), settings["dataset"], how, bool(config.renew))
+    with progress("cells") as tick:
+        found = map_of(predictor, promise=promise, asked=tick, **asked)
+    kept = None if promise is None else promise.kept(how.share)
+    lines = lines_of(found, kept)
+    drawn = list(layers(found, config.unit))
+    found.save(run_dir / "map.npz")
+    if config.pictures:
+        draw(found, predictor, run_dir, config.unit, floor)
+    origin = predictor.site.georeference
+    if origin is not None and geotiff.wanted(config.geotiff, origin):
+        geotiff.write_geotiff(run_dir / "map.tif", found, origin)
+    write_page(run_dir / "map.html", found, drawn, title_of(found, predictor), lines, floor)
+    facts = {
+        **found.figures(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
+        "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
+        "promise/calibrated": int(promise is not None), **provenance(), **machine_facts(), **peak_memory(),
+    }  # fmt: skip
+    if kept is not None and promise is not None:
+        reach = promise.calibration(how.share).reach
+        facts |= {f"promise/held/{name}": value for name, value in vars(kept).items()}
+        facts |= {"promise/reach_m": reach, "promise/block_m": promise.block_m}
+    write_summary(run_dir / "summary.json", facts)
+    show(run_dir, lines=lines, before=f"{facts['map/cells']} cells, {facts['map/stations']} station(s); map ")
+    return facts
+
+
+def check_map(predictor: Predictor, asked: dict[str, Any]) -> None:
+    """Refuse what cannot be mapped before any evidence is gathered: a map of no cells is made.
+
+    Raises:
+        DataError: as `map_of`.
+    """
+    map_of(predictor, **{**asked, "dry": True})

@@ -1,0 +1,73 @@
+"""`gsparc place ckpt=FILE`: where one more station serves an area best."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from gsparc.commands.map import context_of_stored, opened, progress, promise_of
+from gsparc.commands.output import run_directory, show
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.maps.pictures import draw_placing
+from gsparc.maps.placing import NewStation, new_station_error, number, place_next, said
+from gsparc.maps.promise import PromiseSettings
+from gsparc.methods import checkpoint
+from gsparc.methods.predictor import load
+from gsparc.methods.registry import build
+from gsparc.methods.timing import machine_facts
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Try candidates, draw and write; returns the facts of `summary.json`."""
+    RunSettings.of(config)
+    run_dir, settings, path = run_directory(), plain(config), str(config.ckpt)
+    predictor = load(path)
+    asked = {
+        "area": settings["area"], "goal": config.goal, "threshold_db": float(config.threshold_db),
+        "height_m": config.height_m, "sites": config.sites, "station_height_m": config.station_height_m,
+    }  # fmt: skip
+    place_next(predictor, count=1, **asked)  # refuses what cannot be before anything is fitted
+    promise, error = None, NewStation()
+    if config.promised:
+        promise = promise_of(path, settings["dataset"], PromiseSettings(**settings["promise"]), False)
+    if config.left_out:
+        stored = checkpoint.read(path)
+        run = opened(path, settings["dataset"])
+        make = partial(build, stored.configuration["model"], trusted=False)
+        context = context_of_stored(stored.configuration)
+        fold = run.split.folds[0]
+        error = new_station_error(run.methods[0], make, run.data, fold, context, int(config.left_out))
+    with progress("candidates") as tick:
+        found = place_next(predictor, count=config.count, promise=promise, error=error, asked=tick, **asked)
+    columns: dict[str, Any] = dict(zip(("x", "y", "z"), found.places.T.round(4), strict=True))
+    if predictor.site.georeference is not None:
+        latitude, longitude, _ = predictor.degrees(found.places)
+        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
+    columns |= {found.what: found.goal, "low": found.low, "high": found.high}
+    write_samples(
+        run_dir / "place.csv", {name: np.asarray(values).tolist() for name, values in columns.items()}
+    )
+    draw_placing(found, run_dir / "place.png", float(config.threshold_db))
+    x, y, z = found.places[0]
+    facts = {
+        "place/x": x, "place/y": y, "place/z": z, "place/goal": found.what, "place/before": found.before,
+        "place/after": found.goal[0], "place/low": found.low[0], "place/high": found.high[0],
+        "place/candidates": len(found.places), "place/threshold_db": float(config.threshold_db),
+        "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
+        **provenance(), **machine_facts(),
+    }  # fmt: skip
+    write_summary(run_dir / "summary.json", facts)
+    level = float(config.threshold_db)
+    lines = [
+        f"now {said(found.what, found.before, level)}",
+        f"with a station at ({x:.2f}, {y:.2f}, {z:.2f}): {said(found.what, found.goal[0], level)} "
+        f"(90 % interval {number(found.what, found.low[0])} to {number(found.what, found.high[0])})",
+    ]
+    if not error.stations:
+        lines.append("the interval knows nothing of a whole station's offset: no station was left out")
+    show(run_dir, lines=lines, before=f"{len(found.places)} candidates; ")
+    return facts

@@ -1,0 +1,62 @@
+"""`gsparc plan ckpt=FILE`: where to measure next."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from gsparc.commands.map import plan_of, promise_of, settings_of, stations_of
+from gsparc.commands.output import run_directory, show
+from gsparc.commands.settings import plain
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.maps.pictures import draw_plan_picture
+from gsparc.maps.planning import Plan, plan_next
+from gsparc.maps.promise import PromiseSettings
+from gsparc.methods.predictor import Predictor, load
+from gsparc.methods.timing import machine_facts
+
+
+def write_places(path: Path, found: Plan, predictor: Predictor | None) -> None:
+    """The places as a table, in the order in which they are to be measured."""
+    columns: dict[str, Any] = {"order": np.arange(1, len(found.places) + 1)}
+    columns |= dict(zip(("x", "y", "z"), found.places.T.round(4), strict=True))
+    if predictor is not None and predictor.site.georeference is not None and len(found.places):
+        latitude, longitude, _ = predictor.degrees(found.places)
+        columns |= {"latitude": latitude.round(8), "longitude": longitude.round(8)}
+    columns |= {"rank": found.chosen + 1, "expected_error_db": found.expected_db.round(4)}
+    write_samples(path, {name: values.tolist() for name, values in columns.items()})
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Choose, draw and write; returns the facts of `summary.json`."""
+    settings_of(config)
+    run_dir, settings = run_directory(), plain(config)
+    floor = plan_of(config)
+    predictor = None if config.ckpt is None else load(config.ckpt)
+    promise = None
+    if predictor is not None and config.promised:
+        how = PromiseSettings(**settings["promise"])
+        promise = promise_of(str(config.ckpt), settings["dataset"], how, False)
+    found = plan_next(
+        predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
+        plan=floor, stations=stations_of(settings["stations"]), other_end=settings["other_end"],
+        promise=promise, least_gain_db=float(config.least_gain_db), route=bool(config.route),
+        start=settings["start"], route_m=config.route_m, length_m=config.length_m,
+    )  # fmt: skip
+    write_places(run_dir / "plan.csv", found, predictor)
+    draw_plan_picture(found, run_dir / "plan.png", promise, predictor, floor)
+    facts = {
+        "plan/places": len(found.places), "plan/before_db": found.before_db, "plan/after_db": found.after_db,
+        "plan/length_m": found.length_m, "plan/stopped": found.stopped or None,
+        "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
+        **provenance(), **machine_facts(),
+    }  # fmt: skip
+    write_summary(run_dir / "summary.json", facts)
+    said = f"{len(found.places)} places: expected error {found.before_db:.2f} -> {found.after_db:.2f} dB"
+    if config.route or config.route_m is not None:
+        said += f", a walk of {found.length_m:.4g} m"
+    show(run_dir, lines=[found.stopped] if found.stopped else [], before=f"{said}; plan ")
+    return facts

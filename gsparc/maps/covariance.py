@@ -1,0 +1,177 @@
+"""What a model does not know yet: covariances of its errors between places, station by station."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.linalg import solve_triangular
+from scipy.spatial.distance import cdist
+
+from gsparc.data.errors import DataError
+from gsparc.data.schema import Site
+from gsparc.maps.levels import predicted
+from gsparc.maps.making import CHUNK, ends_of
+from gsparc.maps.promise import Promise
+from gsparc.methods.distance_law import Rows
+from gsparc.methods.method import HasProcess
+from gsparc.methods.power_kernel import PowerKernel
+from gsparc.methods.power_process import PowerProcess, fit_powers
+from gsparc.methods.predictor import Predictor
+
+BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
+LEARNED = 1000  # predictions that stand for a model without a process of its own
+SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
+SHARE_OF_SIDE = 0.15  # of the longer side: the length over which powers are alike, where nobody says it
+
+
+@dataclass
+class Unknown:
+    """Errors at S places, all variances in dB^2.
+
+    Attributes:
+        covariance: (S, S) of the power without a measurement's own noise; changes as places are measured.
+        noise: variance of one measurement.
+        weight: (S,) what held-out blocks say that variances are to be multiplied with.
+    """
+
+    covariance: np.ndarray
+    noise: float
+    weight: np.ndarray
+
+    def measured(self, place: int) -> None:
+        """Condition on a measurement at one of the places."""
+        column = self.covariance[:, place].copy()
+        self.covariance -= np.outer(column, column / (column[place] + self.noise))
+
+    def gains(self, targets: np.ndarray) -> np.ndarray:
+        """What a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
+        told = (self.weight * targets) @ self.covariance**2
+        return told / (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+
+    def variances(self) -> np.ndarray:
+        """Of a measurement's error at each place (S,), as held-out blocks scale it."""
+        return self.weight * (np.maximum(self.covariance.diagonal(), 0) + self.noise)
+
+
+def unknown_of(
+    predictor: Predictor,
+    places: np.ndarray,
+    stations: Sequence[str],
+    promise: Promise | None,
+    other_end: Sequence[float] | None = None,
+) -> list[Unknown]:
+    """Of every station, as the model's own process says, or one fitted to what the model predicts.
+
+    Args:
+        predictor: of powers.
+        places: (S, 3) world [m].
+        stations: names; [""] where there is one.
+        promise: evidence of held-out blocks; None: variances as the model states them.
+        other_end: see `map_of`.
+
+    Raises:
+        DataError: the model has neither a process nor known places.
+    """
+    found = []
+    for name in stations:
+        asking = predictor if predictor.site.stations is None else predictor.at(name)
+        number = 0 if predictor.site.stations is None else predictor.site.stations.name.index(name)
+        process = asking.method.process() if isinstance(asking.method, HasProcess) else None
+        if process is None:
+            process = _stand_in(asking, promise, number)
+        local = _queries(asking, places, other_end, process.places.shape[1])
+        covariance = posterior(process, local)
+        noise = process.kernel.amplitude * process.kernel.noise
+        weight = np.ones(len(places))
+        if promise is not None:
+            weight = _scaled(asking, promise, places, local, number, covariance, noise, other_end)
+        found.append(Unknown(covariance, noise, weight))
+    return found
+
+
+def before_measuring(places: np.ndarray, length_m: float | None) -> list[Unknown]:
+    """The same where nothing was measured: shadowing of one length about a level nobody knows.
+
+    Args:
+        places: (S, 3) [m].
+        length_m: over which powers are alike; None: `SHARE_OF_SIDE` of the longer side.
+    """
+    length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
+    variance = SHADOWING_DB**2
+    prior = variance * (PowerKernel((length,), (1.0,), NOISE, 1.0).correlation(cdist(places, places)) + 1)
+    return [Unknown(prior, variance * NOISE, np.ones(len(places)))]
+
+
+def posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:
+    """Covariance (S, S) [dB^2] of the power at places (S, D), given what the process knows."""
+    terms = process.trend.terms(torch.from_numpy(places)).numpy()
+    known = process.trend.terms(torch.from_numpy(process.places)).numpy()
+    cross = process.kernel.correlation(cdist(process.places, places)) + known @ terms.T
+    told = solve_triangular(process.factor, cross, lower=True, check_finite=False)
+    prior = process.kernel.correlation(cdist(places, places)) + terms @ terms.T
+    return process.kernel.amplitude * (prior - told.T @ told)
+
+
+def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerProcess:
+    """A process of what the model predicts at places it knows."""
+    if promise is None:
+        raise DataError(
+            f"{asking.method.name} states no covariance, and the model does not say where was measured; "
+            "run gsparc map on it first, which stores it"
+        )
+    own = promise.known[promise.station == number]
+    if not len(own):
+        own = promise.known
+    own = own[np.linspace(0, len(own) - 1, min(len(own), LEARNED)).astype(int)]
+    if own.shape[1] == 6:
+        raise DataError(f"{asking.method.name} states no covariance; plan for models of one moving end")
+    world = own + asking.site.origin
+    said = asking.predict(**{asking.site.moving_end: world})
+    level, _ = predicted(said, asking.site.kind)
+    good = np.isfinite(level)
+    rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
+    return fit_powers(rows, asking.site, "constant")[0]
+
+
+def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | None, width: int) -> np.ndarray:
+    """Local places (S, D) as the process has them."""
+    site: Site = asking.site
+    local = places - site.origin
+    if width == 3:
+        return local
+    if site.static_position is not None:
+        still = site.static_position
+    elif other is not None:
+        still = np.asarray(other, np.float64) - site.origin
+    else:
+        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
+    both = {"tx": np.broadcast_to(still, local.shape), "rx": local}
+    if site.static_end == "rx":
+        both = {"tx": local, "rx": np.broadcast_to(still, local.shape)}
+    return np.hstack([both["tx"], both["rx"]])
+
+
+def _scaled(
+    asking: Predictor,
+    promise: Promise,
+    places: np.ndarray,
+    local: np.ndarray,
+    number: int,
+    posterior: np.ndarray,
+    noise: float,
+    other: Sequence[float] | None,
+) -> np.ndarray:
+    """Expected squared errors of held-out blocks over the process's variance, (S,), within `BETWEEN`."""
+    calibration = promise.calibration()
+    spread = np.concatenate([
+        predicted(asking.predict(**ends_of(asking.site, part, other)), asking.site.kind)[1]
+        for part in np.split(places, range(CHUNK, len(places), CHUNK))
+    ])  # fmt: skip
+    far = promise.distance(local[:, -promise.known.shape[1] :], number)
+    inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
+    error = calibration.expected_error(spread, inside, np.full(len(far), number))
+    ratio = error**2 / (np.maximum(posterior.diagonal(), 0) + noise)
+    return np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)

@@ -1,0 +1,155 @@
+"""What a map holds, and its layers over all stations: which serves, at what ratio, with what outage."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.data.errors import DataError
+from gsparc.data.files import whole_file
+from gsparc.maps.area import Grid
+
+REFUSED = -1  # of `best_server`
+
+
+@dataclass(frozen=True)
+class FieldMap:
+    """Predictions for the cells of a grid; float32, NaN where they are refused.
+
+    Attributes:
+        grid: the cells, world.
+        stations: (T,) names; one, "", where there is one.
+        power_db: (T, ny, nx) received power.
+        lower_db, upper_db: (T, ny, nx) ends of the interval.
+        expected_error_db: (T, ny, nx) root mean square error.
+        best_server: (ny, nx) int16, number of the strongest station; `REFUSED`.
+        sinr_db: (ny, nx) of the strongest station, over the others' load and noise.
+        outage: (ny, nx) probability that the strongest station's power lies below `threshold_db`.
+        share: of the truth that the intervals hold.
+        calibrated: whether held-out blocks say so; else the model's own deviations alone.
+        threshold_db: of `outage`.
+        extra: further layers (ny, nx) by name: `delay_spread_ns`, `direction_deg`.
+        places: (n, 2) where was measured, world [m].
+        station_place: (T, 2) world [m], NaN where unknown.
+        notes: what a reader must know, one line each.
+    """
+
+    grid: Grid
+    stations: tuple[str, ...]
+    power_db: np.ndarray
+    lower_db: np.ndarray
+    upper_db: np.ndarray
+    expected_error_db: np.ndarray
+    best_server: np.ndarray
+    sinr_db: np.ndarray
+    outage: np.ndarray
+    share: float
+    calibrated: bool
+    threshold_db: float
+    extra: Mapping[str, np.ndarray] = field(default_factory=dict)
+    places: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    station_place: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    notes: tuple[str, ...] = ()
+
+    @property
+    def refused(self) -> np.ndarray:
+        """Cells (ny, nx) bool of the area about which nothing is said."""
+        return self.grid.inside & (self.best_server == REFUSED)
+
+    def strongest(self, layers: np.ndarray) -> np.ndarray:
+        """Of layers (T, ny, nx), that of each cell's strongest station (ny, nx); NaN where refused."""
+        number = np.maximum(self.best_server, 0).astype(np.int64)
+        chosen = np.take_along_axis(layers, number[None], axis=0)[0]
+        return np.where(self.best_server == REFUSED, np.nan, chosen)
+
+    def save(self, path: str | Path) -> None:
+        """Write as npz, whole or not at all."""
+        arrays = {
+            "x": self.grid.x, "y": self.grid.y, "height": np.array(self.grid.height),
+            "inside": self.grid.inside, "stations": np.array(self.stations), "power_db": self.power_db,
+            "lower_db": self.lower_db, "upper_db": self.upper_db,
+            "expected_error_db": self.expected_error_db, "best_server": self.best_server,
+            "sinr_db": self.sinr_db, "outage": self.outage, "share": np.array(self.share),
+            "calibrated": np.array(self.calibrated), "threshold_db": np.array(self.threshold_db),
+            **self.extra,
+        }  # fmt: skip
+        with whole_file(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    def figures(self) -> dict[str, float | int | None]:
+        """`map/*` for `summary.json`; shares are of the cells that something is said of."""
+        told = self.grid.inside & ~self.refused
+        best = self.strongest(self.power_db)[told]
+        count = int(told.sum())
+
+        def mean(values: np.ndarray) -> float | None:
+            known = values[np.isfinite(values)]
+            return float(known.mean()) if len(known) else None
+
+        width = self.strongest(self.upper_db - self.lower_db)[told]
+        found = {
+            "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
+            "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
+            "lowest_db": float(best.min()) if count else None,
+            "highest_db": float(best.max()) if count else None,
+            "width_db": mean(width),
+            "expected_error_db": mean(self.strongest(self.expected_error_db)[told]),
+            "threshold_db": self.threshold_db, "outage": mean(self.outage[told]),
+            "sinr_db": mean(self.sinr_db[told]),
+        }  # fmt: skip
+        return {f"map/{name}": value for name, value in found.items()}
+
+
+def best_server(power_db: np.ndarray) -> np.ndarray:
+    """Number of the strongest of (T, n) powers [dB], (n,) int16; `REFUSED` where none is known."""
+    known = np.isfinite(power_db)
+    number = np.where(known, power_db, -np.inf).argmax(axis=0)
+    return np.where(known.any(axis=0), number, REFUSED).astype(np.int16)
+
+
+def sinr(power_db: np.ndarray, load: np.ndarray, noise_db: float | None) -> np.ndarray:
+    """Signal over interference and noise (n,) [dB] of the strongest of (T, n) powers.
+
+    Args:
+        power_db: NaN where unknown: such a station is taken for silent.
+        load: (T,) share of the time that each transmits while another serves.
+        noise_db: power of the noise, in the unit of the powers; None: interference alone.
+
+    Returns:
+        NaN where no power is known, or where there is neither noise nor interference.
+    """
+    linear = np.where(np.isfinite(power_db), 10 ** (power_db.astype(np.float64) / 10), 0.0)
+    number = best_server(power_db)
+    cell = np.arange(linear.shape[1])
+    signal = linear[np.maximum(number, 0), cell]
+    every = load @ linear - load[np.maximum(number, 0)] * signal
+    noise = 0.0 if noise_db is None else 10 ** (noise_db / 10)
+    rest = np.maximum(every, 0.0) + noise
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = 10 * np.log10(signal / rest)
+    return np.where((number == REFUSED) | ~(rest > 0), np.nan, ratio)
+
+
+def loads(given: float | Sequence[float] | Mapping[str, float], stations: Sequence[str]) -> np.ndarray:
+    """Loads (T,) in [0, 1] of one number, one per station, or by name (the others 1).
+
+    Raises:
+        DataError: another number of them, an unknown name, or no share.
+    """
+    if isinstance(given, Mapping):
+        wrong = next((name for name in given if name not in stations), None)
+        if wrong is not None:
+            raise DataError(f"load: no station {wrong!r}; there are {', '.join(stations)}")
+        given = [given.get(name, 1.0) for name in stations]
+    try:
+        values = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise DataError(f"load={given}: a number from 0 to 1 is needed, or one per station") from None
+    if values.ndim > 1 or values.size not in (1, len(stations)):
+        raise DataError(f"load={given}: one number is needed, or {len(stations)}, one per station")
+    if not ((values >= 0) & (values <= 1)).all():
+        raise DataError(f"load={given}: shares from 0 to 1 are needed")
+    return np.broadcast_to(values, (len(stations),))

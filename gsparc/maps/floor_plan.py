@@ -1,0 +1,89 @@
+"""A floor plan: an image, and two points that say where it lies and how large it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from gsparc.data.assemble import FARTHEST
+from gsparc.data.errors import DataError
+
+LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
+LARGEST = 4000  # pixels of the longer side that are kept
+SHOW = "say plan_points=[[column,row,x,y],[column,row,x,y]], pixels from the upper left corner, metres"
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """An image laid on the floor.
+
+    Attributes:
+        image: (h, w, 3) uint8.
+        scale: complex, metres per pixel, turned; world x + jy = `scale` (column - j row) + `shift`.
+        shift: complex [m].
+    """
+
+    image: np.ndarray
+    scale: complex
+    shift: complex
+
+    def corners(self) -> np.ndarray:
+        """World places (4, 2) [m] of the corners, in turn from the upper left."""
+        height, width = self.image.shape[:2]
+        pixel = np.array([0, width, width - 1j * height, -1j * height])
+        world = self.scale * pixel + self.shift
+        return np.column_stack([world.real, world.imag])
+
+    def matrix(self) -> tuple[float, float, float, float, float, float]:
+        """(a, b, c, d, e, f): x = a column + c row + e and y = b column + d row + f [m]."""
+        one, two = self.scale, -1j * self.scale
+        return one.real, one.imag, two.real, two.imag, self.shift.real, self.shift.imag
+
+
+def read_plan(path: str | Path, points: Sequence[Sequence[float]] | None) -> FloorPlan:
+    """Read an image and lay it on the floor by two points.
+
+    Args:
+        path: PNG, JPEG or another image.
+        points: two of (column, row, x, y): pixels from the upper left corner, world metres.
+
+    Raises:
+        DataError: no image, or points that tell no scale.
+    """
+    if not Path(path).is_file():
+        raise DataError(f"plan={path}: no such file")
+    try:
+        with Image.open(path) as picture:
+            shrink = max(1.0, max(picture.size) / LARGEST)
+            size = tuple(max(1, round(side / shrink)) for side in picture.size)
+            image = np.asarray(picture.convert("RGB").resize(size))  # type: ignore[arg-type]
+    except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
+        raise DataError(f"plan={path}: not an image that can be read; expected PNG or JPEG") from None
+    if points is None:
+        raise DataError(f"plan={path}: has no scale; {SHOW}")
+    pairs = _checked(points, path)
+    pixel = (pairs[:, 0] - 1j * pairs[:, 1]) / shrink
+    world = pairs[:, 2] + 1j * pairs[:, 3]
+    scale = (world[1] - world[0]) / (pixel[1] - pixel[0])
+    return FloorPlan(image, complex(scale), complex(world[0] - scale * pixel[0]))
+
+
+def _checked(points: Any, path: str | Path) -> np.ndarray:
+    try:
+        pairs = np.array(points, dtype=np.float64)
+    except (TypeError, ValueError):
+        pairs = np.zeros(0)
+    if pairs.shape != (2, 4) or not np.isfinite(pairs).all():
+        raise DataError(f"plan_points={points}: two points of four numbers are needed; {SHOW}")
+    if np.hypot(*(pairs[1, :2] - pairs[0, :2])) < LEAST_PIXELS:
+        raise DataError(
+            f"plan={path}: its two points are one pixel, which tells no scale; take two far apart"
+        )
+    if not 0 < np.hypot(*(pairs[1, 2:] - pairs[0, 2:])) < FARTHEST or np.abs(pairs[:, 2:]).max() > FARTHEST:
+        raise DataError(f"plan={path}: its two points are one place, or not in metres; take two far apart")
+    return pairs

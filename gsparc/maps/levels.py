@@ -1,0 +1,60 @@
+"""Received power in decibels, with its deviation, of whatever a model predicts or a row holds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsparc.data.schema import Kind, Measurements
+from gsparc.evaluation.intervals import DB, in_decibels
+from gsparc.methods.method import Prediction
+
+MAPPED: tuple[Kind, ...] = ("rssi", "csi")
+
+
+def predicted(said: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """Level and its standard deviation (B,) float64 [dB]; NaN where no power is predicted.
+
+    The power of a channel is its mean over antennas and subcarriers, expected: |mean|^2 + error variance.
+    Its deviation takes the error for one complex normal variable shared by all entries, which overstates it.
+
+    Args:
+        said: a prediction; its variance is of the entries.
+        kind: `rssi` or `csi`.
+        scale: of stored targets; 1 where `said` is in physical units.
+
+    Returns:
+        The deviation is 1 dB everywhere where the method has no variance.
+    """
+    mean = said.mean.detach().cpu().numpy().reshape(len(said.mean), -1)
+    variance = None if said.variance is None else said.variance.detach().cpu().double().numpy() * scale**2
+    level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
+    if kind == "rssi":
+        power = mean[:, 0].astype(np.float64) * scale
+        good = np.isfinite(power) & (power > 0)
+        given = np.zeros(len(power)) if variance is None else variance
+        level[good], spread[good] = in_decibels(power[good], given[good])
+    else:
+        power = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
+        error = np.zeros(len(power)) if variance is None else variance
+        good = np.isfinite(power) & (power + error > 0)
+        whole = power[good] + error[good]
+        level[good] = 10 * np.log10(whole)
+        spread[good] = DB * np.sqrt(2 * power[good] * error[good] + error[good] ** 2) / whole
+    if variance is None:
+        spread[good] = 1.0
+    return level, np.where(spread > 0, spread, np.nan)
+
+
+def measured(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Level (n,) [dB] of rows (n,), NaN where nothing was measured, and which (n,) bool lie below theirs."""
+    target = np.abs(data.target[rows].reshape(len(rows), -1)).astype(np.float64) * data.site.target_scale
+    power = target if data.site.kind == "rssi" else target**2
+    silent = np.zeros(len(rows), bool) if data.censored is None else data.censored[rows]
+    if data.mask is not None:
+        seen = data.mask[rows].reshape(power.shape) | silent[:, None]
+        power = np.where(seen, power, np.nan)
+    known = np.isfinite(power)
+    mean = np.where(known, power, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = np.where(mean > 0, 10 * np.log10(mean), np.nan)
+    return level, silent

@@ -1,0 +1,336 @@
+"""A map of a model: every cell of an area is asked about, in chunks of bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from scipy.stats import norm
+
+from gsparc.data.errors import DataError
+from gsparc.data.instantiate import suggest
+from gsparc.data.links.stations import station_number
+from gsparc.data.schema import End, Site
+from gsparc.maps.area import Grid, grid_of
+from gsparc.maps.field_map import FieldMap, best_server, loads, sinr
+from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.intervals import Calibration
+from gsparc.maps.levels import MAPPED, predicted
+from gsparc.maps.promise import Promise, stored_promise
+from gsparc.maps.refining import refined
+from gsparc.methods.method import HasPaths
+from gsparc.methods.predictor import Predictor
+
+CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
+ALL_CELLS = 40_000  # of a map that are all asked about
+BANDS = 1 << 16  # cells at a time of what follows from predictions
+
+
+def map_of(
+    predictor: Predictor,
+    area: Any = None,
+    *,
+    height_m: float | None = None,
+    step_m: float | None = None,
+    threshold_db: float = -100.0,
+    stations: Sequence[str | int] | None = None,
+    load: float | Sequence[float] | Mapping[str, float] = 1.0,
+    noise_db: float | None = None,
+    other_end: Sequence[float] | None = None,
+    plan: FloorPlan | None = None,
+    promise: Promise | None = None,
+    share: float = 0.9,
+    tolerance_db: float = 0.1,
+    asked: Callable[[float], None] = lambda share: None,
+    dry: bool = False,
+) -> FieldMap:
+    """Predict every cell of an area; `predictor.map(...)` is this.
+
+    >>> found = gsparc.load("model.ckpt").map(step_m=0.5)
+    >>> found.power_db.shape, found.outage.mean()
+
+    Args:
+        predictor: of powers or channels.
+        area, height_m, step_m: see `grid_of`.
+        threshold_db: of outage.
+        stations: names or numbers; None: all that the model can answer for.
+        load, noise_db: see `sinr`.
+        other_end: (3,) world place of the end that the map is not of, where both moved [m].
+        plan: beneath the map.
+        promise: evidence of held-out blocks; None: intervals are the model's own deviations, and nothing is
+            refused.
+        share: of the truth that intervals are to hold.
+        tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
+            every cell. Known places must be stored with the model.
+        asked: called with the share of the work that is done.
+        dry: predict one cell of each station alone: whether everything asked for is possible.
+
+    Raises:
+        DataError: anything wrong with what is asked for.
+    """
+    site = predictor.site
+    if site.kind not in MAPPED:
+        raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
+    names, notes = answering(predictor, stations, promise)
+    grid = grid_of(site, area, height_m, step_m, plan, len(names))
+    share_of = loads(load, names)
+    if dry:
+        first = np.zeros_like(grid.inside)
+        first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
+        grid, promise = replace(grid, inside=first), None
+    calibration = None if promise is None else promise.calibration(share)
+    arrays = [np.full((len(names), *grid.shape), np.nan, np.float32) for _ in range(4)]
+    stride = _stride(grid, promise, tolerance_db)
+    told = 0
+    for layer, name in enumerate(names):
+        asking = predictor if site.stations is None else predictor.at(name)
+        number = 0 if site.stations is None else site.stations.name.index(name)
+        report = _reporter(
+            asked, layer, len(names), int(grid.inside.sum()) / stride**2 * (1.3 if stride > 1 else 1)
+        )
+        ask = _asker(asking, grid, other_end, report)
+        (mean, spread), count = refined(ask, grid.inside, stride, tolerance_db)
+        told += count
+        for cells in _chunks(grid, BANDS):
+            level, wide = (values.reshape(-1)[cells].astype(np.float64) for values in (mean, spread))
+            said = _described(
+                level, wide, grid.places(cells), other_end, site, promise, calibration, number, share
+            )
+            for array, values in zip(arrays, said, strict=True):
+                array[layer].reshape(-1)[cells] = values
+    asked(1.0)
+    if told < len(names) * int(grid.inside.sum()):
+        notes.append(
+            f"{told} of {len(names) * int(grid.inside.sum())} predictions were made, the others interpolated "
+            f"within about {tolerance_db:g} dB"
+        )
+    power, lower, upper, error = arrays
+    best, ratio, outage = _over_stations(power, error, share_of, noise_db, threshold_db, calibration)
+    if calibration is not None and not np.isfinite(power).any():
+        raise DataError(
+            f"area: every cell lies more than {calibration.reach:.3g} m from what was measured, the farthest "
+            "that held-out blocks tell anything of; map where was measured, or give a larger promise.block_m"
+        )
+    return FieldMap(
+        grid, tuple(names), power, lower, upper, error, best, ratio, outage, share, calibration is not None,
+        threshold_db, _path_layers(predictor, grid, best, names),
+        np.zeros((0, 2)) if promise is None else _measured_places(promise, site), _still(site, names),
+        tuple(notes),
+    )  # fmt: skip
+
+
+def mapped(predictor: Predictor, area: Any = None, **how: Any) -> FieldMap:
+    """`map_of` with the evidence that the model's checkpoint holds, where it does."""
+    return map_of(predictor, area, **{"promise": stored_promise(predictor.extra), **how})
+
+
+def answering(
+    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None
+) -> tuple[list[str], list[str]]:
+    """Names of the stations that are mapped, and what must be said of the others.
+
+    Those are stations that the model does not answer for, and, where something is promised, stations that it
+    never heard: what was held out tells nothing of them.
+
+    Raises:
+        DataError: one of them was asked for, or none is left.
+    """
+    stations = predictor.site.stations
+    if stations is None:
+        if wanted is not None:
+            raise DataError(
+                f"stations={list(wanted)}: the model of {predictor.site.name} has one; leave it out"
+            )
+        return [""], []
+    names: list[str] = []
+    for one in wanted if wanted is not None else stations.name:
+        number = station_number(one, stations.name, len(stations))
+        if number is None:
+            raise DataError(f"stations: no station {one!r}{suggest(str(one), stations.name)}")
+        names.append(stations.name[number])
+    if not names:
+        raise DataError("stations=[]: name one at least, or all")
+    notes = []
+    for name in dict.fromkeys(names):
+        try:
+            predictor.at(name)
+            if promise is not None and not (promise.station == stations.name.index(name)).any():
+                raise DataError(f"station {name} was never heard, so that nothing can be promised of its map")
+        except ValueError as error:
+            if wanted is not None:
+                raise DataError(str(error)) from None
+            notes.append(f"left out: {error}")
+            names.remove(name)
+    if not names:
+        raise DataError(notes[0])
+    return list(dict.fromkeys(names)), notes
+
+
+def _chunks(grid: Grid, size: int) -> Iterator[np.ndarray]:
+    every = np.flatnonzero(grid.inside)
+    for start in range(0, len(every), size):
+        yield every[start : start + size]
+
+
+def _stride(grid: Grid, promise: Promise | None, tolerance_db: float) -> int:
+    """Cells between those that are asked about everywhere: no farther apart than what was measured."""
+    if tolerance_db <= 0 or grid.inside.sum() <= ALL_CELLS or promise is None:
+        return 1
+    places = np.unique(promise.known[:, -3:-1], axis=0)
+    if len(places) < 2:
+        return 1
+    apart = float(np.median(cKDTree(places).query(places, k=2)[0][:, 1]))
+    return 1 << max(int(np.log2(max(apart / grid.step, 1.0))) - 1, 0)
+
+
+def _reporter(
+    asked: Callable[[float], None], layer: int, layers: int, expected: float
+) -> Callable[[int], None]:
+    """Says the share of all work after so many more predictions; the last percent is not known before."""
+    done = 0
+
+    def report(more: int) -> None:
+        nonlocal done
+        done += more
+        asked((layer + min(done / max(expected, 1.0), 0.99)) / layers)
+
+    return report
+
+
+def _asker(
+    predictor: Predictor, grid: Grid, other: Sequence[float] | None, report: Callable[[int], None]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Level and deviation (n, 2) [dB] of cells (n,), in chunks, as many at once as torch has threads."""
+    site, workers = predictor.site, torch.get_num_threads()
+
+    def one(cells: np.ndarray) -> np.ndarray:
+        said = predictor.predict(**ends_of(site, grid.places(cells), other))
+        return np.column_stack(predicted(said, site.kind))
+
+    def ask(cells: np.ndarray) -> np.ndarray:
+        parts = [cells[start : start + CHUNK] for start in range(0, len(cells), CHUNK)]
+        found = []
+        pool = ThreadPoolExecutor(workers)
+        try:
+            for part, values in zip(parts, pool.map(one, parts), strict=True):
+                found.append(values)
+                report(len(part))
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)  # an interrupt waits for a chunk, not for all
+        return np.concatenate(found) if found else np.zeros((0, 2))
+
+    return ask
+
+
+def ends_of(site: Site, places: np.ndarray, other: Sequence[float] | None) -> dict[End, np.ndarray]:
+    """World places (n, 3) of the ends that a predictor is to be told.
+
+    Raises:
+        DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
+    """
+    if site.static_end is not None:
+        if other is not None:
+            raise DataError(f"other_end: the {site.static_end} stood still; leave it out")
+        return {site.moving_end: places}
+    if other is None:
+        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
+    place = np.asarray(other, np.float64)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise DataError(f"other_end={other}: three finite numbers [m] are needed")
+    return {"rx": places, "tx": np.broadcast_to(place, places.shape)}
+
+
+def _described(
+    mean: np.ndarray,
+    spread: np.ndarray,
+    places: np.ndarray,
+    other: Sequence[float] | None,
+    site: Site,
+    promise: Promise | None,
+    calibration: Calibration | None,
+    station: int,
+    share: float,
+) -> tuple[np.ndarray, ...]:
+    """Power, ends of its interval and expected error (n,) [dB]; all NaN where one of them is not known."""
+    if promise is None or calibration is None:
+        half, error = norm.ppf((1 + share) / 2) * spread, spread
+    else:
+        local = places - site.origin
+        if site.static_end is None and other is not None:
+            local = np.hstack([np.broadcast_to(np.asarray(other) - site.origin, local.shape), local])
+        far = promise.distance(local, station)
+        own = np.full(len(far), station)
+        half, error = calibration.interval(spread, far, own), calibration.expected_error(spread, far, own)
+    mean = np.where(np.isfinite(half), mean, np.nan)
+    return mean, mean - half, mean + half, np.where(np.isfinite(mean), error, np.nan)
+
+
+def _over_stations(
+    power: np.ndarray,
+    error: np.ndarray,
+    load: np.ndarray,
+    noise_db: float | None,
+    threshold_db: float,
+    calibration: Calibration | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Best server, SINR and outage (ny, nx)."""
+    flat, wrong = (array.reshape(len(array), -1) for array in (power, error))
+    best = np.empty(flat.shape[1], np.int16)
+    ratio, outage = (np.empty(flat.shape[1], np.float32) for _ in range(2))
+    for start in range(0, flat.shape[1], BANDS):
+        part = slice(start, start + BANDS)
+        best[part] = number = best_server(flat[:, part])
+        ratio[part] = sinr(flat[:, part], load, noise_db)
+        cell = np.arange(len(number))
+        mean, spread = (array[:, part][np.maximum(number, 0), cell] for array in (flat, wrong))
+        if calibration is None:
+            outage[part] = norm.cdf((threshold_db - mean) / spread)
+        else:
+            outage[part] = calibration.below(threshold_db, mean, spread)
+    shape = power.shape[1:]
+    return best.reshape(shape), ratio.reshape(shape), outage.reshape(shape)
+
+
+def _path_layers(
+    predictor: Predictor, grid: Grid, best: np.ndarray, names: Sequence[str]
+) -> dict[str, np.ndarray]:
+    """Delay spread [ns] and azimuth [deg] of the strongest path (ny, nx), of models with paths."""
+    if not isinstance(predictor.method, HasPaths) or predictor.site.stations is not None:
+        return {}
+    layers = {name: np.full(grid.shape, np.nan, np.float32) for name in ("delay_spread_ns", "direction_deg")}
+    told = np.flatnonzero((best >= 0).reshape(-1))
+    for start in range(0, len(told), CHUNK):
+        cells = told[start : start + CHUNK]
+        try:
+            found = predictor.paths(**ends_of(predictor.site, grid.places(cells), None))
+        except ValueError:  # what was fitted has none
+            return {}
+        power = np.abs(found.gain).astype(np.float64) ** 2
+        power, delay = power.mean(axis=1), np.asarray(found.delay_s, np.float64).mean(axis=1)
+        share = power / np.maximum(power.sum(axis=1, keepdims=True), np.finfo(float).tiny)
+        middle = (share * delay).sum(axis=1, keepdims=True)
+        spread = np.sqrt((share * (delay - middle) ** 2).sum(axis=1))
+        layers["delay_spread_ns"].reshape(-1)[cells] = spread * 1e9
+        if found.direction is not None:
+            towards = found.direction[np.arange(len(cells)), power.argmax(axis=1)]
+            azimuth = np.degrees(np.arctan2(towards[:, 1], towards[:, 0]))
+            layers["direction_deg"].reshape(-1)[cells] = azimuth
+    return {name: layer for name, layer in layers.items() if np.isfinite(layer).any()}
+
+
+def _measured_places(promise: Promise, site: Site) -> np.ndarray:
+    return np.unique(promise.known[:, -3:-1] + site.origin[:2], axis=0)
+
+
+def _still(site: Site, names: Sequence[str]) -> np.ndarray:
+    """World places (T, 2) of the stations [m], NaN where unknown."""
+    if site.stations is not None:
+        rows = [site.stations.name.index(name) for name in names]
+        return site.stations.position[rows][:, :2] + site.origin[:2]
+    place = np.full(3, np.nan) if site.static_position is None else site.static_position
+    return (place + site.origin)[None, :2]

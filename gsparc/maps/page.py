@@ -1,0 +1,104 @@
+"""One offline HTML page of a map: layers to switch, and the value under the pointer."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment
+from matplotlib import colormaps
+from PIL import Image
+
+from gsparc.data.files import whole_file
+from gsparc.maps.field_map import FieldMap
+from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.pictures import MOST_POINTS, Layer
+
+MOST_CELLS = 600  # along a side: the page shows every n-th cell of larger maps
+LEVELS = 65_534  # of a value; 65535 is no value
+NOTHING = 65_535
+PLAN_PIXELS = 1600  # of a plan's longer side
+
+
+def write_page(
+    path: Path,
+    found: FieldMap,
+    drawn: Sequence[Layer],
+    title: str,
+    lines: Sequence[str],
+    plan: FloorPlan | None,
+) -> None:
+    """Write a page that needs nothing but itself.
+
+    Args:
+        path: HTML file.
+        found: the map.
+        drawn: its layers.
+        title: of the page.
+        lines: what a reader must know.
+        plan: beneath the map.
+    """
+    every = max(1, -(-max(found.grid.shape) // MOST_CELLS))
+    text = files("gsparc.maps").joinpath("page.html.j2").read_text(encoding="utf-8")
+    left, right, low, high = found.grid.extent
+    few = found.places[np.linspace(0, len(found.places) - 1, min(len(found.places), MOST_POINTS)).astype(int)]
+    stations = [
+        {"name": name, "x": float(x), "y": float(y)}
+        for name, (x, y) in zip(found.stations, found.station_place, strict=True)
+        if np.isfinite([x, y]).all()
+    ]
+    content = {
+        "extent": [left, right, low, high], "step": found.grid.step * every,
+        "layers": [_encoded(layer, every) for layer in drawn],
+        "places": np.round(few, 3).tolist(), "stations": stations,
+        "plan": None if plan is None else _plan(plan), "every": every,
+        "refused": _bits(found.refused[::every, ::every]),
+    }  # fmt: skip
+    page = Environment(autoescape=True).from_string(text)
+    html = page.render(title=title, lines=lines, content=content)
+    with whole_file(path) as partial:
+        partial.write_text(html, encoding="utf-8")
+
+
+def _encoded(layer: Layer, every: int) -> dict[str, Any]:
+    values = layer.values[::every, ::every].astype(np.float64)
+    known = np.isfinite(values)
+    least, most = (float(values[known].min()), float(values[known].max())) if known.any() else (0.0, 1.0)
+    scale = (most - least) / LEVELS or 1.0
+    code = np.full(values.shape, NOTHING, np.uint16)
+    code[known] = np.round((values[known] - least) / scale).astype(np.uint16)
+    low, high = layer.range()
+    if layer.words:
+        low, high = -0.5, len(layer.words) - 0.5
+        colours = colormaps["tab20"](np.arange(len(layer.words)) % 20)
+    else:
+        colours = colormaps[layer.colours](np.linspace(0, 1, 256))
+    return {
+        "name": layer.name, "label": layer.label, "words": list(layer.words), "ny": values.shape[0],
+        "nx": values.shape[1], "least": least, "scale": scale, "low": low, "high": high,
+        "data": base64.b64encode(code.astype("<u2").tobytes()).decode(),
+        "colours": (colours[:, :3] * 255).round().astype(int).tolist(),
+    }  # fmt: skip
+
+
+def _bits(values: np.ndarray) -> str:
+    return base64.b64encode(np.packbits(values.reshape(-1)).tobytes()).decode()
+
+
+def _plan(plan: FloorPlan) -> dict[str, Any]:
+    picture = Image.fromarray(plan.image)
+    shrink = max(1.0, max(picture.size) / PLAN_PIXELS)
+    small = picture.resize((max(1, round(picture.width / shrink)), max(1, round(picture.height / shrink))))
+    buffer = io.BytesIO()
+    small.save(buffer, "PNG")
+    a, b, c, d, e, f = plan.matrix()
+    across, down = picture.width / small.width, picture.height / small.height
+    return {
+        "image": base64.b64encode(buffer.getvalue()).decode(),
+        "matrix": [a * across, b * across, c * down, d * down, e, f],
+    }

@@ -1,0 +1,262 @@
+"""A PNG of every layer of a map: floor plan beneath, measured points, stations, scale bar."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Affine2D
+
+from gsparc.evaluation.drawing import panels, save
+from gsparc.maps.field_map import REFUSED, FieldMap
+from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.placing import Placing
+from gsparc.maps.planning import Plan
+from gsparc.maps.promise import Promise
+from gsparc.methods.predictor import Predictor
+
+INCHES = 7.0  # longer side of the map
+NAMED = 15  # stations; of more only their marks are drawn
+MOST_POINTS = 4000  # measured places that are drawn
+OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A layer as it is drawn.
+
+    Attributes:
+        name: of its file and its button.
+        label: of the colour bar, with the unit.
+        values: (ny, nx) float, NaN where nothing is said.
+        colours: a matplotlib colour map.
+        limits: of the colours; None: the 1 and 99 % quantiles.
+        words: names of whole numbers, for a layer of classes.
+    """
+
+    name: str
+    label: str
+    values: np.ndarray
+    colours: str = "viridis"
+    limits: tuple[float, float] | None = None
+    words: tuple[str, ...] = ()
+
+    def range(self) -> tuple[float, float]:
+        """Of the colours."""
+        if self.limits is not None:
+            return self.limits
+        known = self.values[np.isfinite(self.values)]
+        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+        return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
+
+
+def layers(found: FieldMap, unit: str = "dB") -> Iterator[Layer]:
+    """Every layer of a map that says something; of several stations, also the power of each.
+
+    Args:
+        found: the map.
+        unit: of powers: `dBm` where they are.
+    """
+    several = len(found.stations) > 1
+    of = " of the strongest station" if several else ""
+    yield Layer("power", f"received power{of} [{unit}]", found.strongest(found.power_db))
+    if several:
+        values = np.where(found.best_server == REFUSED, np.nan, found.best_server.astype(float))
+        yield Layer("best_server", "strongest station", values, words=found.stations)
+    if np.isfinite(found.sinr_db).any():
+        yield Layer("sinr", "signal over interference and noise [dB]", found.sinr_db)
+    level = f"{found.threshold_db:g} {unit}"
+    yield Layer("outage", f"probability of less than {level}", found.outage, "magma_r", (0.0, 1.0))
+    error = found.strongest(found.expected_error_db)
+    yield Layer("expected_error", "expected error [dB]", error, "cividis")
+    width = found.strongest(found.upper_db - found.lower_db)
+    yield Layer("width", f"width of the {found.share:.0%} interval [dB]", width, "cividis")
+    for name, label, colours, limits in (
+        ("delay_spread_ns", "delay spread [ns]", "plasma", None),
+        ("direction_deg", "azimuth of the strongest path [degrees]", "twilight", (-180.0, 180.0)),
+    ):
+        if name in found.extra:
+            yield Layer(name, label, found.extra[name], colours, limits)
+    if several:
+        for number, name in enumerate(found.stations):
+            values = found.power_db[number]
+            if np.isfinite(values).any():
+                yield Layer(f"power {name}", f"received power of {name} [{unit}]", values)
+
+
+def file_name(layer: Layer) -> str:
+    """Of its PNG, without what a file system may not like."""
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + ".png"
+
+
+def draw_layer(
+    found: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None, more: Any = None
+) -> None:
+    """Save one layer.
+
+    Args:
+        found: the map.
+        layer: of it.
+        path: PNG file.
+        title: above.
+        plan: beneath.
+        more: called with the axes, to draw on them.
+    """
+    left, right, low, high = found.grid.extent
+    width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
+    figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
+    axis = axes[0, 0]
+    if plan is not None:
+        draw_plan(axis, plan)
+    nothing = np.where(found.refused, 1.0, np.nan)
+    grey = ListedColormap(["0.82"])
+    axis.imshow(nothing, origin="lower", extent=found.grid.extent, cmap=grey, zorder=1, alpha=0.6)
+    how: dict[str, Any] = {"origin": "lower", "extent": found.grid.extent, "interpolation": "nearest"}
+    how |= {"alpha": 1.0 if plan is None else 0.65, "zorder": 2}
+    if layer.words:
+        count = len(layer.words)
+        colours = ListedColormap(colormaps["tab20"](np.arange(count) % 20))
+        drawn = axis.imshow(
+            layer.values, cmap=colours, norm=BoundaryNorm(np.arange(count + 1) - 0.5, count), **how
+        )
+        bar = figure.colorbar(drawn, ax=axis, ticks=np.arange(count), shrink=0.85, pad=0.02)
+        bar.ax.set_yticklabels(layer.words)
+    else:
+        lowest, highest = layer.range()
+        how |= {"vmin": lowest, "vmax": highest}
+        drawn = axis.imshow(layer.values, cmap=layer.colours, **how)
+        ends = "neither" if layer.limits else "both"
+        bar = figure.colorbar(drawn, ax=axis, shrink=0.85, pad=0.02, extend=ends)
+    bar.set_label(layer.label)
+    draw_places(axis, found)
+    axis.set(
+        xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title
+    )
+    axis.ticklabel_format(useOffset=False, style="plain")
+    scale_bar(axis, right - left)
+    if more is not None:
+        more(axis)
+    if found.refused.any():
+        axis.plot([], [], "s", color="0.82", label="too far from what was measured")
+    handles, _ = axis.get_legend_handles_labels()
+    if handles:
+        figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=0.12, h_pad=0.1)  # axes of equal scales take more than their share
+    save(figure, path, 110)
+
+
+def draw_plan(axis: Any, plan: FloorPlan) -> None:
+    """The floor plan, where it lies."""
+    height, width = plan.image.shape[:2]
+    a, b, c, d, e, f = plan.matrix()
+    turn = Affine2D(np.array([[a, c, e], [b, d, f], [0, 0, 1]])) + axis.transData
+    axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
+
+
+def draw_places(axis: Any, found: FieldMap) -> None:
+    """Measured points and stations; those outside the map are left out."""
+    left, right, low, high = found.grid.extent
+    places = found.places
+    if len(places):
+        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        size = float(np.clip(2500 / len(few), 0.3, 8.0))
+        axis.plot(*few.T, "k.", markersize=size, alpha=0.5, label="measured", zorder=3, linestyle="")
+    known = found.station_place
+    inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
+    if inside.any():
+        how = {"markersize": 9, "markeredgecolor": "white", "zorder": 4}
+        axis.plot(*known[inside].T, "k^", label="station", **how)
+    if 1 < len(known) <= NAMED:
+        for where, name in zip(known[inside], np.array(found.stations)[inside], strict=True):
+            edge = where[0] > left + 0.75 * (right - left)
+            note = axis.annotate(
+                name, where, xytext=(-7 if edge else 7, 5), textcoords="offset points", fontsize="small",
+                ha="right" if edge else "left", path_effects=OUTLINE, zorder=5,
+            )  # fmt: skip
+            note.set_in_layout(False)
+
+
+def draw_plan_picture(
+    found: Plan, path: Path, promise: Promise | None, predictor: Predictor | None, plan: FloorPlan | None
+) -> None:
+    """Expected error before and after, the chosen places, and how it falls."""
+    left, right, low, high = found.grid.extent
+    wide = (right - left) / max(right - left, high - low)
+    tall = (high - low) / max(right - left, high - low)
+    figure, ((before, after, curve),) = panels(
+        11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
+    )
+    errors = np.concatenate([found.error_before, found.error_after])
+    limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
+    for axis, values, title in ((before, found.error_before, "before"), (after, found.error_after, "after")):
+        if plan is not None:
+            draw_plan(axis, plan)
+        image = np.full(found.grid.shape, np.nan)
+        image[found.grid.inside] = values
+        drawn = axis.imshow(
+            image, origin="lower", extent=found.grid.extent, cmap="cividis", zorder=1,
+            alpha=1 if plan is None else 0.65, **limits,
+        )  # fmt: skip
+        axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", title=title)
+        scale_bar(axis, right - left)
+    if promise is not None and predictor is not None:
+        places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
+        few = places[np.linspace(0, len(places) - 1, min(len(places), MOST_POINTS)).astype(int)]
+        before.plot(*few.T, "k.", markersize=float(np.clip(2500 / len(few), 0.3, 6.0)), alpha=0.5, zorder=2)
+    how: dict[str, Any] = {"marker": "o", "color": "red", "markeredgecolor": "white", "markersize": 6}
+    after.plot(*found.places[:, :2].T, linestyle="-" if found.walk else "", linewidth=1, zorder=3, **how)
+    for number, place in enumerate(found.places[:60], 1):
+        after.annotate(str(number), place[:2], xytext=(4, 3), textcoords="offset points", fontsize="x-small",
+                       path_effects=OUTLINE, zorder=4)  # fmt: skip
+    figure.colorbar(drawn, ax=[before, after], label="expected error [dB]", shrink=0.8)
+    curve.plot(np.append(found.before_db, found.expected_db[np.argsort(found.chosen)]), ".-")
+    curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
+    curve.grid(alpha=0.3)
+    engine: Any = figure.get_layout_engine()
+    engine.set(w_pad=0.12, h_pad=0.1)
+    save(figure, path, 100)
+
+
+def draw_placing(found: Placing, path: Path, threshold_db: float) -> None:
+    """The goal at every candidate, the stations that stand, and the best place."""
+    left, right, low, high = found.grid.extent
+    figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
+    label = f"share of the area with {threshold_db:g} dB or more"
+    label = label if found.what == "coverage" else "power that nine tenths of the area exceed [dB]"
+    drawn = axis.scatter(*found.places[:, :2].T, c=found.goal, s=60, marker="s", cmap="viridis")
+    figure.colorbar(drawn, ax=axis, label=f"{label}, with a station here", shrink=0.85)
+    how = {"markersize": 9, "markeredgecolor": "white", "linestyle": ""}
+    axis.plot(*found.stations.T, "k^", label="station", **how)
+    axis.plot(*found.places[0, :2], "r*", label="best", markersize=18, markeredgecolor="white", linestyle="")
+    axis.set(xlim=(left, right), ylim=(low, high), aspect="equal", xlabel="x [m]", ylabel="y [m]")
+    scale_bar(axis, right - left)
+    figure.legend(loc="outside lower left", ncols=3, fontsize="small", frameon=False)
+    save(figure, path, 100)
+
+
+def scale_bar(axis: Any, width: float) -> None:
+    """A bar of a round length, about a fifth of the map wide."""
+    wanted = width / 5
+    decade = 10.0 ** np.floor(np.log10(wanted))
+    length = max(one for one in (1, 2, 5) if one * decade <= wanted) * decade
+    left, right = axis.get_xlim()
+    low, high = axis.get_ylim()
+    x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
+    axis.plot([x, x + length], [y, y], color="black", linewidth=4, solid_capstyle="butt", zorder=6,
+              path_effects=[withStroke(linewidth=6, foreground="white")])  # fmt: skip
+    said = (
+        f"{length / 1000:g} km"
+        if length >= 1000
+        else f"{length:g} m"
+        if length >= 1
+        else f"{length * 100:g} cm"
+    )
+    axis.annotate(said, (x + length / 2, y), xytext=(0, 5), textcoords="offset points", ha="center",
+                  fontsize="small", path_effects=OUTLINE, zorder=6)  # fmt: skip

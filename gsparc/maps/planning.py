@@ -1,0 +1,240 @@
+"""Where to measure next: the places that together take most off the expected error over an area.
+
+Greedy choice of the largest drop of the mean posterior variance (A-optimal design; A. Krause, A. Singh and
+C. Guestrin, J. Mach. Learn. Res. 9 (2008), choose greedily by information instead).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.errors import DataError
+from gsparc.data.links.georeference import Georeference
+from gsparc.maps.area import Grid, grid_of
+from gsparc.maps.covariance import Unknown, before_measuring, unknown_of
+from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.geojson import Shapes, read_shapes
+from gsparc.maps.making import answering
+from gsparc.maps.promise import Promise
+from gsparc.maps.route import Tour
+from gsparc.methods.predictor import Predictor
+
+TARGETS = 900  # places that the error is averaged over, about
+CANDIDATES = 900  # where somebody may measure, at most
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Places to measure, the most telling first, or in the order of a walk.
+
+    Attributes:
+        places: (n, 3) world [m].
+        expected_db: (n,) expected error over the area once this place and those chosen before it are
+            measured [dB].
+        before_db: the same before any of them is.
+        chosen: (n,) int64, which the greedy choice took first, 0 to n - 1.
+        length_m: of the walk in this order [m].
+        grid: the area.
+        error_before, error_after: (S,) expected error at `at` [dB].
+        at: (S, 3) places that errors were averaged over [m].
+        walk: whether the order is one.
+        stopped: why there are fewer than were asked for; "" where there are not.
+    """
+
+    places: np.ndarray
+    expected_db: np.ndarray
+    before_db: float
+    chosen: np.ndarray
+    length_m: float
+    grid: Grid
+    error_before: np.ndarray
+    error_after: np.ndarray
+    at: np.ndarray
+    walk: bool = False
+    stopped: str = ""
+
+    @property
+    def after_db(self) -> float:
+        """Expected error once all are measured [dB]."""
+        return float(self.expected_db[self.chosen.argmax()]) if len(self.places) else self.before_db
+
+
+def plan_next(
+    predictor: Predictor | None,
+    count: int = 20,
+    area: Any = None,
+    *,
+    height_m: float | None = None,
+    walkable: Any = None,
+    plan: FloorPlan | None = None,
+    stations: Sequence[str | int] | None = None,
+    other_end: Sequence[float] | None = None,
+    promise: Promise | None = None,
+    least_gain_db: float = 0.0,
+    route: bool = False,
+    start: Sequence[float] | None = None,
+    route_m: float | None = None,
+    length_m: float | None = None,
+) -> Plan:
+    """Choose places to measure next, as a batch.
+
+    >>> found = gsparc.maps.plan_next(gsparc.load("model.ckpt"), count=20, route=True)
+    >>> found.places, found.before_db, found.after_db
+
+    Args:
+        predictor: of powers; None before anything is measured, with `area` or `plan`.
+        count: places wanted.
+        area, height_m, plan: see `grid_of`.
+        walkable: GeoJSON file of where somebody may measure: polygons, or lines such as corridors; None: the
+            whole area.
+        stations, other_end: see `map_of`; what is measured at a place is measured of all of them.
+        promise: evidence of held-out blocks, which scales the model's own variances.
+        least_gain_db: stop where a place takes less than this off the expected error.
+        route: whether places are put in the order of a short walk.
+        start: (2,) where the walk starts [m]; None: anywhere.
+        route_m: longest walk [m]; None: any.
+        length_m: before anything is measured, over which powers are alike [m].
+
+    Raises:
+        DataError: anything wrong with what is asked for.
+    """
+    if type(count) is not int or count < 1:
+        raise DataError(f"count={count}: a whole number of at least 1 is needed")
+    if route_m is not None and not (np.isfinite(route_m) and route_m > 0):
+        raise DataError(f"route_m={route_m}: metres above 0 are needed")
+    if not (np.isfinite(least_gain_db) and least_gain_db >= 0):
+        raise DataError(f"least_gain_db={least_gain_db}: at least 0 dB is needed")
+    if length_m is not None and not (np.isfinite(length_m) and length_m > 0):
+        raise DataError(f"length_m={length_m}: metres above 0 are needed")
+    origin = None if predictor is None else predictor.site.georeference
+    grid = coarse_grid(predictor, area, height_m, plan)
+    targets = grid.places()
+    allowed = targets if walkable is None else walkable_places(walkable, grid, origin)
+    places, free, wanted = _joined(targets, allowed)
+    if predictor is None:
+        unknown = before_measuring(places, length_m)
+    else:
+        names, _ = answering(predictor, stations)
+        unknown = unknown_of(predictor, places, names, promise, other_end)
+    begin = None if start is None else _start(start)
+    tour = Tour(begin, route_m)
+    before = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+    chosen, expected, stopped = greedy(unknown, free, wanted, places, count, least_gain_db, tour)
+    after = np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+    walk = route or route_m is not None
+    order = tour.order() if walk else np.arange(len(chosen))
+    picked = places[chosen] if len(chosen) else np.zeros((0, 3))
+    first = _mean_db(before, wanted)
+    return Plan(
+        picked[order], np.array(expected)[order] if len(chosen) else np.zeros(0), first, order,
+        Tour.length_of(picked[order], begin), grid, before[wanted], after[wanted], places[wanted], walk,
+        stopped,
+    )  # fmt: skip
+
+
+def coarse_grid(
+    predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None
+) -> Grid:
+    """About `TARGETS` cells."""
+    fine = grid_of(None if predictor is None else predictor.site, area, height_m, None, plan)
+    left, right, low, high = fine.extent
+    share = fine.inside.mean()
+    step = float(np.sqrt((right - left) * (high - low) * share / TARGETS))
+    x, y = (np.arange(a + step / 2, b, step) for a, b in ((left, right), (low, high)))
+    column, row = (((v - a) / fine.step).astype(int).clip(0, n - 1)
+                   for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y))))  # fmt: skip
+    inside = fine.inside[np.ix_(row, column)]
+    if not inside.any():
+        return fine
+    return replace(fine, x=x, y=y, step=step, inside=inside)
+
+
+def walkable_places(path: Any, grid: Grid, origin: Georeference | None, key: str = "walkable") -> np.ndarray:
+    """Places (n, 3) in polygons or along lines of a file."""
+    shapes: Shapes = read_shapes(path, key, origin, "either")
+    found = [np.zeros((0, 2))]
+    if shapes.polygons:
+        low, high = (np.array(v) for v in Shapes(shapes.polygons, ()).bounds())
+        step = max(grid.step / 2, float(np.sqrt((high - low).prod() / (4 * CANDIDATES))))
+        x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
+        every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        found.append(every[shapes.contains(every)])
+    for line in shapes.lines:
+        along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+        at = np.linspace(0, along[-1], max(2, int(np.ceil(2 * along[-1] / grid.step)) + 1))
+        found.append(np.column_stack([np.interp(at, along, line[:, k]) for k in range(2)]))
+    places = np.unique(np.concatenate(found), axis=0)
+    if not len(places):
+        raise DataError(f"{key}={path}: its polygons are too small for any place")
+    if len(places) > CANDIDATES:
+        places = places[np.random.default_rng(0).permutation(len(places))[:CANDIDATES]]
+    return np.column_stack([places, np.full(len(places), grid.height)])
+
+
+def _joined(targets: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places (S, 3), which are candidates and which are targets (S,) bool."""
+    if targets is allowed:
+        every = np.ones(len(targets), bool)
+        return targets, every, every.copy()
+    places = np.concatenate([targets, allowed])
+    wanted = np.arange(len(places)) < len(targets)
+    return places, ~wanted, wanted
+
+
+def greedy(
+    unknown: list[Unknown],
+    free: np.ndarray,
+    wanted: np.ndarray,
+    places: np.ndarray,
+    count: int,
+    least_gain_db: float,
+    tour: Tour,
+) -> tuple[list[int], list[float], str]:
+    """Chosen places, expected error after each, and why it stopped early."""
+    free = free.copy()
+    chosen: list[int] = []
+    expected: list[float] = []
+    error = _expected(unknown, wanted)
+    while len(chosen) < count:
+        gains = np.sum([one.gains(wanted) for one in unknown], axis=0)
+        possible = free & tour.within(places)
+        if not possible.any():
+            why = "no place is left" if not free.any() else "no other place fits in the walk"
+            return chosen, expected, f"{why} after {len(chosen)} places"
+        best = int(np.where(possible, gains, -np.inf).argmax())
+        kept = [one.covariance.copy() for one in unknown] if least_gain_db > 0 else []
+        for one in unknown:
+            one.measured(best)
+        after = _expected(unknown, wanted)
+        if error - after < least_gain_db:
+            for one, before in zip(unknown, kept, strict=True):
+                one.covariance = before
+            gain = error - after
+            return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
+        chosen.append(best)
+        expected.append(after)
+        tour.add(places[best])
+        free[best], error = False, after
+    return chosen, expected, ""
+
+
+def _expected(unknown: list[Unknown], wanted: np.ndarray) -> float:
+    return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
+
+
+def _mean_db(error: np.ndarray, wanted: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(error[wanted] ** 2)))
+
+
+def _start(given: Sequence[float]) -> np.ndarray:
+    try:
+        place = np.array([float(value) for value in given])
+    except (TypeError, ValueError):
+        place = np.zeros(0)
+    if len(place) not in (2, 3) or not np.isfinite(place).all():
+        raise DataError(f"start={given}: [x,y] in metres is needed")
+    return place[:2]

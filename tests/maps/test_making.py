@@ -1,0 +1,129 @@
+"""A map is what the model predicts cell by cell, with its layers over stations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from campaigns import channels
+from towns import MASTS, town_model
+
+import gsparc
+from gsparc.data.errors import DataError
+from gsparc.data.own import load_own
+from gsparc.data.splits import Fold
+from gsparc.maps.field_map import REFUSED, best_server, loads, sinr
+from gsparc.maps.intervals import Evidence
+from gsparc.maps.making import answering, map_of
+from gsparc.maps.promise import Promise
+from gsparc.maps.refining import refined
+from gsparc.methods.method import FitContext
+from gsparc.methods.predictor import Predictor
+from gsparc.methods.registry import method_class
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return gsparc.load(town_model())
+
+
+def test_cells_hold_what_the_model_predicts(predictor):
+    found = predictor.map([0, 0, 80, 60], step_m=4.0, threshold_db=-90)
+    assert found.power_db.shape == (2, 15, 20) and found.power_db.dtype == np.float32
+    place = [found.grid.x[3], found.grid.y[5], 1.5]
+    for number, name in enumerate(found.stations):
+        assert found.power_db[number, 5, 3] == pytest.approx(
+            10 * np.log10(float(predictor.at(name).rssi(rx=place)[0])), abs=1e-3
+        )
+    assert (found.lower_db < found.power_db).all() and (found.power_db < found.upper_db).all()
+    west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]
+    assert (west, east) == (0, 1)
+    assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
+
+
+def test_chunks_do_not_change_a_map(predictor, monkeypatch):
+    whole = predictor.map(step_m=5.0)
+    monkeypatch.setattr("gsparc.maps.making.CHUNK", 7)
+    monkeypatch.setattr("gsparc.maps.making.BANDS", 13)
+    assert np.allclose(predictor.map(step_m=5.0).power_db, whole.power_db, atol=1e-4)
+
+
+def test_an_interrupt_is_heeded_between_chunks(predictor):
+    def stop(share):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        map_of(predictor, step_m=1.0, asked=stop)
+
+
+def test_stations_by_name_or_number_in_the_order_asked_for(predictor):
+    found = predictor.map(step_m=10.0, stations=["east", 0])
+    both = predictor.map(step_m=10.0)
+    assert found.stations == ("east", "west")
+    assert np.array_equal(found.power_db[::-1], both.power_db)
+    assert predictor.map(step_m=10.0, stations=["east"]).power_db.shape[0] == 1
+
+
+def test_ratio_of_signal_to_interference_by_hand():
+    power = np.array([[-50.0, np.nan, np.nan], [-60.0, -60.0, np.nan]])
+    assert sinr(power, np.array([1.0, 1.0]), None)[0] == pytest.approx(10)
+    assert sinr(power, np.array([1.0, 0.1]), None)[0] == pytest.approx(20)
+    assert sinr(power, np.ones(2), -60.0)[0] == pytest.approx(10 - 10 * np.log10(2))
+    assert sinr(power, np.ones(2), -80.0)[1] == pytest.approx(20)
+    assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
+    assert best_server(power).tolist() == [0, 1, REFUSED]
+    assert loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
+
+
+def test_saved_and_read_back(predictor, tmp_path):
+    found = predictor.map(step_m=10.0)
+    found.save(tmp_path / "map.npz")
+    with np.load(tmp_path / "map.npz") as stored:
+        assert np.array_equal(stored["power_db"], found.power_db)
+        assert stored["stations"].tolist() == ["west", "east"] and stored["x"].shape == (found.grid.shape[1],)
+    assert found.figures()["map/cells"] == found.grid.inside.sum()
+
+
+def test_spectra_have_no_power(predictor, monkeypatch):
+    from dataclasses import replace
+
+    monkeypatch.setattr(predictor, "site", replace(predictor.site, kind="spectrum"))
+    with pytest.raises(DataError, match="no received power"):
+        map_of(predictor)
+
+
+def test_interpolated_cells_are_as_exact_as_asked_for():
+    def ask(cells):
+        row, column = np.divmod(cells, 200)
+        x, y = column / 10, row / 10
+        return np.column_stack(
+            [-20 * np.log10(1 + np.hypot(x - 5, y - 4)), 2 + np.sin(x / 3) * np.cos(y / 4)]
+        )
+
+    inside = np.ones((150, 200), bool)
+    inside[100:, :60] = False
+    every, count = refined(ask, inside, 1, 0.1)
+    few, asked = refined(ask, inside, 4, 0.1)
+    assert count == inside.sum() and asked < 0.2 * count
+    assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.15
+
+
+def test_channels_have_a_power_and_paths(tmp_path):
+    data = load_own(channels(tmp_path / "own.npz"))
+    method, rows = method_class("image_source_gp")(budget_s=3.0), np.arange(len(data))
+    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path))
+    found = map_of(Predictor(method, data.site), step_m=0.5, height_m=1.2)
+    assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
+    assert (found.expected_error_db > 0).all() and set(found.extra) == {"delay_spread_ns", "direction_deg"}
+    assert (found.extra["delay_spread_ns"] >= 0).all() and (found.extra["delay_spread_ns"] < 100).all()
+    near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
+    place = found.grid.places(np.array([near]))[0, :2]
+    assert np.linalg.norm(place - [1, 1]) < 1.0
+
+
+def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
+    nothing = Evidence(*(np.zeros(0) for _ in range(7)))
+    promise = Promise(nothing, np.zeros((4, 3)), np.zeros(4, np.int64), 1.0)
+    names, notes = answering(predictor, None, promise)
+    assert names == ["west"] and "east was never heard" in notes[0]
+    with pytest.raises(DataError, match="never heard"):
+        answering(predictor, ["east"], promise)

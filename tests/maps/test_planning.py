@@ -1,0 +1,89 @@
+"""Places to measure: they fall where nobody measured, take error away, and make a short walk."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from towns import town_model
+
+import gsparc
+from gsparc.data.errors import DataError
+from gsparc.maps.covariance import Unknown
+from gsparc.maps.planning import plan_next
+from gsparc.maps.route import Tour
+
+
+@pytest.fixture(scope="module")
+def predictor():
+    return gsparc.load(town_model())
+
+
+def test_gains_are_what_conditioning_takes_away():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(6, 6))
+    one = Unknown(root @ root.T, 0.3, np.ones(6))
+    every = np.ones(6, bool)
+    gains, before = one.gains(every), one.variances().sum()
+    for place in range(6):
+        twin = Unknown(one.covariance.copy(), 0.3, np.ones(6))
+        twin.measured(place)
+        assert before - twin.variances().sum() == pytest.approx(gains[place])
+
+
+def test_error_falls_and_places_lie_where_data_do_not(predictor):
+    area = [-40, 0, 80, 60]  # nobody was west of 0
+    found = plan_next(predictor, 8, area)
+    assert len(found.places) == 8 and found.after_db < found.before_db
+    assert (np.diff(found.expected_db) < 0).all() and (found.places[:, 0] < 5).mean() > 0.7
+    random = np.median(found.error_before)
+    assert found.error_before[found.at[:, 0] < -20].mean() > random
+
+
+def test_a_first_design_spreads_over_the_floor():
+    found = plan_next(None, 9, [0, 0, 30, 30])
+    apart = np.linalg.norm(found.places[:, None] - found.places[None], axis=-1) + 99 * np.eye(9)
+    assert apart.min() > 5 and found.after_db < 0.8 * found.before_db
+
+
+def test_corridors_and_a_length(tmp_path, predictor):
+    lines = {"type": "MultiLineString", "coordinates": [[[5, 5], [75, 5]], [[40, 5], [40, 55]]]}
+    (tmp_path / "corridor.geojson").write_text(json.dumps(lines))
+    found = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", route=True, start=[5, 5])
+    on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
+    assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
+    short = plan_next(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)
+    assert short.length_m <= 30 and len(short.places) >= 1
+
+
+def test_it_stops_where_a_place_gains_too_little(predictor):
+    found = plan_next(predictor, 50, [-40, 0, 80, 60], least_gain_db=0.1)
+    assert 0 < len(found.places) < 50 and "less than 0.1 dB" in found.stopped
+    assert len(plan_next(predictor, 50, least_gain_db=50).places) == 0
+
+
+def test_a_walk_is_not_longer_than_it_must_be():
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.permutation(12), np.zeros(12), np.zeros(12)])
+    tour = Tour(np.zeros(2), None)
+    for place in places:
+        tour.add(place)
+    assert Tour.length_of(places[tour.order()], np.zeros(2)) == pytest.approx(11)
+
+
+@pytest.mark.parametrize(
+    ("how", "said"),
+    [
+        ({"count": 0}, "at least 1"),
+        ({"count": 2, "route_m": -1}, "above 0"),
+        ({"count": 2, "start": [1]}, r"\[x,y\]"),
+        ({"count": 2, "least_gain_db": -1}, "at least 0"),
+        ({"count": 2, "length_m": 0}, "above 0"),
+        ({"count": 2, "area": None}, "nothing says where"),
+        ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
+    ],
+)
+def test_spoilt_wishes(how, said):
+    with pytest.raises(DataError, match=said):
+        plan_next(None, **{"area": [0, 0, 9, 9], **how})
