@@ -31,13 +31,11 @@ from gsparc.ops import Pose
 
 log = logging.getLogger(__name__)
 
-CANDIDATES = (
-    "distance_law", "idw", "kriging", "gp", "complex_gp", "uplink", "directional_gp", "array", "gsparc",
-)  # fmt: skip
+CANDIDATES = ("distance_law", "idw", "kriging", "gp", "complex_gp", "uplink", "gsparc")
 """Tried by default, the cheapest first; those whose seconds can be chosen come last in any order.
 
-`moving_array` and `image_source_gp` are not among them: `gsparc` tries their searches, and they would take
-seconds from it.
+`array`, `moving_array`, `directional_gp` and `image_source_gp` are not among them: `gsparc` contains them, and
+their trials would take seconds from it.
 """
 FOLDS = ((2_000, 5), (8_000, 3))  # up to so many training rows, of more 2: they take longer and tell more
 FEW = 3  # at most, with candidates whose seconds can be chosen
