@@ -34,8 +34,8 @@ log = logging.getLogger(__name__)
 CANDIDATES = ("distance_law", "idw", "kriging", "gp", "complex_gp", "uplink", "gsparc")
 """Tried by default, the cheapest first; those whose seconds can be chosen come last in any order.
 
-`array`, `moving_array`, `directional_gp` and `image_source_gp` are not among them: `gsparc` contains them, and
-their trials would take seconds from it.
+`array`, `moving_array`, `directional_gp` and `image_source_gp` are not among them: `gsparc` contains them,
+and their trials would take seconds from it.
 """
 FOLDS = ((2_000, 5), (8_000, 3))  # up to so many training rows, of more 2: they take longer and tell more
 FEW = 3  # at most, with candidates whose seconds can be chosen
