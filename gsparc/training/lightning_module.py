@@ -134,10 +134,14 @@ class GaussianModule(L.LightningModule):
         if (self.global_step + 1) % self.log_every == 0:
             self.log("train/task_loss", task.detach().mean())
             self.log("train/loss", loss.detach())  # weighted by the confidence, where there is one
-            for group in self.trainer.optimizers[0].param_groups:
-                self.log(f"rate/{group['name']}", group["lr"])
             self.log("model/num_gaussians", float(self.count))
         return loss
+
+    def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
+        """The rates of the step that was taken."""
+        if self.global_step % self.log_every == 0:
+            for group in self.trainer.optimizers[0].param_groups:
+                self.log(f"rate/{group['name']}", group["lr"])
 
     @property
     def count(self) -> int:

@@ -144,7 +144,7 @@ def test_hostile_config_is_refused_and_not_run(fitted, tmp_path):
     with pytest.raises(CheckpointError, match="which is not a class of gsparc"):
         checkpoint.load(path)
     rewritten(path, target=target, config="")
-    with pytest.raises(CheckpointError, match="does not know"):
+    with pytest.raises(CheckpointError, match="which no gsparc or plugin here knows"):
         checkpoint.load(path)
     assert not mark.exists()
 

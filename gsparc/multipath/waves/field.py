@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -374,7 +374,7 @@ class ChannelField(ConditionalField):
             "runs": torch.from_numpy(self.runs),
             "run_factors": self.run_factors,
             "groups": [
-                {**vars(group), "slot": _stored(group.slot), "target": group.target * self._turn(group)}
+                {**_parts(group), "slot": _stored(group.slot), "target": group.target * self._turn(group)}
                 for group in groups
             ],
         }
@@ -444,3 +444,8 @@ def _factors(groups: tuple[Group, ...], lowers: list[Tensor], runs: int) -> Tens
     factors = np.ones(runs, np.complex128)
     factors[heard] = 1 / aligning(quadratic[np.ix_(heard, heard)], size[heard])
     return torch.from_numpy(factors)
+
+
+def _parts(group: Group) -> dict[str, Any]:
+    """The attributes, without what was computed from them."""
+    return {one.name: getattr(group, one.name) for one in fields(group)}
