@@ -165,7 +165,7 @@ def restored(state: dict[str, Any]) -> PowerProcess:
 
 
 def fit_powers(
-    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0
+    rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int | None = None
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """A process of largest leave-one-out likelihood, and what must be said of it.
 
@@ -176,26 +176,29 @@ def fit_powers(
         site: where the still end is.
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
+        chosen_on: rows that settings are chosen on, of more; None: CHOSEN_ON.
     """
     notes = []
     if len(rows.places) > MOST_ROWS:
         notes.append(f"learned from {MOST_ROWS} of {len(rows.places)} rows, drawn evenly")
         rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
-    process, more = _fitted(rows, _trends(rows, site, mean), seed)
+    process, more = _fitted(rows, _trends(rows, site, mean), seed, chosen_on)
     return process, (_description(process.trend, process.kernel), *notes, *more)
 
 
-def fit_about(rows: Rows, trend: Trend, seed: int = 0) -> tuple[PowerProcess, tuple[str, ...]]:
+def fit_about(
+    rows: Rows, trend: Trend, seed: int = 0, chosen_on: int | None = None
+) -> tuple[PowerProcess, tuple[str, ...]]:
     """The same about a mean law that is given."""
     rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
-    return _fitted(rows, [(trend, 0, ())], seed)
+    return _fitted(rows, [(trend, 0, ())], seed, chosen_on)
 
 
 def _fitted(
-    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int
+    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """The process about the best of `trends`, and what must be said of it."""
-    trend, kernel, said = _settings(rows, trends, seed)
+    trend, kernel, said = _settings(rows, trends, seed, chosen_on)
     process, more = conditioned(rows, trend, kernel, seed)
     return process, (*said, *more)
 
@@ -223,11 +226,11 @@ class _Candidate:
 
 
 def _settings(
-    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int
+    rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
 ) -> tuple[Trend, PowerKernel, tuple[str, ...]]:
     """Mean, lengths and noise, chosen on a part of many rows, and what must be said of the choice."""
     loud = rows.at(np.flatnonzero(~rows.silent)) if not rows.silent.all() else rows
-    loud = loud.at(draw(np.zeros(len(loud.places), bool), CHOSEN_ON, seed))
+    loud = loud.at(draw(np.zeros(len(loud.places), bool), chosen_on or CHOSEN_ON, seed))
     few = loud.at(draw(np.zeros(len(loud.places), bool), COMPARED_ON, seed))
     weighed = rows.at(draw(rows.silent, WEIGHED_ON, seed))
     both = weighed.silent.any() and not weighed.silent.all()

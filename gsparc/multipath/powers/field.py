@@ -26,6 +26,7 @@ from gsparc.methods.censored import silent
 from gsparc.methods.distance_law import Law, Rows
 from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
 from gsparc.methods.power_process import (
+    CHOSEN_ON,
     LAW_NEEDS,
     MEANS,
     MOST_ROWS,
@@ -49,6 +50,9 @@ from gsparc.ops import Pose
 
 QUERIES = 512  # at a time: memory
 SOUGHT_ON = 600  # rows: each look factors a matrix
+UNHURRIED_S = 8.0  # of a budget, from which settings are chosen on as many rows as ever
+LEAST_CHOSEN_ON = 300
+SEEK_WITHIN = 0.25  # of a budget: seeking, and trying on groups, takes several times what the process took
 FOLDS = 5
 RIDGE_STEPS = 5  # of the variance of what is left
 LEAST = 40  # rows that were heard, for seeking Gaussians
@@ -291,6 +295,13 @@ class PowerField(ConditionalField):
         return from_real(decibels[:, None].float(), "rssi", (1,))
 
 
+def rows_within(budget: TimeBudget | None) -> int | None:
+    """Rows that settings are chosen on, None for as many as ever: a look at n of them takes n^3."""
+    if budget is None or budget.seconds >= UNHURRIED_S:
+        return None
+    return max(int(CHOSEN_ON * (budget.seconds / UNHURRIED_S) ** (1 / 3)), LEAST_CHOSEN_ON)
+
+
 def ridge(columns: np.ndarray, values: np.ndarray, prior: float) -> np.ndarray:
     """Weights (P,) of columns (n, P) with a prior variance, when what is left of values (n,) is white."""
     weights, left = np.zeros(columns.shape[1]), float((values**2).mean())
@@ -338,7 +349,7 @@ def initialise(
     if not len(rows):
         raise ValueError("a field of powers needs at least one row")
     seen = rows_of(data, rows)
-    plain, notes = fit_powers(seen, data.site, settings.mean, seed)
+    plain, notes = fit_powers(seen, data.site, settings.mean, seed, rows_within(budget))
     bare = PowerField(data.site, plain.trend, plain.kernel, Blockers.none(), None, seed)
     if (
         settings.fringes
@@ -356,8 +367,8 @@ def initialise(
         return bare, notes
     if known is None and int((~seen.silent).sum()) < LEAST:
         return bare, (*notes, f"no Gaussians: fewer than {LEAST} rows were heard")
-    if known is None and budget and budget.over():
-        return bare, (*notes, "no Gaussians: no time to seek them")
+    if known is None and budget and budget.over(SEEK_WITHIN):
+        return bare, (*notes, "no Gaussians: no time to seek them and to try them on groups of places")
     found = shadowed(seen, data.site, settings, seed, budget, known)
     if found is None:
         return bare, (*notes, "no Gaussians: no candidate in the paths' way explains enough of the powers")
@@ -394,7 +405,7 @@ def shadowed(
     few = loud.at(draw(loud.silent, SOUGHT_ON, seed))
     if len(few.places) < max(LAW_NEEDS, 2) or len(np.unique(few.places[:, :3], axis=0)) < 2:
         return None
-    plain, _ = fit_powers(few, site, "distance", seed)
+    plain, _ = fit_powers(few, site, "distance", seed, rows_within(budget))
     assert plain.trend.law is not None
     still = plain.trend.law.place
     if known is None:
@@ -404,7 +415,7 @@ def shadowed(
     if not len(blockers):
         return None
     trend = ShadowedTrend.over(plain.trend, blockers, still)
-    process, notes = fit_about(rows, trend, seed)
+    process, notes = fit_about(rows, trend, seed, rows_within(budget))
     return trend, process.kernel, notes
 
 
@@ -431,7 +442,7 @@ def gain_of_groups(
         if len(asked) == 0 or int((~learned.silent).sum()) < least:
             continue
         queries, measured = rows.places[asked], rows.decibels[asked]
-        process, _ = fit_powers(learned, site, settings.mean, seed)
+        process, _ = fit_powers(learned, site, settings.mean, seed, rows_within(budget))
         without = process.mean_and_variance(queries)[0] - measured
         found = shadowed(learned, site, settings, seed, budget, known)
         if found is not None:

@@ -21,7 +21,7 @@ from gsparc.methods.power_process import Trend
 from gsparc.methods.registry import field_initialiser
 from gsparc.multipath.powers import field as powers
 from gsparc.multipath.powers.blockers import Blockers
-from gsparc.multipath.powers.field import PowerField, PowerSettings, initialise, restored
+from gsparc.multipath.powers.field import PowerField, PowerSettings, initialise, restored, rows_within
 from gsparc.ops import Pose
 
 STATION = (5.0, 20.0, 3.0)
@@ -244,6 +244,12 @@ def powers_of(
 ) -> PowerField:
     field, _ = field_initialiser("powers")(data, rows, init, visibility, FitContext())
     return field
+
+
+def test_settings_of_little_time_are_chosen_on_fewer_rows():
+    budgets = (FitContext(budget_s=seconds).time_budget() for seconds in (0.1, 4.0, 60.0))
+    few, some, all_of_them = (rows_within(budget) for budget in budgets)
+    assert 300 == few < some < 1000 and all_of_them is None and rows_within(None) is None
 
 
 def test_without_visibility_nothing_stands_in_the_way(blocked):
