@@ -78,7 +78,7 @@ class PerStation(Method):
         self._make = make
         first = make()
         self.name, self.guesses = first.name, first.guesses
-        self.wrapped = first
+        self.wrapped, self.takes_budget = first, first.takes_budget
         self._copies: dict[int, Method] = {}
         self._shared = False  # whether one copy knows all stations
 

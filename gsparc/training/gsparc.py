@@ -220,9 +220,7 @@ class Gsparc(LearnedField):
         weighed = held is not None
         rows = fold.train if weighed else np.sort(np.concatenate([fold.train, fold.val]))
         groups = () if held is None else _groups(held, fold.train)
-        plans: list[tuple[str, InitSettings, float | None]] = [
-            (part, self.init, None) for part in parts if part not in OPEN_ENDED
-        ]
+        plans = [(part, self.init, 1.0) for part in parts if part not in OPEN_ENDED]
         for part in (part for part in parts if part in OPEN_ENDED):
             if weighed and part in SEARCHES:
                 plans.append((f"few {part}", replace(self.init, **FEW), FEW_SHARE))
@@ -231,7 +229,7 @@ class Gsparc(LearnedField):
         reports: dict[str, FitReport] = {}
         for name, init, share in plans:
             left = max(budget.seconds * (1 - STEPS_SHARE) - budget.spent, 1.0)
-            within = replace(context, budget_s=None if share is None else share * left)
+            within = replace(context, budget_s=share * left)
             if name.startswith("few "):
                 within = replace(within, run_dir=Path(), resume=None)
             part = name.split()[-1]

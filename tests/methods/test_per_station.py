@@ -222,3 +222,8 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
     for name in whole.samples:
         np.testing.assert_allclose(parts.samples[name], whole.samples[name], rtol=1e-5)
     np.testing.assert_allclose(parts.variance, whole.variance, rtol=1e-4)
+
+
+def test_seconds_of_stations_were_said_to_be_unused(town):
+    assert for_links(method_class("gsparc"), town).takes_budget
+    assert not for_links(method_class("idw"), town).takes_budget

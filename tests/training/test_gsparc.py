@@ -262,3 +262,14 @@ def test_stations_have_fields_of_their_own_and_share_the_seconds():
 def test_a_search_that_ends_early_says_so():
     fitted = fit("channels", "init=sources", "init.searches=4", budget_s=0.5)
     assert fitted.processor_s < 3 and fitted.report.limited_by == "processor"
+
+
+def test_powers_of_many_rows_were_learned_without_end(tmp_path, monkeypatch):
+    """Twelve stations of a city that shared 60 s took 419 s: their searches were given no seconds."""
+    given = []
+    monkeypatch.setattr(Gsparc, "_initialise", lambda self, *args: given.append(args[-1].budget_s) or 1 / 0)
+    data = KINDS["powers"](tmp_path)
+    fold = split_for({"name": "random"}, data).folds[0]
+    with pytest.raises(ZeroDivisionError):
+        method_class("gsparc")().fit(data, fold, short(tmp_path, 10, budget_s=5.0))
+    assert len(given) == 1 and 4 < given[0] < 5
