@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -37,9 +38,9 @@ class Links(HTMLParser):
         ]
 
 
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-def test_the_site_builds_strictly_and_its_notebooks_run(tmp_path):
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the pages, built strictly, with notebooks that were run."""
     for needed in ("mkdocs", "mkdocs_jupyter", "mkdocstrings", "material", "nbclient", "ipykernel"):
         pytest.importorskip(needed, reason="the site needs the extra docs: make docs")
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "NO_MKDOCS_2_WARNING": "1"}
@@ -48,9 +49,15 @@ def test_the_site_builds_strictly_and_its_notebooks_run(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     assert int(re.search(r"5 notebooks: .* (\d+) s of processor", done.stderr)[1]) < MOST_S, done.stderr
     subprocess.run(["make", "named"], check=True, **run)
-    site = tmp_path / "site"
-    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(site)], **run)
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)], **run)
     assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_links_lead_somewhere_and_nothing_is_fetched(site):
     pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
     assert len(pages) > 30 and "rasterize" in (site / "search" / "search_index.js").read_text()
     for page in pages:
@@ -61,3 +68,19 @@ def test_the_site_builds_strictly_and_its_notebooks_run(tmp_path):
             path = unquote(address.partition("#")[0].partition("?")[0])
             if path and not re.match(r"[a-z]+:", path):
                 assert (page.parent / path).exists(), f"{page.relative_to(site)}: {address}"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("page", ["index.html", "reference/rasterizer.html"])
+def test_pages_are_searched_from_a_folder(site, browser, page):
+    browser.get((site / page).as_uri())
+    entry = browser.find_element("css selector", "input.md-search__input")
+    browser.execute_script("arguments[0].focus()", entry)
+    entry.send_keys("rasterize")
+    until = time.monotonic() + 30
+    while not browser.find_elements("css selector", ".md-search-result__item"):
+        assert time.monotonic() < until, [line["message"] for line in browser.get_log("browser")]
+        time.sleep(0.2)
+    found = browser.find_element("css selector", ".md-search-result__list").text
+    assert "Rasterizer" in found

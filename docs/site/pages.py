@@ -39,4 +39,4 @@ def on_post_page(output: str, page: Any, config: Any) -> str:
             "</h1>", f'</h1><p><a href="{name}" download>Download this notebook</a></p>', 1
         )
     up = "../" * page.url.count("/")
-    return output.replace("https://unpkg.com/iframe-worker/shim", f"{up}site/iframe-worker.js")
+    return output.replace("https://unpkg.com/iframe-worker/shim", f"{up}site/frame-worker.js")
