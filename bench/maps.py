@@ -18,8 +18,8 @@ from gsparc.data.load import datamodule, split_for
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.maps.covariance import Unknown, posterior
-from gsparc.maps.intervals import held, of_held
+from gsparc.maps.covariance import ErrorCovariance, posterior
+from gsparc.maps.intervals import coverage_of, held
 from gsparc.maps.levels import measured
 from gsparc.maps.planning import greedy
 from gsparc.maps.promise import PromiseSettings, answerable, evidence_of, gather, predict_rows
@@ -74,7 +74,7 @@ def promise(name: str, file: str, method: str, draws: list[int], folds: int = 4)
         known = gather(fitted, lambda: make(method), data, fold, settings, context)
         found = evidence_of(fitted, data, fold, np.zeros(len(fold.test), np.int64))
         inside, width = held(known.calibration(), found)
-        kept = of_held(found, inside, width, np.isfinite(width), 0, 0.9)
+        kept = coverage_of(found, inside, width, np.isfinite(width), 0, 0.9)
         rmse = np.sqrt(np.mean((found.level_db - found.mean_db) ** 2))
         values = (kept.share, kept.width_db, kept.reached, kept.own_share, kept.own_width_db, rmse)
         spent = f"{trained:.1f},{time.perf_counter() - began - trained:.1f}"
@@ -155,7 +155,7 @@ def _next(
         process = copy.process()
         noise = process.kernel.amplitude * process.kernel.noise
         every = np.concatenate([places, squares]) if strategy == "ours" else places
-        unknown.append(Unknown(posterior(process, every), noise, np.ones(len(every))))
+        unknown.append(ErrorCovariance(posterior(process, every), noise, np.ones(len(every))))
     if strategy == "ours":
         wanted = np.arange(len(every)) >= len(places)
         free = np.append(free, np.zeros(len(squares), bool))

@@ -21,7 +21,7 @@ from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.maps import geotiff
 from gsparc.maps.field_map import FieldMap
 from gsparc.maps.floor_plan import FloorPlan, read_plan
-from gsparc.maps.intervals import Kept
+from gsparc.maps.intervals import Coverage
 from gsparc.maps.making import map_of
 from gsparc.maps.page import write_page
 from gsparc.maps.pictures import draw_layer, file_name, layers
@@ -55,7 +55,7 @@ def promise_of(path: str, dataset: dict[str, Any], settings: PromiseSettings, re
     fold = run.split.folds[0]
     log.info("a promise for this map: %d fits without blocks of places", settings.folds)
     found = gather(run.methods[0], make, run.data, fold, settings, context, log.info)
-    found.kept(settings.share)  # too little evidence is said before anything is stored
+    found.coverage(settings.share)  # too little evidence is said before anything is stored
     found.keep(path)
     return found
 
@@ -136,7 +136,7 @@ def title_of(found: FieldMap, predictor: Predictor) -> str:
     return f"{predictor.site.name}, {predictor.method.label}: {height}"
 
 
-def lines_of(found: FieldMap, kept: Kept | None) -> list[str]:
+def lines_of(found: FieldMap, kept: Coverage | None) -> list[str]:
     """What a reader of the map must know."""
     said = [*found.notes]
     if kept is None:
@@ -177,7 +177,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         promise = promise_of(str(config.ckpt), settings["dataset"], how, bool(config.renew))
     with progress("cells") as tick:
         found = map_of(predictor, promise=promise, asked=tick, **asked)
-    kept = None if promise is None else promise.kept(how.share)
+    kept = None if promise is None else promise.coverage(how.share)
     lines = lines_of(found, kept)
     drawn = list(layers(found, config.unit))
     found.save(run_dir / "map.npz")
@@ -202,7 +202,7 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def check_map(predictor: Predictor, asked: dict[str, Any]) -> None:
-    """Refuse what cannot be mapped before any evidence is gathered: a map of no cells is made.
+    """Refuse what cannot be mapped before any evidence is gathered: one cell of each station is predicted.
 
     Raises:
         DataError: as `map_of`.

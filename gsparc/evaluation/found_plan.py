@@ -19,7 +19,7 @@ from gsparc.evaluation.site_plan import still_ends
 INCHES = 6.5  # longer side of the map
 UPRIGHT = 0.3  # vertical part of a unit normal, below which a plane is drawn as a wall
 LEAST_DB = 0.5  # of a Gaussian that is drawn
-AROUND = 0.5  # of the extent of the places, that is drawn around them where walls were found
+AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them with walls and without
 
 
 def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None) -> None:
@@ -34,7 +34,7 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     origin = data.site.origin
     places = np.unique(data.moving[:, -3:], axis=0) + origin
     ends = still_ends(data)
-    low, high = _view(np.concatenate([places[:, :2], ends]), objects, origin[:2])
+    low, high = _view(np.concatenate([places[:, :2], ends]), AROUND if len(objects.planes) else MARGIN)
     width, height = (high - low) / (high - low).max() * INCHES
     figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
     axis = axes[0, 0]
@@ -60,10 +60,10 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     save(figure, path)
 
 
-def _view(shown: np.ndarray, objects: SiteObjects, origin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (2,) of the map."""
+def _view(shown: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Corners (2,) of the map: points (n, 2) and a share of their extent around them."""
     low, high = shown.min(axis=0), shown.max(axis=0)
-    margin = max(float((high - low).max()), 1e-3) * (AROUND if len(objects.planes) else 0.06)
+    margin = max(float((high - low).max()), 1e-3) * share
     return low - margin, high + margin
 
 

@@ -28,7 +28,7 @@ SHARE_OF_SIDE = 0.15  # of the longer side: the length over which powers are ali
 
 
 @dataclass
-class Unknown:
+class ErrorCovariance:
     """Errors at S places, all variances in dB^2.
 
     Attributes:
@@ -62,7 +62,7 @@ def unknown_of(
     stations: Sequence[str],
     promise: Promise | None,
     other_end: Sequence[float] | None = None,
-) -> list[Unknown]:
+) -> list[ErrorCovariance]:
     """Of every station, as the model's own process says, or one fitted to what the model predicts.
 
     Args:
@@ -88,11 +88,11 @@ def unknown_of(
         weight = np.ones(len(places))
         if promise is not None:
             weight = _scaled(asking, promise, places, local, number, covariance, noise, other_end)
-        found.append(Unknown(covariance, noise, weight))
+        found.append(ErrorCovariance(covariance, noise, weight))
     return found
 
 
-def before_measuring(places: np.ndarray, length_m: float | None) -> list[Unknown]:
+def before_measuring(places: np.ndarray, length_m: float | None) -> list[ErrorCovariance]:
     """The same where nothing was measured: shadowing of one length about a level nobody knows.
 
     Args:
@@ -102,7 +102,7 @@ def before_measuring(places: np.ndarray, length_m: float | None) -> list[Unknown
     length = length_m or max(float(np.ptp(places, axis=0).max()) * SHARE_OF_SIDE, 1e-6)
     variance = SHADOWING_DB**2
     prior = variance * (PowerKernel((length,), (1.0,), NOISE, 1.0).correlation(cdist(places, places)) + 1)
-    return [Unknown(prior, variance * NOISE, np.ones(len(places)))]
+    return [ErrorCovariance(prior, variance * NOISE, np.ones(len(places)))]
 
 
 def posterior(process: PowerProcess, places: np.ndarray) -> np.ndarray:

@@ -191,7 +191,7 @@ def held(calibration: Calibration, evidence: Evidence) -> tuple[np.ndarray, np.n
 
 
 @dataclass(frozen=True)
-class Kept:
+class Coverage:
     """How often a promise held on blocks that its own calibration did not see.
 
     Attributes:
@@ -211,7 +211,7 @@ class Kept:
     own_width_db: float
 
 
-def kept(evidence: Evidence, share: float, parts: int = 5, seed: int = 0) -> Kept:
+def cross_validated(evidence: Evidence, share: float, parts: int = 5, seed: int = 0) -> Coverage:
     """Calibrate on some blocks, try on the others, by turns."""
     blocks, number = np.unique(evidence.block, return_inverse=True)
     part = np.random.default_rng(seed).permutation(len(blocks))[number.reshape(-1)] % parts
@@ -220,17 +220,17 @@ def kept(evidence: Evidence, share: float, parts: int = 5, seed: int = 0) -> Kep
         rest, tried = np.flatnonzero(part != turn), np.flatnonzero(part == turn)
         inside[tried], width[tried] = held(calibrate(evidence.at(rest), share), evidence.at(tried))
     said = np.isfinite(width)
-    return of_held(evidence, inside, width, said, len(blocks), share)
+    return coverage_of(evidence, inside, width, said, len(blocks), share)
 
 
-def of_held(
+def coverage_of(
     evidence: Evidence, inside: np.ndarray, width: np.ndarray, said: np.ndarray, blocks: int, share: float
-) -> Kept:
+) -> Coverage:
     """Shares and means over the rows (n,) that something is said of."""
     half = float(norm.ppf((1 + share) / 2))
     own = np.abs(evidence.error) <= half
     spread = evidence.spread_db[said]
-    return Kept(
+    return Coverage(
         float(inside[said].mean()), float(width[said].mean()), float(said.mean()), int(said.sum()), blocks,
         float(own[said].mean()), float(2 * half * spread.mean()),
     )  # fmt: skip

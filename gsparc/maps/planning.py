@@ -15,7 +15,7 @@ import numpy as np
 from gsparc.data.errors import DataError
 from gsparc.data.links.georeference import Georeference
 from gsparc.maps.area import Grid, grid_of
-from gsparc.maps.covariance import Unknown, before_measuring, unknown_of
+from gsparc.maps.covariance import ErrorCovariance, before_measuring, unknown_of
 from gsparc.maps.floor_plan import FloorPlan
 from gsparc.maps.geojson import Shapes, read_shapes
 from gsparc.maps.making import answering
@@ -186,7 +186,7 @@ def _joined(targets: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def greedy(
-    unknown: list[Unknown],
+    unknown: list[ErrorCovariance],
     free: np.ndarray,
     wanted: np.ndarray,
     places: np.ndarray,
@@ -222,7 +222,7 @@ def greedy(
     return chosen, expected, ""
 
 
-def _expected(unknown: list[Unknown], wanted: np.ndarray) -> float:
+def _expected(unknown: list[ErrorCovariance], wanted: np.ndarray) -> float:
     return float(np.sqrt(np.mean([one.variances()[wanted].mean() for one in unknown])))
 
 

@@ -15,7 +15,7 @@ from gsparc.data.inner_folds import cut_inside
 from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
-from gsparc.maps.intervals import Calibration, Evidence, Kept, calibrate, distances, kept
+from gsparc.maps.intervals import Calibration, Coverage, Evidence, calibrate, cross_validated, distances
 from gsparc.maps.levels import measured, predicted
 from gsparc.methods import checkpoint
 from gsparc.methods.method import FitContext, Method, Reconditions
@@ -67,9 +67,9 @@ class Promise:
         """See `calibrate`."""
         return calibrate(self.evidence, share)
 
-    def kept(self, share: float = 0.9) -> Kept:
-        """See `gsparc.maps.intervals.kept`."""
-        return kept(self.evidence, share)
+    def coverage(self, share: float = 0.9) -> Coverage:
+        """See `gsparc.maps.intervals.cross_validated`."""
+        return cross_validated(self.evidence, share)
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
         """From local places (n, D) to the nearest that was learned from (n,) [m]."""

@@ -234,11 +234,10 @@ class Gsparc(LearnedField):
                 within = replace(within, run_dir=Path(), resume=None)
             part = name.split()[-1]
             try:
-                if part in OPEN_ENDED:
-                    within = replace(within, leave_out=groups)
-                    found[name], report = self._initialise(part, init, data, rows, within)
-                else:
-                    found[name], report = self._initialise(part, init, data, rows, within)
+                leave_out = groups if part in OPEN_ENDED else ()  # these predict the groups themselves
+                within = replace(within, leave_out=leave_out)
+                found[name], report = self._initialise(part, init, data, rows, within)
+                if part not in OPEN_ENDED:
                     found[name].held = _held(found[name], data, rows, groups)
             except KeyboardInterrupt:
                 if not name.startswith("few "):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsparc.maps.intervals import LEAST_ROWS, Evidence, calibrate, distances, held, kept
+from gsparc.maps.intervals import LEAST_ROWS, Evidence, calibrate, cross_validated, distances, held
 
 
 def evidence(count=3000, seed=0, heavy=False, stations=1):
@@ -29,7 +29,7 @@ def test_as_many_lie_inside_as_promised(heavy, share):
     learned, fresh = evidence(heavy=heavy), evidence(seed=1, heavy=heavy)
     inside, width = held(calibrate(learned, share), fresh)
     assert abs(inside[np.isfinite(width)].mean() - share) < 0.03
-    assert abs(kept(learned, share).share - share) < 0.03
+    assert abs(cross_validated(learned, share).share - share) < 0.03
 
 
 def test_width_rises_with_distance_and_ends():

@@ -10,7 +10,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.data.errors import DataError
-from gsparc.maps.covariance import Unknown
+from gsparc.maps.covariance import ErrorCovariance
 from gsparc.maps.planning import plan_next
 from gsparc.maps.route import Tour
 
@@ -23,11 +23,11 @@ def predictor():
 def test_gains_are_what_conditioning_takes_away():
     rng = np.random.default_rng(0)
     root = rng.normal(size=(6, 6))
-    one = Unknown(root @ root.T, 0.3, np.ones(6))
+    one = ErrorCovariance(root @ root.T, 0.3, np.ones(6))
     every = np.ones(6, bool)
     gains, before = one.gains(every), one.variances().sum()
     for place in range(6):
-        twin = Unknown(one.covariance.copy(), 0.3, np.ones(6))
+        twin = ErrorCovariance(one.covariance.copy(), 0.3, np.ones(6))
         twin.measured(place)
         assert before - twin.variances().sum() == pytest.approx(gains[place])
 

@@ -54,3 +54,4 @@ def test_other_loggers_are_left_alone(file):
     logger = type("CSV", (), {"experiment": object()})()
     picture([logger], "predictions", file, 7)
     table([logger], "results", ["method"], [["gp"]])
+    assert not vars(logger)
