@@ -119,6 +119,8 @@ def prepare(
     trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
     if whole["stations"] != "each":  # cells from before there was a choice keep their names
         trainer["stations"] = whole["stations"]
+    if problem.draw is None and cell.seed and "seed" not in whole["model"]:
+        trainer["seed"] = cell.seed  # of a draw, the split's own hash tells
     name = key(whole["model"], trainer, *problem.hashes)
     folder = kept / f"{cell.dataset}-{cell.split}-{cell.method}-{name}"
     return Prepared(cell, problem, config, folder, not contender.timed_only)

@@ -92,6 +92,21 @@ def test_the_trainers_budget_is_part_of_the_name_of_whoever_takes_it(model, tmp_
     assert short.config.budget_s == 5 and short.folder != long.folder
 
 
+@pytest.mark.parametrize("model", ["gsparc", "auto", "moving_array"])
+def test_every_seed_is_a_cell_of_its_own(model, tmp_path):
+    """The first seed of gsparc stood for all three: a spread of 0.00."""
+    problem = Problem("own", "random", "spectrum", ("d", "s"))
+    contender = Contender(model, (f"model={model}",), ("budget_s={budget_s}",))
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        folders = [
+            prepare(
+                Cell("own", "random", model, 60.0, seed), contender, {"file": "x"}, problem, tmp_path
+            ).folder
+            for seed in range(3)
+        ]
+    assert len(folders) == 3
+
+
 @pytest.mark.slow
 def test_cells_are_filled_once_and_reported_again(tmp_path):
     spectra(tmp_path / "own.npz")
