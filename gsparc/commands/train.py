@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +11,6 @@ from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from lightning.pytorch.loggers import Logger
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands import cli
@@ -103,7 +100,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     model = partial(build, config.model)
     trainer = instantiate(config.trainer, _partial_=True)
     callbacks = partial(callbacks_of, config.get("callbacks"))
-    with _loggers(config) as loggers:
+    with tracking.opened(config.logger) as loggers:
         given = {"trainer": trainer, "callbacks": callbacks, "loggers": loggers, "datamodule": module}
 
         def context(number: int) -> FitContext:
@@ -201,22 +198,6 @@ def _tell(method: Method, report: FitReport, budget_s: float | None) -> None:
         log.log(level, text, method.name, options)
     for note in report.notes:
         log.info("%s", note)
-
-
-@contextmanager
-def _loggers(config: DictConfig) -> Iterator[Sequence[Logger]]:
-    """The run's loggers, closed whatever happens."""
-    made: list[Logger] = []
-    status = "failed"
-    try:
-        made.extend(instantiate(node) for node in (config.logger or {}).values())
-        yield made
-        status = "success"
-    finally:
-        for logger in made:
-            logger.finalize(status)
-            if hasattr(logger, "experiment") and hasattr(logger.experiment, "finish"):
-                logger.experiment.finish(exit_code=0 if status == "success" else 1)
 
 
 def objective_of(config: DictConfig, kind: Kind) -> str:

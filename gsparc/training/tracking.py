@@ -2,14 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from hydra.utils import instantiate
 
 if TYPE_CHECKING:
-    from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+    from lightning.pytorch.loggers import Logger, TensorBoardLogger, WandbLogger
+
+
+@contextmanager
+def opened(nodes: Mapping[str, Any] | None) -> Iterator[list[Logger]]:
+    """Loggers of a config of the group `logger`, closed whatever happens."""
+    made: list[Logger] = []
+    status = "failed"
+    try:
+        made.extend(instantiate(node) for node in (nodes or {}).values())
+        yield made
+        status = "success"
+    finally:
+        for logger in made:
+            logger.finalize(status)
+            if hasattr(logger, "experiment") and hasattr(logger.experiment, "finish"):
+                logger.experiment.finish(exit_code=0 if status == "success" else 1)
 
 
 def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:

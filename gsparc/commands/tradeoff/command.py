@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig
-from rich.table import Table
 
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import plain
@@ -31,6 +30,7 @@ from gsparc.methods.pareto import Point, cost_of_halving, front, worded
 from gsparc.methods.predictor import Predictor
 from gsparc.methods.reduced import combinations, contributions, reduced
 from gsparc.methods.timing import BLOCKS, COPY, machine_facts, peak_memory, reference_copy
+from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +77,11 @@ def task(config: DictConfig) -> dict[str, Any]:
         "tradeoff/stored": len(chosen) if config.store else 0,
     }  # fmt: skip
     write_summary(run_dir / "summary.json", facts)
-    show(run_dir, _table(best, figure, title), lines=_slope(facts))
+    heads, lines = _cells(best, figure)
+    with tracking.opened(config.logger) as loggers:
+        tracking.picture(loggers, "operating points", run_dir / "tradeoff.png", 0)
+        tracking.table(loggers, "operating points", heads, lines)
+    show(run_dir, table(title, ["not beaten"], heads[1:], lines), lines=_slope(facts))
     for p in best:
         other = beaten_by(p, beside, figure)
         if other is not None:
@@ -166,13 +170,14 @@ def _facts(
     return facts
 
 
-def _table(best: list[Point], figure: str, title: str) -> Table:
+def _cells(best: list[Point], figure: str) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows of the table of points."""
     rows = []
     for p in best:
         gap, error = p.difference
         apart = "-" if gap is None or error is None else f"{gap:+.3g} ± {error:.2g}"
         rows.append([p.label, f"{p.p50:.3g}", f"{p.p95:.3g}", f"{p.value(figure):.4g}", apart])
-    return table(title, ["not beaten"], ["ms p50", "ms p95", figure, "difference to full"], rows)
+    return ["point", "ms p50", "ms p95", figure, "difference to full"], rows
 
 
 def _slope(facts: dict[str, Any]) -> list[str]:

@@ -20,6 +20,7 @@ from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint, operating_point, stored_front
 from gsparc.methods.pareto import Point
 from gsparc.methods.timing import ClockSettings, interleaved
+from gsparc.training import tracking
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,17 @@ def swept(field, tmp_path_factory):
         patch.setattr(
             HydraConfig, "get", lambda: type("C", (), {"runtime": type("R", (), {"output_dir": folder})})
         )
-        return task(config), folder, ckpt
+        said: list[tuple] = []
+        patch.setattr(tracking, "table", lambda loggers, *table: said.append((len(loggers), *table)))
+        config.logger = {"any": {"_target_": "lightning.pytorch.loggers.logger.DummyLogger"}}
+        return task(config), folder, ckpt, said
+
+
+def test_dashboards_get_the_points_that_nothing_beats(swept):
+    facts, _, _, said = swept
+    ((loggers, name, heads, rows),) = said
+    assert (loggers, name, heads[:2]) == (1, "operating points", ["point", "ms p50"])
+    assert len(rows) == facts["tradeoff/front"] and {len(row) for row in rows} == {len(heads)}
 
 
 def test_a_misspelt_subset_is_refused_in_words_before_anything_is_measured(field, tmp_path, monkeypatch):
@@ -50,7 +61,7 @@ def test_a_misspelt_subset_is_refused_in_words_before_anything_is_measured(field
 
 
 def test_it_leaves_a_table_a_picture_and_a_summary(swept):
-    facts, folder, _ = swept
+    facts, folder, *_ = swept
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == facts["tradeoff/points"] == 7  # as trained, 2 alone, 2 x 2 without confidence
@@ -68,7 +79,7 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
 
 
 def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
-    _, _, ckpt = swept
+    _, _, ckpt, _ = swept
     before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
     points, measured = stored_front.kept(after.extra)
     assert points and "contribution" in measured and stored_front.kept(before.extra) == ([], {})
@@ -79,7 +90,7 @@ def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
 
 
 def test_what_is_kept_is_decided_without_a_measurement(swept, field):
-    _, folder, _ = swept
+    _, folder, *_ = swept
     with (folder / "tradeoff.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["kept_with_model"] == "1"]
     close = [float(row["closeness_db"]) for row in rows]
@@ -95,7 +106,7 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
 
 
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
-    _, _, ckpt = swept
+    _, _, ckpt, _ = swept
     points, _ = stored_front.kept(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
     monkeypatch.setattr(operating_point, "interleaved", lambda calls, clock, threads: pretended)
@@ -107,7 +118,7 @@ def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
 
 
 def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
-    _, _, ckpt = swept
+    _, _, ckpt, _ = swept
     threads = torch.get_num_threads()
     predictor = gsparc.load(ckpt, budget_ms=1000)
     place = predictor.site.origin + 0.1
