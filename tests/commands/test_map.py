@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+from campaigns import compose
+from hydra.core.hydra_config import HydraConfig
 from PIL import Image
 from towns import town_model
 
@@ -86,11 +90,21 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
         ("place", [], "train with stations=together"),
     ],
 )
-def test_errors_are_one_line(model, tmp_path, command, settings, said):
-    done = run(command, f"ckpt={model}", *settings, folder=tmp_path / "run")
-    assert done.returncode == 1 and said in done.stderr
+def test_errors_come_before_anything_is_written(model, tmp_path, monkeypatch, command, settings, said):
+    runtime = type("R", (), {"output_dir": tmp_path})
+    monkeypatch.setattr(HydraConfig, "get", lambda: type("C", (), {"runtime": runtime}))
+    with pytest.raises(ValueError, match=re.escape(said)) as error:
+        import_module(f"gsparc.commands.{command}").task(
+            compose(f"ckpt='{model}'", *settings, config=command)
+        )
+    assert len(str(error.value).splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_errors_are_one_line(model, tmp_path):
+    done = run("map", f"ckpt={model}", "step_m=0", folder=tmp_path / "run")
+    assert done.returncode == 1 and "above 0 metres" in done.stderr
     assert len([line for line in done.stderr.splitlines() if line.startswith("error:")]) == 1
-    assert not list((tmp_path / "run").glob("map.npz*"))
 
 
 def test_an_interrupt_leaves_no_half_written_file(model, tmp_path):
