@@ -354,10 +354,16 @@ def test_an_interrupt_leaves_a_checkpoint_that_goes_on(tmp_path):
 
 
 @pytest.mark.slow
-def test_wandb_offline_is_closed(tmp_path):
+def test_wandb_offline_is_closed_and_holds_curves_a_picture_and_the_table(tmp_path):
     file = spectra(tmp_path / "own.npz")
     run = start(file, tmp_path / "run", "logger=wandb")
     _, said = run.communicate(timeout=240)
     assert run.returncode == 0, said
     (folder,) = (tmp_path / "run" / "wandb").glob("offline-run-*")
-    assert list(folder.glob("*.wandb"))
+    (stored,) = folder.glob("*.wandb")
+    names = (b"train/loss", b"val/psnr_db", b"model/num_gaussians", b"rate/", b"final/test/psnr_db")
+    assert all(name in stored.read_bytes() for name in names)
+    media = folder / "files" / "media"
+    assert list(media.glob("images/test rows*.png")) and list(media.glob("images/predictions*.png"))
+    (table,) = (json.loads(file.read_text()) for file in media.glob("table/results*.json"))
+    assert table["columns"][0] == "method" and "gsparc" in [row[0] for row in table["data"]]
