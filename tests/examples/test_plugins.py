@@ -13,6 +13,7 @@ from hydra.core.config_store import ConfigStore
 
 import gsparc
 from gsparc.commands.compare.cells import code_version, plugged
+from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.plugins import offer
 from gsparc.commands.train import train
 from gsparc.data.load import datamodule
@@ -65,6 +66,8 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     assert predictor.rssi(rx=[30.0, 1.0, 1.5]).shape == (1,)
     assert datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name == "corridor"
     assert plugged()["nearest_k"].overrides(None) == ["model=nearest_k"]
+    again, *_ = evaluate_files([objects.checkpoints[0]])
+    assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
 
 
 def test_without_the_plugin_its_checkpoint_is_refused(installed, tmp_path):
