@@ -204,7 +204,9 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Batch:
         """The same samples on another device."""
-        moved = {k: v.to(device) for k, v in vars(self).items() if isinstance(v, (Tensor, Pose))}
+        moved: dict[str, Any] = {
+            k: v.to(device) for k, v in vars(self).items() if isinstance(v, (Tensor, Pose))
+        }
         return replace(self, **moved)
 
 
