@@ -15,6 +15,7 @@ from gsparc.callbacks.events import noted
 from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.model import GaussianModel
+from gsparc.training.processes import largest, total
 from gsparc.training.schedule import INTERVAL, STEPS, due, in_steps
 
 log = logging.getLogger(__name__)
@@ -67,10 +68,17 @@ class Densify(Checked, L.Callback):
             return
         with torch.no_grad():
             visible = raster.visible.float()
-            self.statistics["gradient"] += (gradient.norm(dim=-1) * visible).sum(0)
-            self.statistics["seen"] += visible.sum(0)
+            if module.batch.rx.batched:
+                if not module.batch.share:  # another process has these rows
+                    visible = torch.zeros_like(visible)
+                own = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
+                found, seen = total(own)
+            else:  # of one pose the gradient is the sum over rows, and every process sees the same
+                found, seen = (total(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
+            self.statistics["gradient"] += found
+            self.statistics["seen"] += seen
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
-            self.statistics["radius"] = torch.maximum(self.statistics["radius"], radius.float())
+            self.statistics["radius"] = largest(torch.maximum(self.statistics["radius"], radius.float()))
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Edit the field when the schedule says so."""

@@ -22,6 +22,8 @@ from gsparc.commands.plugins import offer
 from gsparc.commands.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, one_line
 
+LAUNCHERS = ("submitit.", "joblib.externals.loky.")  # where their errors are defined
+
 
 class _Failed(BaseException):
     """Carries an error past Hydra, which would add a line of its own."""
@@ -59,13 +61,21 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         error = failure.error if isinstance(failure, _Failed) else failure
         if before == "1":
             raise error from error.__cause__
-        _say(one_line(error))
+        _say(_told(error))
         sys.exit(1)
     finally:
         release()
         os.environ.pop(FULL_ERROR)
         if before is not None:
             os.environ[FULL_ERROR] = before
+
+
+def _told(error: Exception) -> str:
+    """One line; of a launcher whose job has died, with what to do."""
+    if type(error).__module__.startswith(LAUNCHERS):
+        advice = "what is done is kept, the same command goes on with the rest"
+        return f"a job was lost ({one_line(error)}); {advice}"
+    return one_line(error)
 
 
 def _explained(task: Callable[[DictConfig], object], config: str) -> str:

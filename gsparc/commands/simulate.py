@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import time
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
@@ -24,6 +27,8 @@ from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
+
+log = logging.getLogger(__name__)
 
 
 def campaign(config: DictConfig) -> Campaign:
@@ -47,13 +52,16 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
     return AutoSettings(**{**config, "full": effects_from_config(config["full"])})
 
 
-def task(config: DictConfig) -> Outcome:
-    """Simulate, then table, summary and pictures."""
+def task(config: DictConfig) -> Outcome | None:
+    """Simulate, then table, summary and pictures; of several jobs, in that which wrote the file."""
     RunSettings.of(config)
     run_dir = run_directory()
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
-    outcome = simulate(campaign(config), out)
+    outcome = simulate(campaign(config), out, shared=HydraConfig.get().mode == RunMode.MULTIRUN)
+    if outcome is None:
+        log.info("%s is written, by another job", out)
+        return None
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
     console = open_console()

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands import cli
 from gsparc.commands.context import callbacks_of, context_of
+from gsparc.commands.continued import once
 from gsparc.commands.output import run_directory, show
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.run import fit_and_score
@@ -215,11 +217,17 @@ def objective_of(config: DictConfig, kind: Kind) -> str:
 
 
 def task(config: DictConfig) -> float:
-    """Train as configured and show the table.
+    """Train as configured and show the table; a job of a multirun that has ended here is not done again.
 
     Returns:
         The objective, larger is better: ratios of powers as -10 log10, errors with their sign turned.
     """
+    if HydraConfig.get().mode == RunMode.MULTIRUN:
+        return once(run_directory(), config, _train_and_show)
+    return _train_and_show(config)
+
+
+def _train_and_show(config: DictConfig) -> float:
     run_dir = run_directory()
     facts, objects = train(config, run_dir)
     figure = objective_of(config, objects.data.site.kind)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cached_property
 from typing import Self
 
@@ -79,7 +80,9 @@ class StepLoader:
         start = self.first_step()
         for step in range(start, (start // len(self) + 1) * len(self)):
             rows = order(self.seed, step, self.batch_size, self.pool)
-            yield self.data.batch(share(rows, self.rank, self.devices))
+            mine = share(rows, self.rank, self.devices)
+            part = len(mine) / len(rows) if self.rank < len(rows) else 0.0
+            yield replace(self.data.batch(mine), share=part)
 
     def state_dict(self) -> dict[str, int]:
         """Nothing to store: the order is a pure function of (seed, step). Marks the loader as resumable."""

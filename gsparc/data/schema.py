@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -185,6 +185,7 @@ class Batch:
         uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
         station: (B,) int64, which of the site's stations each is of; None where there is one.
         run: (B,) int64, see `Measurements`; None where all are in phase.
+        share: of a training step's rows, where processes share them; 0 where another has these rows.
     """
 
     index: Tensor
@@ -196,14 +197,17 @@ class Batch:
     uplink: Tensor | None = None
     station: Tensor | None = None
     run: Tensor | None = None
+    share: float = 1.0
 
     def __len__(self) -> int:
         return self.index.shape[0]
 
     def to(self, device: torch.device | str) -> Batch:
         """The same samples on another device."""
-        moved = {k: v.to(device) for k, v in vars(self).items() if v is not None}
-        return Batch(**moved)
+        moved: dict[str, Any] = {
+            k: v.to(device) for k, v in vars(self).items() if isinstance(v, (Tensor, Pose))
+        }
+        return replace(self, **moved)
 
 
 @dataclass(frozen=True)

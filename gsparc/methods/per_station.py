@@ -288,7 +288,7 @@ def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
 
 def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
     parts = {
-        name: value if value is None or name in ("rx", "station") else value[chosen]
+        name: value[chosen] if isinstance(value, Tensor) and name != "station" else value
         for name, value in vars(batch).items()
     }
     known = batch.station is not None and site is not None and site.stations is not None

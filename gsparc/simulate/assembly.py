@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,14 +71,13 @@ def assemble(
     convergence: Convergence | None,
     seconds: float,
     shards: Shards,
-    out: Path,
 ) -> Assembled:
-    """Put the shards, all of them there, together, write the file `out`, drop the shards.
+    """Put the shards, all of them there, together, write the file, drop the shards.
 
     Args:
         campaign, engine, receivers, effects, choice, convergence: what the file is of.
         seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
-        shards, out: from where and where to.
+        shards: from where, and to which file.
 
     Raises:
         ValueError: nothing reaches any receiver.
@@ -110,7 +108,7 @@ def assemble(
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
     if choice is not None:
         about["auto"] = json.dumps(asdict(choice))
-    data = write_own(out, arrays, {**about, "simulate_s": seconds})
+    data = write_own(shards.out, arrays, {**about, **shards.signature, "simulate_s": seconds})
     shards.remove()
     return Assembled(data, power, whole["delay_spread"], facts)
 

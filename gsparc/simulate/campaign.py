@@ -6,9 +6,11 @@ import logging
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from gsparc.data.claims import each_once
 from gsparc.simulate import auto, priors
 from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
 from gsparc.simulate.attribution import Deliverable, Probe
@@ -19,7 +21,7 @@ from gsparc.simulate.engine import Engine
 from gsparc.simulate.scenes.build import build
 from gsparc.simulate.scenes.placement import neighbours, spread
 from gsparc.simulate.settings import Campaign
-from gsparc.simulate.shards import Shards
+from gsparc.simulate.shards import Shards, written_by
 
 log = logging.getLogger(__name__)
 
@@ -64,45 +66,81 @@ class Outcome:
     seconds: dict[str, float]
 
 
-def simulate(campaign: Campaign, out: Path) -> Outcome:
-    """Make the dataset, or go on where an interrupted run stopped.
+def simulate(campaign: Campaign, out: Path, shared: bool = False) -> Outcome | None:
+    """Make the dataset, or go on where an interrupted run stopped; processes that make the same one share it.
+
+    Args:
+        campaign: what is simulated.
+        out: the file.
+        shared: whether others may be making it, or may have made it.
+
+    Returns:
+        None where another process has written the file.
 
     Raises:
         ValueError: `out` exists, or parts beside it belong to another simulation, or bad settings.
         SimulatorMissing: the scene needs Sionna and it is not here.
     """
+    plan = {**asdict(campaign), "parts": PARTS}
     if out.exists():
+        if shared and written_by(out, plan):
+            return None
         raise ValueError(f"out={out} exists; remove it or choose another")
     laps = [time.perf_counter()]
     engine, receivers = build(campaign.scene, campaign.sampling)
-    shards = Shards(out, {**asdict(campaign), "parts": PARTS})
+    shards = Shards(out, plan)
     laps.append(time.perf_counter())
     choice, changed, effects, decided_s = None, None, campaign.effects, 0.0
     if isinstance(effects, AutoSettings):
-        choice, changed, decided_s = _choose(campaign, effects, engine, receivers, shards)
+        decided = _choose(campaign, effects, engine, receivers, shards)
+        if decided is None:
+            return None
+        choice, changed, decided_s = decided
         effects = choice.effects
     effects = engine.supported(effects)
     laps.append(time.perf_counter())
     _trace_all(campaign, engine, receivers, effects, shards)
     laps.append(time.perf_counter())
-    convergence = _converge(campaign, engine, receivers, effects)
-    laps.append(time.perf_counter())
-    other_s = laps[1] - laps[0] + decided_s + laps[4] - laps[3]
-    made = assemble(campaign, engine, receivers, effects, choice, convergence, other_s, shards, out)
-    laps.append(time.perf_counter())
-    seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
-    return Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, seconds)
+    mine: list[Outcome] = []
+
+    def finish(unused: str) -> None:
+        convergence = _converge(campaign, engine, receivers, effects)
+        laps.append(time.perf_counter())
+        other_s = laps[1] - laps[0] + decided_s + laps[4] - laps[3]
+        made = assemble(campaign, engine, receivers, effects, choice, convergence, other_s, shards)
+        laps.append(time.perf_counter())
+        seconds = dict(zip(STAGES, np.diff(laps).tolist(), strict=True))
+        whole = Outcome(made, receivers, engine.transmitter, effects, choice, changed, convergence, seconds)
+        mine.append(whole)
+
+    each_once(["file"], shards.lock, lambda unused: out.exists(), finish)
+    return mine[0] if mine else None
 
 
 def _choose(
     campaign: Campaign, settings: AutoSettings, engine: Engine, receivers: np.ndarray, shards: Shards
-) -> tuple[Choice, Changed, float]:
-    """The decision of `auto`, taken once and stored with the shards; errors it makes; its time [s]."""
-    begin = time.perf_counter()
+) -> tuple[Choice, Changed, float] | None:
+    """The decision of `auto`, taken once and stored with the shards; errors it makes; its time [s].
+
+    None where another process has written the file meanwhile.
+    """
+
+    def work(note: str) -> None:
+        shards.write_note(note, _decide(campaign, settings, engine, receivers))
+
+    each_once(["choice"], shards.lock, lambda note: shards.finished or shards.has_note(note), work)
     stored = shards.read_note("choice")
-    if stored is not None:
-        changed = Changed(np.array(stored["rows"], dtype=int), np.array(stored["errors"]))
-        return Choice.from_dict(stored["choice"]), changed, float(stored["seconds"])
+    if stored is None:
+        return None
+    changed = Changed(np.array(stored["rows"], dtype=int), np.array(stored["errors"]))
+    return Choice.from_dict(stored["choice"]), changed, float(stored["seconds"])
+
+
+def _decide(
+    campaign: Campaign, settings: AutoSettings, engine: Engine, receivers: np.ndarray
+) -> dict[str, Any]:
+    """The decision of `auto` as it is stored."""
+    begin = time.perf_counter()
     chosen = spread(receivers, settings.probes + settings.held_back, campaign.scene.seed)
     # Farthest-point order: taking every so many leaves both groups spread out.
     taken = np.zeros(len(chosen), dtype=bool)
@@ -121,8 +159,7 @@ def _choose(
     errors = probe.errors(choice.effects, Deliverable.parse(settings.deliverable, settings.quantile))
     seconds = time.perf_counter() - begin
     cost = {"rows": held.tolist(), "errors": errors.tolist(), "seconds": seconds}
-    shards.write_note("choice", {"choice": asdict(choice), **cost})
-    return choice, Changed(held, errors), seconds
+    return {"choice": asdict(choice), **cost}
 
 
 def _probe(
@@ -151,17 +188,24 @@ def _converge(
 def _trace_all(
     campaign: Campaign, engine: Engine, receivers: np.ndarray, effects: Effects, shards: Shards
 ) -> None:
-    """Every shard that is not there yet, with progress in the log."""
+    """Every shard that is not there yet and that no other process is making, with progress in the log."""
     starts = range(0, len(receivers), campaign.shard)
     parts = {n: receivers[i : i + campaign.shard] for n, i in enumerate(starts)}
     missing = {n: places for n, places in parts.items() if not shards.path(n).exists()}
     if len(missing) < len(starts):
         log.info("%d of %d shards are there already", len(starts) - len(missing), len(starts))
-    begin, done, left = time.perf_counter(), 0, sum(map(len, missing.values()))
-    for number, places in missing.items():
+    begin, count = time.perf_counter(), len(receivers)
+    at_first = sum(map(len, missing.values()))
+
+    def there(number: int) -> bool:
+        return shards.path(number).exists() or shards.finished
+
+    def work(number: int) -> None:
         start = time.perf_counter()
-        made = shard_arrays(engine.trace(places, effects), campaign, engine.wavelength)
+        made = shard_arrays(engine.trace(missing[number], effects), campaign, engine.wavelength)
         shards.put(number, {**made, SECONDS: np.array(time.perf_counter() - start)})
-        done, left = done + len(places), left - len(places)
-        rate, count = done / (time.perf_counter() - begin), len(receivers)
+        left = sum(len(places) for n, places in missing.items() if not shards.path(n).exists())
+        rate = (at_first - left) / (time.perf_counter() - begin)  # of all processes
         log.info("%d of %d receivers, %.1f per s, %.0f s left", count - left, count, rate, left / rate)
+
+    each_once(missing, shards.lock, there, work)

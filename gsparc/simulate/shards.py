@@ -6,13 +6,16 @@ renaming, and the dataset is written from all of them at the end.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 
 from gsparc.data.files import whole_file
@@ -30,17 +33,17 @@ class Shards:
     """
 
     def __init__(self, out: Path, plan: Mapping[str, Any]) -> None:
+        self.out, self.plan = out, _text(plan)
         self.folder = out.with_name(out.name + ".parts")
         self._removed = out.with_name(out.name + ".gone")
         self._sweep()
-        text = json.dumps(plan, sort_keys=True, indent=1, default=str)
         stored = self.folder / "plan.json"
-        if stored.exists() and stored.read_text(encoding="utf-8") != text:
+        if stored.exists() and stored.read_text(encoding="utf-8") != self.plan:
             raise ValueError(
                 f"{self.folder} holds parts of a different simulation; remove it, or choose another out="
             )
         if not stored.exists():
-            _write(stored, text)
+            _write(stored, self.plan)
 
     def write_note(self, name: str, content: Mapping[str, Any]) -> None:
         """Store a decision, so that a resumed run does not decide again."""
@@ -50,6 +53,24 @@ class Shards:
         """The stored decision, or None."""
         path = self.folder / f"{name}.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+    def lock(self, piece: object) -> Path:
+        """File by which one process claims a piece of the work, a shard or a decision."""
+        return self.folder / f"{piece}.lock"
+
+    @property
+    def signature(self) -> dict[str, str]:
+        """Attribute of the dataset that says which plan it was made by."""
+        return _signature(self.plan)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the dataset is written, and shards that are not there were not missing."""
+        return self.out.exists()
+
+    def has_note(self, name: str) -> bool:
+        """Whether a decision is stored."""
+        return (self.folder / f"{name}.json").exists()
 
     def path(self, number: int) -> Path:
         """File of a shard; it is there once the shard is finished."""
@@ -74,7 +95,29 @@ class Shards:
 
     def _sweep(self) -> None:
         if self._removed.exists():
-            shutil.rmtree(self._removed)
+            with suppress(FileNotFoundError):  # another process sweeps, too
+                shutil.rmtree(self._removed)
+
+
+def written_by(out: Path, plan: Mapping[str, Any]) -> bool:
+    """Whether a dataset's file was made by a plan; False where it is of another kind."""
+    try:
+        with h5py.File(out) as file:
+            return all(_as_text(file.attrs.get(k)) == v for k, v in _signature(_text(plan)).items())
+    except OSError:
+        return False
+
+
+def _text(plan: Mapping[str, Any]) -> str:
+    return json.dumps(plan, sort_keys=True, indent=1, default=str)
+
+
+def _signature(text: str) -> dict[str, str]:
+    return {"plan_sha256": hashlib.sha256(text.encode()).hexdigest()}
+
+
+def _as_text(value: Any) -> str | None:
+    return value.decode() if isinstance(value, bytes) else value
 
 
 def _write(path: Path, content: str) -> None:

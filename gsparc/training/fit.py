@@ -17,8 +17,7 @@ from typing import Any
 import lightning.pytorch as L
 import torch
 from lightning.pytorch.plugins.io import CheckpointIO
-from lightning.pytorch.strategies.launchers import _MultiProcessingLauncher
-from torch.multiprocessing.spawn import ProcessException
+from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 
 from gsparc.data.datamodule import Loaded
 from gsparc.data.schema import Measurements
@@ -26,9 +25,12 @@ from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext
 from gsparc.methods.time_budget import Spent, TimeBudget
 from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.processes import Processes
 from gsparc.training.time_budget import SPENT, Budget, Stretched
 
-SECONDS = "time/learning_s"
+log = logging.getLogger(__name__)
+
+SECONDS, TAKEN = "time/learning_s", "steps/taken"
 KEPT = ("steps/kept", "steps/kept_position")
 CONDITIONAL_ROWS = 256  # of a step of a conditional field: it factors a matrix of this size
 LOG_EVERY = 10  # steps: Lightning spends a fifth of a step on logging two figures
@@ -74,27 +76,13 @@ def total_steps(context: FitContext) -> int:
     return steps
 
 
-class SeveralDevices(L.Callback):
-    """Brings the training time home, and refuses to train on when Gaussians were added or removed.
-
-    Gradients are then no longer averaged: DistributedDataParallel knows the parameters it began with.
-    """
-
-    def __init__(self) -> None:
-        self.parameters: set[int] = set()
-
-    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        """Remember what the devices share."""
-        self.parameters = {id(p) for p in module.parameters()}
-
-    def on_train_batch_end(self, trainer: L.Trainer, module: L.LightningModule, *unused: Any) -> None:
-        """Look whether it is still the same."""
-        if trainer.world_size > 1 and self.parameters != {id(p) for p in module.parameters()}:
-            raise ValueError("callbacks that add or remove Gaussians need one device: trainer.devices=1")
+class BringHome(L.Callback):
+    """Time and steps of training as metrics: of all attributes, only these leave a process."""
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
-        """Also after a checkpoint with every step done; of all attributes, only metrics leave the process."""
-        trainer.callback_metrics[SECONDS] = torch.tensor(module.train_seconds, dtype=torch.float64)
+        """Also after a checkpoint with every step done."""
+        for name, value in ((SECONDS, module.train_seconds), (TAKEN, trainer.global_step)):
+            trainer.callback_metrics[name] = torch.tensor(value, dtype=torch.float64)
 
 
 class _Stopped(BaseException):
@@ -104,7 +92,7 @@ class _Stopped(BaseException):
 class StopBetweenSteps(L.Callback):
     """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
 
-    On several devices it does not wait, nor does a second one: the checkpoint before is what is left.
+    In several processes it does not wait, nor does a second one: the checkpoint before is what is left.
 
     Args:
         file: the checkpoint written when stopped.
@@ -190,29 +178,31 @@ def run_stage(
     if not len(fold.val):
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps if pace is None else -1
+    processes = Processes.named(make.keywords.get("strategy"))
+    if module.conditional and processes is not None:
+        log.info("weights in closed form: one process takes these steps, each needs all rows of its batch")
+        options |= {"devices": 1, "num_nodes": 1, "strategy": "auto"}
+    elif processes is not None:
+        options["strategy"] = processes
     trainer = make(
         max_epochs=-1,
-        callbacks=[*callbacks, SeveralDevices(), stop],
+        callbacks=[*callbacks, BringHome(), stop],
         logger=list(context.loggers) or False,
         plugins=[checkpoints],
         default_root_dir=folder,
         enable_checkpointing=any(isinstance(c, L.callbacks.ModelCheckpoint) for c in callbacks),
         **options,
     )
-    # Processes of several devices must end with training: tests and files are the work of one.
-    if trainer.world_size > 1 and not isinstance(trainer.strategy.launcher, _MultiProcessingLauncher):
-        raise ValueError(
-            "trainer.strategy: on several devices this would run the whole program once per device; "
-            "say trainer=ddp, or a strategy ddp_spawn* or ddp_fork*"
-        )
+    if trainer.world_size > 1 and processes is None:
+        raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     try:
         with stop.listening():
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
     except (_Stopped, SystemExit, ProcessException) as ended:
         # Lightning's answer to a KeyboardInterrupt is SystemExit.
-        if isinstance(ended, ProcessException) and not stop.requested:
-            raise RuntimeError(_last_line(ended)) from ended
         advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
+        if isinstance(ended, ProcessException) and not stop.requested:
+            raise RuntimeError(_lost(ended, advice)) from ended
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
     finally:
         batches.trainer = None  # which holds the optimizer's state
@@ -220,11 +210,14 @@ def run_stage(
     learned = float(metrics[SECONDS]) or float(metrics[SPENT][0]) - before.wall  # where no ledger counts
     budget.charge(Spent(*metrics[SPENT].tolist()) - budget.counted)
     steps, position = (int(metrics[name]) if name in metrics else None for name in KEPT)
-    return Ran(learned, trainer.global_step if steps is None else steps, position)
+    return Ran(learned, int(metrics[TAKEN]) if steps is None else steps, position)
 
 
-def _last_line(error: ProcessException) -> str:
-    """What was said by the process that failed, without its traceback."""
+def _lost(error: ProcessException, advice: str) -> str:
+    """What was said by the process that failed, without its traceback; or which one was killed."""
+    if isinstance(error, ProcessExitedException):
+        how = error.signal_name or f"exit status {error.exit_code}"
+        return f"training process {error.error_index} ended by {how}, the others were stopped; {advice}"
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1].partition("Error: ")[2] or lines[-1] if lines else type(error).__name__
 
@@ -233,13 +226,13 @@ def _quieten_lightning() -> None:
     """Lightning advertises and repeats what the progress line says; its warnings stay, but for a few."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # its report was asked for
+    logging.getLogger("torch.multiprocessing.spawn").setLevel(logging.ERROR)  # our error says it in one line
     for pointless in (
         r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
         r".*does not have many workers.*",  # data this small is faster without
         r".*callbacks used to create the checkpoint need to be provided.*",  # schedules may change
         r".*The dirpath has changed.*",  # a resumed run may have a directory of its own
         r".*recommended to use `self.log\(.*sync_dist=True.*",  # every device validates all rows
-        r".*Grad strides do not match bucket view strides.*",  # of DistributedDataParallel, for harmonics
         r".*smaller than the logging interval.*",  # small campaigns have few batches
         r".*Checkpoint directory .* exists and is not empty.*",  # it is the run directory
     ):

@@ -13,6 +13,7 @@ from gsparc.field import edit
 from gsparc.field.model import GaussianModel
 from gsparc.training.fit import KEPT
 from gsparc.training.lightning_module import GaussianModule
+from gsparc.training.processes import agreed
 
 log = logging.getLogger(__name__)
 
@@ -53,13 +54,14 @@ class KeepBest(L.Callback):
             with torch.no_grad():
                 parts = [(len(b), module.error(b.to(module.device)).mean()) for b in data.val_dataloader()]
             error = sum(n * float(e) for n, e in parts) / sum(n for n, _ in parts)
-            self._look(module, error, trainer.global_step)
+            self._look(module, agreed(error, trainer), trainer.global_step)
 
     def on_validation_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Keep what is better; end training when nothing was for long."""
         if trainer.sanity_checking or trainer.state.fn != "fit":
             return
-        self._look(module, float(trainer.callback_metrics["val/error"]), trainer.global_step)
+        error = agreed(float(trainer.callback_metrics["val/error"]), trainer)
+        self._look(module, error, trainer.global_step)
         if module.position - self.position >= self.patience * module.total_steps:
             trainer.should_stop = True
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, get_args, runtime_checkable
@@ -27,6 +28,7 @@ from gsparc.training.optimizer import (
     optimizer_for,
     scheduler_for,
 )
+from gsparc.training.processes import count
 from gsparc.training.time_budget import Pace
 
 
@@ -132,10 +134,12 @@ class GaussianModule(L.LightningModule):
             bad = ~torch.isfinite(task)
             raise self._stop(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
         if (self.global_step + 1) % self.log_every == 0:
-            self.log("train/task_loss", task.detach().mean())
-            self.log("train/loss", loss.detach())  # weighted by the confidence, where there is one
+            part = batch.share * count()  # the mean over processes is that over the batch
+            self.log("train/task_loss", task.detach().mean() * part, sync_dist=True)
+            # weighted by the confidence, where there is one
+            self.log("train/loss", loss.detach() * part, sync_dist=True)
             self.log("model/num_gaussians", float(self.count))
-        return loss
+        return loss * batch.share
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
         """The rates of the step that was taken."""
@@ -225,12 +229,11 @@ class GaussianModule(L.LightningModule):
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps, self.pace)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
 
-    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Make room for the checkpoint's number of Gaussians before its tensors arrive."""
-        if self.conditional:
-            return
-        count = len(checkpoint["state_dict"]["model.gaussians.ids"])
-        edit.resize(self.model, self.model.gaussians, count)
+    def load_state_dict(self, state_dict: Mapping[str, Any], *rest: Any, **named: Any) -> Any:
+        """Make room for the number of Gaussians before their tensors arrive."""
+        if not self.conditional:
+            edit.resize(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
+        return super().load_state_dict(state_dict, *rest, **named)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """A poisoned state never replaces a good checkpoint."""

@@ -13,6 +13,7 @@ import lightning.pytorch as L
 import torch
 
 from gsparc.methods.time_budget import Spent, TimeBudget
+from gsparc.training.processes import agreed
 from gsparc.training.schedule import in_steps
 
 SPENT = "time/spent_s"  # metric of both clocks
@@ -64,7 +65,7 @@ class Budget(L.Callback):
 
     def _look(self, trainer: L.Trainer) -> None:
         if self.pace is not None:
-            self.pace.spend(self._learned.by(self.budget.clock))
+            self.pace.spend(agreed(self._learned.by(self.budget.clock), trainer))
             trainer.should_stop = trainer.should_stop or self.pace.over
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:

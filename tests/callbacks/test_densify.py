@@ -76,6 +76,11 @@ def test_never_more_than_allowed_and_the_neediest_first(model, share, grown):
     assert set(edit.parents.tolist()) == {6, 7, 8, 9}
 
 
+def rendering(model, rendered, share=1.0):
+    batch = SimpleNamespace(share=share, rx=SimpleNamespace(batched=True))
+    return SimpleNamespace(model=model, total_steps=100, rendered=rendered, batch=batch)
+
+
 def test_gradients_are_read_per_sample_before_summing(model):
     """Two samples that pull apart: their sum is zero, their need is not."""
     shift = torch.zeros(2, 10, 2)
@@ -86,7 +91,7 @@ def test_gradients_are_read_per_sample_before_summing(model):
         radii=torch.full((2, 10), 2.0),
     )
     densify = Densify()
-    module = SimpleNamespace(model=model, total_steps=100, rendered=Rendered(torch.zeros(1), raster))
+    module = rendering(model, Rendered(torch.zeros(1), raster))
     for _ in range(2):
         densify.on_after_backward(SimpleNamespace(global_step=0), module)
     assert densify.statistics["gradient"][5] == 12 and densify.statistics["seen"][5] == 4
@@ -98,9 +103,21 @@ def test_who_was_not_seen_asks_for_nothing(model):
         means2d=SimpleNamespace(grad=torch.ones(1, 10, 2)), visible=hidden, radii=torch.ones(1, 10)
     )
     densify = Densify()
-    module = SimpleNamespace(model=model, total_steps=100, rendered=Rendered(torch.zeros(1), raster))
+    module = rendering(model, Rendered(torch.zeros(1), raster))
     densify.on_after_backward(SimpleNamespace(global_step=0), module)
     assert not densify.statistics["gradient"].any() and not densify.statistics["radius"].any()
+
+
+def test_rows_of_another_process_are_not_counted_twice(model):
+    seen = torch.ones(1, 10, dtype=torch.bool)
+    means2d = torch.zeros(1, 10, 2)
+    means2d.grad = torch.ones(1, 10, 2)
+    raster = SimpleNamespace(means2d=means2d, visible=seen, radii=torch.ones(1, 10))
+    densify = Densify()
+    for share in (1.0, 0.0):
+        module = rendering(model, Rendered(torch.zeros(1), raster), share)
+        densify.on_after_backward(SimpleNamespace(global_step=0), module)
+    assert densify.statistics["seen"].tolist() == [1] * 10
 
 
 def test_edits_happen_on_the_schedule_only(model):
@@ -133,9 +150,7 @@ def test_a_moving_receiver_gives_gradients_per_pose(campaign):
     rendered = moving(batch.tx, batch.rx)
     rendered.mean.sum().backward()
     densify = Densify()
-    densify.on_after_backward(
-        SimpleNamespace(global_step=0), SimpleNamespace(model=moving, total_steps=100, rendered=rendered)
-    )
+    densify.on_after_backward(SimpleNamespace(global_step=0), rendering(moving, rendered))
     assert rendered.raster.means2d.grad.shape == (4, 30, 2)
     assert densify.statistics["seen"].max() > 1 and densify.statistics["gradient"].any()
 

@@ -94,19 +94,6 @@ def test_two_devices_learn_what_one_does(file, trained, tmp_path):
     assert (both - one).norm() < 0.2 * (one - began).norm()  # the same mean gradient, but for rounding
 
 
-@pytest.mark.slow
-def test_devices_whose_gaussians_differ_are_refused(file, tmp_path):
-    more = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "callbacks=densify"]
-    more += [
-        "callbacks.densify.start=3",
-        "callbacks.densify.interval=4",
-        "callbacks.densify.grad_threshold=0",
-    ]
-    with pytest.raises(RuntimeError, match=r"need one device: trainer\.devices=1$") as error:
-        train(compose(*brief(file, *more)), tmp_path)
-    assert "\n" not in one_line(error.value)
-
-
 def test_tensorboard_that_is_not_there_is_one_line(file, tmp_path, monkeypatch):
     def absent(*unused, **named):
         raise ModuleNotFoundError("No module named 'tensorboard'")

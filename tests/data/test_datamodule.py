@@ -217,6 +217,16 @@ def test_devices_share_every_batch_and_none_is_left_out(rows, devices):
         assert sum(map(len, shares)) == rows
 
 
+@pytest.mark.parametrize(("batch", "devices"), [(4, 2), (3, 2), (1, 2), (2, 3)])
+def test_shares_of_a_step_add_up_to_one(data, batch, devices):
+    loaders = [StepLoader(data, FOLD.train, batch, 0, rank=r, devices=devices) for r in range(devices)]
+    for parts in zip(*loaders, strict=True):
+        assert sum(part.share for part in parts) == pytest.approx(1)
+        counted = sum(len(part) for part in parts if part.share)
+        assert all(part.share in (0, pytest.approx(len(part) / counted)) for part in parts)
+        assert parts[-1].to("cpu").share == parts[-1].share
+
+
 def test_several_devices_take_the_steps_of_one(data):
     one = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0)]
     two = [[b.index.tolist() for b in StepLoader(data, FOLD.train, 4, 0, rank=r, devices=2)] for r in (0, 1)]

@@ -26,7 +26,8 @@ def module(data, run_dir, confidence: bool = True) -> GaussianModule:
         confidence=ConfidenceSettings(enabled=confidence),
     )
     shape = data.target.shape[1:] if data.site.kind == "csi" else None
-    model = GaussianModel(settings, data.site, RECEIVER, shape=shape)
+    ends = (RECEIVER, None) if data.site.static_end == "rx" else (None, torch.tensor([4.0, 0.0, 0.0]))
+    model = GaussianModel(settings, data.site, *ends, shape=shape)
     made = GaussianModule(model, LossSettings(0.0), OptimizerSettings(), 10, run_dir)
     made.log = lambda *a, **k: None  # type: ignore[method-assign]
     return made

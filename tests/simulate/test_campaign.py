@@ -1,7 +1,10 @@
 """Whole campaigns on our own engine: no ray tracer needed."""
 
 import json
+import multiprocessing
+import os
 import shutil
+import signal
 import time
 from pathlib import Path
 
@@ -10,6 +13,7 @@ import numpy as np
 import pytest
 
 from gsparc.commands.check import main as check
+from gsparc.data import claims
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
@@ -197,3 +201,42 @@ def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):
         simulate(plan(scene=SceneSettings(**{**vars(SCENE), **changes})), tmp_path / "box.h5")
     assert not list(tmp_path.iterdir())
+
+
+def shares(out: Path, begun: Path, killed_at: int | None) -> None:
+    """One of several processes that make a dataset; `begun` counts the shards and decisions they begin."""
+    real = ShoeboxEngine.trace
+
+    def counted(self, receivers, *rest, **named):
+        with begun.open("a") as file:
+            file.write(f"{len(receivers)} {receivers[0].sum()}\n")
+        if killed_at is not None and len(begun.read_text().splitlines()) == killed_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(self, receivers, *rest, **named)
+
+    ShoeboxEngine.trace = counted
+    claims.POLL_S = 0.02
+    simulate(plan(shard=8), out, shared=True)
+
+
+def test_two_processes_share_shards_and_one_is_killed(tmp_path):
+    simulate(plan(shard=8), tmp_path / "whole.h5")
+    out, begun = tmp_path / "shared.h5", tmp_path / "begun"
+    fork = multiprocessing.get_context("fork")
+    workers = [fork.Process(target=shares, args=(out, begun, at)) for at in (3, None)]
+    workers[0].start()
+    while workers[0].is_alive() and not begun.exists():
+        time.sleep(0.01)
+    workers[1].start()
+    for worker in workers:
+        worker.join(120)
+    assert workers[1].exitcode == 0 and workers[0].exitcode in (0, -signal.SIGKILL)
+    traced = begun.read_text().splitlines()
+    killed = workers[0].exitcode != 0
+    assert len(set(traced)) == 8 and len(traced) == 8 + killed
+    (one, _), (two, _) = arrays(tmp_path / "whole.h5"), arrays(out)
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+    assert simulate(plan(shard=8), out, shared=True) is None  # a job that comes late
+    with pytest.raises(ValueError, match="exists"):
+        simulate(plan(shard=9), out, shared=True)

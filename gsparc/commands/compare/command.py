@@ -12,6 +12,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
@@ -28,6 +30,7 @@ from gsparc.commands.compare.overview import overview
 from gsparc.commands.compare.problem import Problem, load_problems, split_choices, stored_problems
 from gsparc.commands.output import columns, run_directory, show
 from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.claims import each_once
 from gsparc.data.files import platform_cache
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
@@ -53,7 +56,12 @@ def task(config: DictConfig) -> list[table.Row]:
         for problem, cell in plan(problems, methods, budgets, settings["only"])
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
-    filled = fill_all(prepared, bool(settings["train"]), limit_s)
+    several = HydraConfig.get().mode == RunMode.MULTIRUN
+    failed = run_dir.parent / "failed" if several else None
+    filled = fill_all(prepared, bool(settings["train"]), limit_s, failed)
+    if several and settings["worker"]:
+        log.info("every cell is filled or has failed; the report is worker 0's")
+        return []
     if not filled:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     by_name = {(r.dataset, r.split): r for r in reversed(problems)}  # the first draw of each
@@ -110,41 +118,62 @@ def _may_match(pattern: str, dataset: str, split: str) -> bool:
     return True
 
 
-def fill_all(prepared: Sequence[Prepared], train: bool = True, limit_s: float | None = None) -> list[Filled]:
+def fill_all(
+    prepared: Sequence[Prepared], train: bool = True, limit_s: float | None = None, failed: Path | None = None
+) -> list[Filled]:
     """Find or fill one cell after another, saying how far it is and how long it will take.
 
     A cell that cannot be filled is said and left out; the others go on. One that is not tried keeps what was
-    measured with earlier program text.
+    measured with earlier program text. Processes that fill the same cells share them.
+
+    Args:
+        prepared: the most wanted first.
+        train: whether missing cells are filled.
+        limit_s: no cell is started that would end later [s].
+        failed: folder in which processes tell each other of cells that cannot be filled.
     """
-    filled: list[Filled] = []
     missing = [one for one in prepared if one.found() is None]
     log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(missing))
-    started, left = time.monotonic(), sum(one.expected_s for one in missing)
-    for number, one in enumerate(prepared, 1):
-        found = one.found()
-        if found is None and train and one.problem.data is not None:
-            if limit_s is not None and time.monotonic() - started + one.expected_s > limit_s:
-                log.warning("max_hours: %s is not started", one.cell)
-            else:
-                log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
-                left -= one.expected_s
-                try:
-                    found = fill(one)
-                except KeyboardInterrupt:
-                    kept = "interrupted; finished cells are kept: the same command goes on with the others"
-                    raise KeyboardInterrupt(kept) from None
-                except (ValueError, RuntimeError) as error:
-                    log.warning("%s cannot be filled: %s", one.cell, one_line(error))
-                    continue
-                score = (
-                    f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB"
-                    if found.scored()
-                    else "-"
-                )
-                log.info("%s: %s after %.1f s", one.cell, score, found.facts["time/train_s"])
-        found = found or one.found_earlier()
-        filled += [found] if found else []
-    return filled
+    started = time.monotonic()
+    broken, late = set[str](), set[str]()  # cells
+
+    def cannot(one: Prepared) -> bool:
+        return str(one.cell) in broken or (failed is not None and (failed / one.folder.name).exists())
+
+    def done(one: Prepared) -> bool:
+        return one.found() is not None or str(one.cell) in late or cannot(one)
+
+    def work(one: Prepared) -> None:
+        if limit_s is not None and time.monotonic() - started + one.expected_s > limit_s:
+            log.warning("max_hours: %s is not started", one.cell)
+            late.add(str(one.cell))
+            return
+        left = sum(other.expected_s for other in missing if not done(other))
+        number = prepared.index(one) + 1
+        log.info("[%d/%d] %s ... about %.0f min left", number, len(prepared), one.cell, left / 60)
+        try:
+            _say_filled(fill(one))
+        except KeyboardInterrupt:
+            kept = "interrupted; finished cells are kept: the same command goes on with the others"
+            raise KeyboardInterrupt(kept) from None
+        except (ValueError, RuntimeError) as error:
+            log.warning("%s cannot be filled: %s", one.cell, one_line(error))
+            broken.add(str(one.cell))
+            if failed is not None:
+                failed.mkdir(parents=True, exist_ok=True)
+                (failed / one.folder.name).write_text(one_line(error) + "\n", encoding="utf-8")
+
+    if train:
+        here = [one for one in missing if one.problem.data is not None]
+        each_once(here, lambda one: one.lock, done, work)
+    found = [one.found() or (None if cannot(one) else one.found_earlier()) for one in prepared]
+    return [one for one in found if one is not None]
+
+
+def _say_filled(found: Filled) -> None:
+    scored = found.scored()
+    score = f"{table.score_db(found.facts['dataset/kind'], found.facts):.2f} dB" if scored else "-"
+    log.info("%s: %s after %.1f s", found.cell, score, found.facts["time/train_s"])
 
 
 def _timed(

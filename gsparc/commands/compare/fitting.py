@@ -78,6 +78,11 @@ class Prepared:
     scored: bool = True
 
     @property
+    def lock(self) -> Path:
+        """File by which one process claims to fill the cell."""
+        return self.folder / ".lock"
+
+    @property
     def expected_s(self) -> float:
         """Seconds it will take: its budget on every fold, and something for scoring [s]; 0 without data."""
         folds = self.problem.folds
@@ -117,7 +122,10 @@ def prepare(
     config = compose(settings, overrides, problem.draw, cell.seed)
     whole = plain(config)
     trainer = {name: whole[name] for name in ("trainer", "callbacks", "budget_s")}
-    if whole["stations"] != "each":  # cells from before there was a choice keep their names
+    # cells from before there was a choice keep their names
+    if whole["trainer"].get("strategy") == "auto":
+        trainer["trainer"] = {name: v for name, v in whole["trainer"].items() if name != "strategy"}
+    if whole["stations"] != "each":
         trainer["stations"] = whole["stations"]
     if problem.draw is None and cell.seed and "seed" not in whole["model"]:
         trainer["seed"] = cell.seed  # of a draw, the split's own hash tells

@@ -1,0 +1,61 @@
+"""Workers that share the cells of a comparison: each cell is filled once, also when one worker is killed."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+from invented import invent
+
+from gsparc.commands.compare import command
+from gsparc.commands.compare.cells import Cell
+from gsparc.commands.compare.fitting import Filled, Prepared
+from gsparc.commands.compare.problem import Problem
+from gsparc.data import claims
+
+FORK = multiprocessing.get_context("fork")
+BROKEN = 5
+COUNT = 10
+
+
+def worker(folder: Path, killed_at: int | None = None) -> None:
+    problem = Problem("toy", "random", "spectrum", ("d", "s"), data=invent("spectrum", 12))
+    cells = [Cell("toy", "random", f"m{number}", None, None) for number in range(COUNT)]
+    prepared = [Prepared(cell, problem, None, folder / f"toy-random-{cell.method}-k") for cell in cells]
+
+    def fill(one: Prepared) -> Filled:
+        number = int(one.cell.method[1:])
+        with (folder / "begun").open("a") as file:
+            file.write(f"{number}\n")
+        if number == killed_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(0.02)
+        if number == BROKEN:
+            raise ValueError("this method does not serve these data")
+        facts = {"dataset/kind": "spectrum", "time/train_s": 0.0}
+        (one.folder / "cell.json").write_text(json.dumps(facts))
+        return Filled(one.cell, one.folder, facts)
+
+    command.fill, claims.POLL_S = fill, 0.02
+    filled = command.fill_all(prepared, failed=folder / "failed")
+    assert [one.cell.method for one in filled] == [f"m{n}" for n in range(COUNT) if n != BROKEN]
+
+
+@pytest.mark.parametrize("killed_at", [None, 2])
+def test_every_cell_is_filled_once(tmp_path, killed_at):
+    workers = [FORK.Process(target=worker, args=(tmp_path, at)) for at in (killed_at, None)]
+    workers[0].start()
+    while killed_at is not None and workers[0].is_alive():
+        time.sleep(0.01)  # the other must not pass by its cell before
+    workers[1].start()
+    for one in workers:
+        one.join(120)
+    assert workers[0].exitcode == (0 if killed_at is None else -signal.SIGKILL) and workers[1].exitcode == 0
+    begun = sorted(map(int, (tmp_path / "begun").read_text().split()))
+    assert begun == sorted([*range(COUNT), *([] if killed_at is None else [killed_at])])
+    assert "does not serve" in (tmp_path / "failed" / f"toy-random-m{BROKEN}-k").read_text()

@@ -1,0 +1,68 @@
+"""A job of a multirun is done once; one that was cut short goes on from its own checkpoint."""
+
+from __future__ import annotations
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsparc.commands.cli import _told
+from gsparc.commands.continued import once
+from gsparc.data.claims import claimed
+from gsparc.evaluation.report.sweep import FAILURE
+
+
+def job(**settings):
+    return OmegaConf.create({"seed": 0, "ckpt_path": None, **settings})
+
+
+def cut_short(folder, name="last.ckpt"):
+    def work(config):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("state")
+        raise KeyboardInterrupt
+
+    return work
+
+
+def test_a_finished_job_returns_what_it_returned(tmp_path):
+    seen = []
+    for _ in range(2):
+        assert once(tmp_path, job(), lambda config: seen.append(config.seed) or 7.5) == 7.5
+    assert seen == [0]
+    assert once(tmp_path, job(seed=1), lambda config: seen.append(config.seed) or 8.5) == 8.5
+    assert seen == [0, 1]
+
+
+@pytest.mark.parametrize(
+    ("left", "resumed"), [("last.ckpt",) * 2, ("refit/last.ckpt",) * 2, ("fold1/last.ckpt", "")]
+)
+def test_an_interrupted_job_goes_on_and_then_counts_as_done(tmp_path, left, resumed):
+    with pytest.raises(KeyboardInterrupt):
+        once(tmp_path, job(), cut_short(tmp_path, left))
+    (tmp_path / FAILURE).write_text("of the first try")
+    seen = []
+    assert once(tmp_path, job(), lambda config: seen.append(config.ckpt_path) or 1.0) == 1.0
+    assert seen == [str(tmp_path / resumed)] and not (tmp_path / FAILURE).exists()
+    assert once(tmp_path, job(), lambda config: 2.0) == 1.0
+
+
+def test_a_checkpoint_of_other_settings_is_not_gone_on_from(tmp_path):
+    with pytest.raises(KeyboardInterrupt):
+        once(tmp_path, job(), cut_short(tmp_path))
+    with pytest.raises(RuntimeError):
+        once(tmp_path, job(seed=1), lambda config: (_ for _ in ()).throw(RuntimeError))
+    seen = []
+    once(tmp_path, job(seed=1), lambda config: seen.append(config.ckpt_path) or 1.0)
+    assert seen == [None]
+
+
+def test_a_job_that_another_process_does_is_refused(tmp_path):
+    with claimed(tmp_path / ".job.lock"), pytest.raises(ValueError, match="another process does this job"):
+        once(tmp_path, job(), lambda config: 1.0)
+
+
+def test_a_launcher_s_lost_job_is_said_with_what_to_do():
+    lost = type("UncompletedJobError", (RuntimeError,), {"__module__": "submitit.core.utils"})
+    said = _told(lost("Job 386 (task: 0) with path FILE\nhas not produced any output"))
+    assert "\n" not in said and "Job 386" in said and said.endswith("the same command goes on with the rest")
+    assert _told(ValueError("seed=x: no")) == "seed=x: no"
