@@ -80,7 +80,7 @@ def task(config: DictConfig) -> Outcome:
 
 
 def _closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
-    count = len(outcome.receivers)
+    count = len(outcome.survey)
     lines = [
         f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "
         + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),

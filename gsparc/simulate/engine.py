@@ -34,5 +34,8 @@ class Engine(Protocol):
     def versions(self) -> dict[str, str]:
         """Versions of the solver's packages."""
 
+    def fingerprint(self) -> str:
+        """Hash of the geometry, and of which material is where."""
+
     def materials(self) -> dict[str, dict[str, Any]]:
         """Material properties of the scene, for provenance and physical expectations."""

@@ -17,7 +17,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     """From above: received power, delay spread and, after `auto`, where a dropped effect mattered."""
     changed = outcome.changed
     count = 2 if changed is None else 3
-    places = outcome.receivers
+    places = outcome.survey.receivers
     extent = np.ptp(places[:, :2], axis=0)
     high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 0.9
     figure = Figure(figsize=(5.4 * count, high), layout="constrained")
@@ -37,7 +37,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         if (~reached).any():
             x, y = places[~reached, 0], places[~reached, 1]
             panel.scatter(x, y, s=size, c="lightgrey", label="nothing arrives")
-        panel.plot(*outcome.transmitter[:2], "r^", markersize=9, label="transmitter")
+        panel.plot(*outcome.survey.transmitters[:, :2].T, "r^", markersize=9, label="transmitter")
         panel.set_aspect("equal")
         panel.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,15 @@ class RayTracer:
 
         return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
 
+    def fingerprint(self) -> str:
+        """Of vertices, faces and material of every object."""
+        digest = sha256()
+        for name, thing in sorted(self._scene.objects.items()):
+            digest.update(f"{name} {thing.radio_material.name};".encode())
+            digest.update(thing.mi_mesh.vertex_positions_buffer().numpy().tobytes())
+            digest.update(thing.mi_mesh.faces_buffer().numpy().tobytes())
+        return digest.hexdigest()
+
     def materials(self) -> dict[str, dict[str, Any]]:
         """ITU name, thickness [m] and scattering coefficient of every material in use."""
         return {
@@ -126,9 +136,9 @@ class RayTracer:
     def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
-        limit = min(CANDIDATES_PER_RECEIVER * boost * len(receivers), LARGEST_BUFFER)
-        if effects.depth == 0:
-            limit = max(limit, len(receivers))
+        # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
+        batch = max(self.sampling.batch, len(receivers))
+        limit = min(CANDIDATES_PER_RECEIVER * boost * batch, LARGEST_BUFFER)
         paths = self._solve(receivers, effects, seed, limit)
         if paths is not None:
             return paths

@@ -3,6 +3,7 @@
 import json
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -185,6 +186,39 @@ def test_auto_decides_once_verifies_and_is_drawn(tmp_path):
     for draw, what in ((floor_plan, outcome), (effect_shares, choice)):
         draw(what, tmp_path / "picture.png")
         assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+def test_probes_are_rows_of_the_file_and_a_decision_is_kept(tmp_path, monkeypatch):
+    """No row is traced twice, and the next set of receivers of the same scene asks no probes."""
+    real, traced = ShoeboxEngine.trace, []
+
+    def counts(self, receivers, effects, seed=None):
+        traced.append((len(receivers), effects.depth))
+        return real(self, receivers, effects, seed)
+
+    monkeypatch.setattr(ShoeboxEngine, "trace", counts)
+    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    first = simulate(plan(effects=asked), tmp_path / "first.h5")
+    assert sum(count for count, _ in traced) == 60 and first.effects.depth < 4
+    chosen, _ = arrays(tmp_path / "first.h5")
+    simulate(plan(effects=first.effects), tmp_path / "same.h5")
+    same, _ = arrays(tmp_path / "same.h5")
+    for name in chosen:  # what probes kept of their full trace is what a run with the choice finds
+        np.testing.assert_array_equal(chosen[name], same[name], err_msg=name)
+    traced.clear()
+    again = simulate(plan(effects=asked, scene=replace(SCENE, seed=3)), tmp_path / "again.h5")
+    assert again.choice.reused and again.effects == first.effects
+    assert sum(count for count, _ in traced) == 60 and {depth for _, depth in traced} == {first.effects.depth}
+    moved = replace(SCENE, transmitter_m=(1.0, 1.4, 2.6))
+    assert not simulate(plan(effects=asked, scene=moved), tmp_path / "moved.h5").choice.reused
+    fresh = replace(asked, reuse=False)
+    assert not simulate(plan(effects=fresh), tmp_path / "fresh.h5").choice.reused
+
+
+def test_where_few_are_left_everything_is_kept(tmp_path):
+    asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
+    outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
+    assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
 
 
 @pytest.mark.parametrize("changes, words", [

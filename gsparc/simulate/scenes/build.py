@@ -16,6 +16,7 @@ from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.placement import clear_of, place
 from gsparc.simulate.shoebox import Room
 from gsparc.simulate.shoebox_engine import ShoeboxEngine
+from gsparc.simulate.survey import Survey
 
 BUILDERS = {"conference_room": conference_room}
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
@@ -88,8 +89,8 @@ def from_config(config: Mapping[str, Any]) -> SceneSettings:
     return SceneSettings(**known_keys(config, SceneSettings, "scene", "setting"))
 
 
-def build(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, np.ndarray]:
-    """The engine, and receivers (S, 3) float64 [m].
+def build(scene: SceneSettings, sampling: Sampling) -> Survey:
+    """The scene with its transmitters, and receivers.
 
     Raises:
         ValueError: no such scene, or no place for the receivers.
@@ -97,7 +98,7 @@ def build(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, np.ndarray]
     """
     engine, allowed = _engine(scene, sampling)
     receivers = place(scene.num_receivers, np.array(scene.area_m), scene.height_m, allowed, scene.seed)
-    return engine, receivers
+    return Survey([engine], receivers)
 
 
 def _engine(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, Callable[[np.ndarray], np.ndarray]]:
