@@ -109,6 +109,9 @@ def assemble(
     }
     arrays = _arrays(campaign, survey, effects, whole, paths)
     about = {**_provenance(campaign, engine, effects), **facts}
+    if survey.georeference is not None:
+        about |= {f"origin_{name}": value for name, value in asdict(survey.georeference).items()}
+    about["antennas"] = json.dumps([str(getattr(one, "antenna", "isotropic")) for one in survey.engines])
     if convergence is not None:
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
     if choice is not None:
@@ -168,6 +171,8 @@ def _ends(survey: Survey) -> dict[str, np.ndarray]:
     else:
         arrays |= {"station_position": survey.transmitters, "station": survey.station}
         arrays["station_name"] = np.array(survey.names)
+    if survey.time_s is not None:
+        arrays["time_s"] = np.tile(survey.time_s, len(survey.engines))
     return arrays
 
 

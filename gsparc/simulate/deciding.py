@@ -214,7 +214,8 @@ def _key(campaign: Campaign, settings: AutoSettings, survey: Survey) -> str:
     about: dict[str, Any] = {
         "geometry": survey.engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
         "materials": survey.engine.materials(), "versions": survey.engine.versions(), "scene": scene,
-        "asked": asked, "samples": campaign.sampling.samples, "names": survey.names,
+        "asked": asked, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
+        "samples": campaign.sampling.samples, "names": survey.names,
     }  # fmt: skip
     if settings.required.kind != "coverage":
         about |= {"csi": asdict(campaign.csi), "spectrum": asdict(campaign.spectrum)}

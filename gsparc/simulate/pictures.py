@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.campaign import Outcome
+from gsparc.simulate.engine import HasTriangles
+
+MOST_WALLS = 50_000
 
 
 def floor_plan(outcome: Outcome, path: Path) -> None:
@@ -38,6 +43,10 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
             x, y = places[~reached, 0], places[~reached, 1]
             panel.scatter(x, y, s=size, c="lightgrey", label="nothing arrives")
         panel.plot(*outcome.survey.transmitters[:, :2].T, "r^", markersize=9, label="transmitter")
+        if isinstance(outcome.survey.engine, HasTriangles):
+            limits = panel.axis()
+            walls(panel, outcome.survey.engine.triangles())
+            panel.axis(limits)
         panel.set_aspect("equal")
         panel.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
@@ -45,6 +54,35 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     title = f"{outcome.made.data.site.name}: {len(places)} receivers, {outcome.effects}"
     figure.suptitle(title, fontsize="medium")
     figure.savefig(path, dpi=110)
+
+
+def plans(scenes: Mapping[str, np.ndarray], path: Path) -> None:
+    """Scenes from above, one panel each: titles and triangles (n, 3, 3) [m]."""
+    columns = 4
+    rows = -(-len(scenes) // columns)
+    figure = Figure(figsize=(3.2 * columns, 3.0 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel in panels[len(scenes) :]:
+        panel.set_axis_off()
+    for panel, (title, triangles) in zip(panels, scenes.items(), strict=False):
+        walls(panel, triangles)
+        panel.set_title(title, fontsize="small")
+        panel.set_aspect("equal")
+        panel.tick_params(labelsize="x-small")
+        panel.autoscale()
+    figure.savefig(path, dpi=110)
+
+
+def walls(axes: Axes, triangles: np.ndarray) -> None:
+    """Upright triangles (n, 3, 3) [m] seen from above, as lines; at most `MOST_WALLS`, the longest."""
+    normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    upright = triangles[np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1).clip(1e-12)][:, :, :2]
+    ends = np.stack([upright, np.roll(upright, -1, axis=1)], axis=2)  # three sides of each
+    length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
+    longest = ends[np.arange(len(ends)), length.argmax(1)]
+    kept = np.argsort(-length.max(1, initial=0))[:MOST_WALLS]
+    axes.add_collection(LineCollection(longest[kept], colors="0.45", linewidths=0.5, zorder=0))
 
 
 def _map(
