@@ -140,6 +140,47 @@ def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
     assert about == other and len(np.unique(two["rx_position"], axis=0)) == 60
 
 
+MASTS = [{"name": "a", "position_m": [1.0, 1.5, 2.6]}, {"name": "b", "position_m": [5.0, 4.0, 2.5]}]
+
+
+def test_several_transmitters_are_stations_and_every_pair_is_there_once(tmp_path, monkeypatch):
+    """Killed and gone on with; a place is tested on with all transmitters or with none."""
+    several = replace(SCENE, transmitter_m=None, transmitters=MASTS)
+    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=3))
+    real, left = ShoeboxEngine.trace, [5]
+
+    def dies(self, receivers, *rest, **named):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return real(self, receivers, *rest, **named)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ShoeboxEngine, "trace", dies)
+        simulate(plan(scene=several, effects=asked), tmp_path / "two.h5")
+    assert (tmp_path / "two.h5.parts").exists()
+    outcome = simulate(plan(scene=several, effects=asked), tmp_path / "two.h5")
+    stored, _ = arrays(tmp_path / "two.h5")
+    pairs = np.column_stack([stored["station"], stored["rx_position"]])
+    assert len(np.unique(pairs, axis=0)) == len(pairs) == 120 and "tx_position" not in stored
+    alone = simulate(plan(effects=outcome.effects), tmp_path / "one.h5")
+    of_a, _ = arrays(tmp_path / "one.h5")
+    np.testing.assert_array_equal(stored["csi"][:60], of_a["csi"])
+    assert alone.survey.places.tolist() == outcome.survey.places.tolist()
+    read = load({"name": "sionna", "file": str(tmp_path / "two.h5"), "target": "csi"})
+    assert read.site.stations.name == ("a", "b") and read.site.static_end == "tx"
+    learn, test = (set(read.place[rows]) for rows in read.release_split)
+    assert not learn & test
+    floor_plan(outcome, tmp_path / "plan.png")
+
+
+def test_a_walk_keeps_its_times(tmp_path):
+    walk = {"kind": "trajectory", "points_m": [[0.5, 0.5], [5.5, 0.5]], "speed_m_s": 1.0, "every_s": 0.2}
+    simulate(plan(scene=replace(SCENE, receivers=walk)), tmp_path / "walk.h5")
+    stored, _ = arrays(tmp_path / "walk.h5")
+    np.testing.assert_allclose(stored["time_s"], np.arange(26) * 0.2)
+
+
 def test_parts_of_another_simulation_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(campaigns, "_trace_all", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
@@ -226,6 +267,12 @@ def test_where_few_are_left_everything_is_kept(tmp_path):
     ({"num_receivers": 3}, "at least 20"),
     ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
     ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
+    ({"transmitter_m": (9.0, 1.0)}, "three finite numbers"),
+    ({"transmitters": [{"position_m": [1, 1, 1]}]}, "not both"),
+    ({"transmitter_m": None, "transmitters": []}, "empty list"),
+    ({"transmitter_m": None, "transmitters": [{"position_m": [1, 1, 1], "sectors": 3}]}, "isotropic"),
+    ({"over": "sea"}, "expected one of zero"),
+    ({"receivers": {"knd": "grid"}}, "no such setting"),
 ])  # fmt: skip
 def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.links.georeference import Georeference, bad_degrees
 from gsparc.simulate.scenes.solid import Solid
 
 LEVEL_M = 3.0  # of a storey
@@ -84,6 +84,9 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     if not shapes:
         raise ValueError(f"scene.file={path}: no building in it; expected ways or relations with building=*")
     degrees = np.concatenate([np.array(shape.exterior.coords)[:, :2] for shape, _ in shapes])
+    fault = bad_degrees(degrees[:, 1], degrees[:, 0])
+    if fault is not None:
+        raise ValueError(f"scene.file={path}: {fault}")
     origin = Georeference.about(degrees[:, 1], degrees[:, 0])
     guesses: Counter[str] = Counter()
     meshes: dict[str, list[Any]] = {}
