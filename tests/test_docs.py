@@ -10,6 +10,7 @@ import pytest
 from hydra import compose, initialize_config_module
 
 from gsparc.commands.listing import COMMANDS
+from gsparc.commands.plugins import offer_scenes
 from gsparc.methods.registry import METHODS
 
 ROOT = Path(__file__).parents[1]
@@ -97,6 +98,7 @@ def test_commands_compose():
     """Commands, settings and choices that the documents name exist."""
     given = commands()
     assert len(given) > 30
+    offer_scenes()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         for (name, *overrides), line in given.items():
             assert compose(name, overrides), line
