@@ -165,6 +165,8 @@ def decide(
     """
     full, deliverable, reached = probe.effects, settings.required, probe.reached
     if not reached.any():
+        if not last:
+            return None
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
