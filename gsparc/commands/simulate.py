@@ -21,9 +21,11 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.effects import from_config as effects_from_config
+from gsparc.simulate.engine import HasTriangles
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
+from gsparc.simulate.scenes.mesh import write_mesh
 from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -64,6 +66,8 @@ def task(config: DictConfig) -> Outcome | None:
     outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
+    if isinstance(outcome.survey.engine, HasTriangles):
+        write_mesh(outcome.survey.engine.triangles(), run_dir / "scene.obj")
     console = open_console()
     if outcome.choice is not None:
         pictures.effect_shares(outcome.choice, run_dir / "effects.png")
