@@ -36,7 +36,7 @@ $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES) $(
 	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[dev,maps,sweep,tables]'
 	@touch $@
 
-sionna: $(VENV)/.sionna ## what `gsparc simulate` needs: Sionna and an LLVM that works with it, without root
+sionna: $(VENV)/.sionna ## what `gsparc simulate` needs: Sionna, an LLVM that works with it, without root, readers of maps
 
 $(VENV)/.docs: $(VENV)/.installed
 	@$(RUN) -c "import tomllib; print(*tomllib.load(open('pyproject.toml', 'rb'))['project']['optional-dependencies']['docs'], sep='\n')" > $(VENV)/docs.txt
@@ -54,7 +54,7 @@ wheel: setup ## a wheel that needs no compiler, into dist/, marked for the oldes
 	$(RUN) -m auditwheel repair --wheel-dir dist build/wheel/*.whl
 
 $(VENV)/.sionna: $(VENV)/.installed
-	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna
+	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna osmnx shapely trimesh mapbox_earcut
 	$(RUN) -m gsparc llvm
 	@touch $@
 

@@ -65,7 +65,9 @@ def promise(name: str, file: str, method: str, draws: list[int], folds: int = 4)
         began = time.perf_counter()
         split = {"name": "blocks", "side_m": side, "seed": draw, "share": 0.2}
         fold = split_for(split, data).folds[0]
-        context = FitContext(budget_s=30.0, budget_clock="processor", split=SplitSettings("blocks", side_m=side))
+        context = FitContext(
+            budget_s=30.0, budget_clock="processor", split=SplitSettings("blocks", side_m=side)
+        )
         fitted = for_links(lambda: make(method), data)
         fitted.fit(data, fold, context)
         fold = answerable(fitted, data, fold)

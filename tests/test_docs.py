@@ -10,7 +10,9 @@ import pytest
 from hydra import compose, initialize_config_module
 
 from gsparc.commands.listing import COMMANDS
+from gsparc.commands.plugins import offer_scenes
 from gsparc.methods.registry import METHODS
+from gsparc.simulate.scenes.shipped import shipped
 
 ROOT = Path(__file__).parents[1]
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
@@ -97,6 +99,7 @@ def test_commands_compose():
     """Commands, settings and choices that the documents name exist."""
     given = commands()
     assert len(given) > 30
+    offer_scenes()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         for (name, *overrides), line in given.items():
             assert compose(name, overrides), line
@@ -108,7 +111,9 @@ def test_commands_compose():
 )
 def test_choices_are_there(page, group):
     chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", "\n".join(said(page)))
-    assert not [name for name in chosen if not (ROOT / "conf" / group / f"{name}.yaml").exists()]
+    offered = ("help", *shipped()) if group == "scene" else ()
+    written = [name for name in chosen if name not in offered]
+    assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()]
 
 
 @TODAY

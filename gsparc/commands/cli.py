@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from gsparc.commands import job_name  # noqa: F401  # configurations name folders by it
-from gsparc.commands.plugins import offer
+from gsparc.commands.plugins import offer, offer_scenes
 from gsparc.commands.run_lock import InUse, release
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, one_line
 
@@ -46,6 +46,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     if {"--help", "-h"} & set(sys.argv[1:]):
         sys.stdout.write(_explained(task, config))  # Hydra's own list of choices and values follows
     offer()
+    if config == "simulate":
+        offer_scenes()
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))

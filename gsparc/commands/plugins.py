@@ -1,14 +1,16 @@
-"""Plugins as choices of `model=` and `dataset=`."""
+"""Plugins as choices of `model=` and `dataset=`, scenes that come with Sionna as choices of `scene=`."""
 
 from __future__ import annotations
 
 import warnings
+from importlib import resources
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
 from hydra.utils import get_class
 
 from gsparc.data.plugins import GROUPS, plugins, settings_of
+from gsparc.simulate.scenes.shipped import settings, shipped
 
 
 def offer() -> None:
@@ -26,3 +28,11 @@ def offer() -> None:
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
             node = {"_target_": path, **own, **shared}
             ConfigStore.instance().store(name=name, group=group, node=node, provider="plugin")
+
+
+def offer_scenes() -> None:
+    """Make every scene that comes with Sionna a choice of `scene=`, and `scene=help`, which lists them."""
+    written = resources.files("gsparc.conf") / "scene"
+    nodes = {name: settings(name) for name in shipped() if not (written / f"{name}.yaml").is_file()}
+    for name, node in {**nodes, "help": {"name": "help"}}.items():
+        ConfigStore.instance().store(name=name, group="scene", node=node, provider="sionna")

@@ -8,10 +8,12 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from hydra.utils import to_absolute_path
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
+from rich.table import Table
 
 from gsparc.commands.output import run_directory
 from gsparc.commands.settings import RunSettings, plain
@@ -22,13 +24,18 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.effects import from_config as effects_from_config
-from gsparc.simulate.raytracer import Sampling
+from gsparc.simulate.engine import HasTriangles
+from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.report import choice_table, figures, reasons
 from gsparc.simulate.scenes.build import from_config as scene_from_config
+from gsparc.simulate.scenes.mesh import write_mesh
+from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.settings import Campaign, CsiSettings
 from gsparc.simulate.spectrum import SpectrumSettings
 
 log = logging.getLogger(__name__)
+
+CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
 def campaign(config: DictConfig) -> Campaign:
@@ -53,9 +60,15 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 
 def task(config: DictConfig) -> Outcome | None:
-    """Simulate, then table, summary and pictures; of several jobs, in that which wrote the file."""
+    """Simulate, then table, summary and pictures, of several jobs in that which wrote the file.
+
+    `scene=help [out=FILE.png]` lists scenes.
+    """
     RunSettings.of(config)
     run_dir = run_directory()
+    if config.scene.name == "help":
+        _list_scenes(None if OmegaConf.is_missing(config, "out") else Path(str(config.out)))
+        return None
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
     outcome = simulate(campaign(config), out, shared=HydraConfig.get().mode == RunMode.MULTIRUN)
@@ -64,6 +77,8 @@ def task(config: DictConfig) -> Outcome | None:
         return None
     seconds = time.perf_counter() - begin
     pictures.floor_plan(outcome, run_dir / "floor_plan.png")
+    if isinstance(outcome.survey.engine, HasTriangles):
+        write_mesh(outcome.survey.engine.triangles(), run_dir / "scene.obj")
     console = open_console()
     if outcome.choice is not None:
         pictures.effect_shares(outcome.choice, run_dir / "effects.png")
@@ -87,8 +102,27 @@ def task(config: DictConfig) -> Outcome | None:
     return outcome
 
 
+def _list_scenes(picture: Path | None) -> None:
+    """Size, triangles and materials of every shipped scene; a plan of each in `picture` where asked."""
+    table, drawn = Table(title="scene=NAME: scenes that come with Sionna"), {}
+    for name in ("scene", "size [m]", "triangles", "materials"):
+        table.add_column(name)
+    for name in shipped():
+        tracer = RayTracer(name, np.zeros(3), CARRIER_HZ)
+        size = " x ".join(f"{side:.0f}" for side in np.ptp(tracer.box(), axis=0))
+        drawn[f"{name}, {size} m"] = tracer.triangles()
+        used = ", ".join(sorted({str(m["itu"] or n) for n, m in tracer.materials().items()}))
+        table.add_row(name, size, f"{len(tracer.triangles()):,}", used)
+    console = open_console()
+    console.print(table)
+    console.print("ours: conference_room, shoebox; your own: osm (scene.file=TOWN.osm), xml (scene.xml=FILE)")
+    if picture is not None:
+        pictures.plans(drawn, Path(to_absolute_path(str(picture))))
+        console.print(f"plans in {picture}")
+
+
 def _closing(outcome: Outcome, seconds: float, load: float) -> list[str]:
-    count = len(outcome.receivers)
+    count = len(outcome.survey)
     lines = [
         f"{count} receivers with {outcome.effects} in {seconds:.0f} s (load {load:.1f} per core): "
         + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),

@@ -42,6 +42,7 @@ FIELDS: dict[str, Field] = {
         Field("station", "(S,)", "1", "no", "which station each row is of, from 0; else a column for each"),
         Field("sensitivity_db", "() or (T,)", "dB", "no", "level below which nothing is heard: NaN is that"),
         Field("run", "(S,)", "1", "no", "name or number; channels of a run share an unknown factor"),
+        Field("time_s", "(S,)", "s", "no", "when each row was measured; kept, not read"),
         Field("spectrum", "(S, H, W)", "1", "one of", "power by direction, linear; or uint8 with 255 = 1"),
         Field("csi", "(S,), (S, K) or (S, A, K)", "1", "one of", "complex channel; (S, T, ...) of stations"),
         Field("rssi", "(S,) or (S, T)", "W", "one of", "received power, linear"),

@@ -19,9 +19,11 @@ from gsparc.simulate.paths import ARRAYS, Paths, join
 from gsparc.simulate.settings import Campaign
 from gsparc.simulate.shards import Shards
 from gsparc.simulate.spectrum import spectra
+from gsparc.simulate.survey import Survey
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
+ROWS = "rows"  # and which rows of the survey it holds
 
 
 @dataclass(frozen=True)
@@ -64,8 +66,7 @@ def shard_arrays(paths: Paths, campaign: Campaign, wavelength: float) -> dict[st
 
 def assemble(
     campaign: Campaign,
-    engine: Engine,
-    receivers: np.ndarray,
+    survey: Survey,
     effects: Effects,
     choice: Choice | None,
     convergence: Convergence | None,
@@ -75,18 +76,20 @@ def assemble(
     """Put the shards, all of them there, together, write the file, drop the shards.
 
     Args:
-        campaign, engine, receivers, effects, choice, convergence: what the file is of.
+        campaign, survey, effects, choice, convergence: what the file is of.
         seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
         shards: from where, and to which file.
 
     Raises:
         ValueError: nothing reaches any receiver.
     """
-    parts = [shards.get(n) for n in range(-(-len(receivers) // campaign.shard))]
+    parts = [shards.get(n) for n in shards.numbers()]
     seconds += sum(float(p.pop(SECONDS)) for p in parts)
-    paths = join([Paths(*(p.pop(name) for name in ("offsets", *ARRAYS))) for p in parts])
-    whole = {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
+    at = np.argsort(np.concatenate([p.pop(ROWS) for p in parts]))
+    paths = join([Paths(*(p.pop(name) for name in ("offsets", *ARRAYS))) for p in parts]).take(at)
+    whole = {name: np.concatenate([p[name] for p in parts])[at] for name in parts[0]}
     del parts
+    engine = survey.engine
     power = whole["received_power"]
     reached = power > 0
     if not reached.any():
@@ -98,12 +101,15 @@ def assemble(
         "delay_spread_ns": spread_s * 1e9,
         "bandwidth_times_delay_spread": spread_s * campaign.scene.bandwidth_hz,
         "near_field_m": near,
-        "share_in_near_field": float((np.linalg.norm(receivers - engine.transmitter, axis=1) < near).mean()),
+        "share_in_near_field": float((survey.distances() < near).mean()),
         "silent_receivers": float((~reached).sum()),
-        "paths_per_receiver": len(paths.order) / len(receivers),
+        "paths_per_receiver": len(paths.order) / len(survey),
     }
-    arrays = _arrays(campaign, engine, receivers, effects, whole, paths)
+    arrays = _arrays(campaign, survey, effects, whole, paths)
     about = {**_provenance(campaign, engine, effects), **facts}
+    if survey.georeference is not None:
+        about |= {f"origin_{name}": value for name, value in asdict(survey.georeference).items()}
+    about["antennas"] = json.dumps([str(getattr(one, "antenna", "isotropic")) for one in survey.engines])
     if convergence is not None:
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
     if choice is not None:
@@ -117,17 +123,17 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def _arrays(
-    campaign: Campaign, engine: Engine, receivers: np.ndarray, effects: Effects, whole: Arrays, paths: Paths
+    campaign: Campaign, survey: Survey, effects: Effects, whole: Arrays, paths: Paths
 ) -> dict[str, np.ndarray]:
-    scene, wavelength = campaign.scene, engine.wavelength
+    scene, wavelength = campaign.scene, survey.engine.wavelength
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
     if campaign.spectrum.normalisation == "none":
         spectrum = np.round(spectrum * (peak / peak.max())[:, None, None]).astype(np.uint8)
-    order = np.random.default_rng(scene.seed).permutation(len(receivers))
-    tests = max(1, round(scene.test_share * len(receivers)))
+    order = np.random.default_rng(scene.seed).permutation(len(survey.places))
+    tests = max(1, round(scene.test_share * len(order)))
+    each = np.arange(len(survey.engines))[:, None] * len(order)  # a place is held out with all transmitters
     arrays = {
-        "rx_position": receivers,
-        "tx_position": engine.transmitter,
+        **_ends(survey),
         "spectrum": spectrum,
         "spectrum_peak": peak,
         "frequency_hz": scene.frequency_hz,
@@ -136,8 +142,8 @@ def _arrays(
         **{f"path_{name}": getattr(paths, name) for name in STORED},
         "path_gain": paths.gain[:, 0] if paths.gain.shape[1] == 1 else paths.gain,
         "line_of_sight": paths.per_receiver((paths.order == 0).astype(float)) > 0,
-        "split_train": np.sort(order[tests:]),
-        "split_test": np.sort(order[:tests]),
+        "split_train": np.sort((order[tests:] + each).ravel()),
+        "split_test": np.sort((order[:tests] + each).ravel()),
     }
     if effects.noise_snr_db is not None:
         variance = float(np.mean(np.abs(csi) ** 2) / 10 ** (effects.noise_snr_db / 10))
@@ -151,6 +157,20 @@ def _arrays(
         elements = campaign.csi.elements(wavelength)
         # one row per channel: with two polarisations every place is there twice
         arrays["csi_array_position"] = np.tile(elements, (csi.shape[1] // len(elements), 1))
+    return arrays
+
+
+def _ends(survey: Survey) -> dict[str, np.ndarray]:
+    """Positions in the schema of one transmitter, or of several stations."""
+    one = len(survey.engines) == 1
+    arrays = {"rx_position": survey.receivers}
+    if one:
+        arrays["tx_position"] = survey.engine.transmitter
+    else:
+        arrays |= {"station_position": survey.transmitters, "station": survey.station}
+        arrays["station_name"] = np.array(survey.names)
+    if survey.time_s is not None:
+        arrays["time_s"] = np.tile(survey.time_s, len(survey.engines))
     return arrays
 
 

@@ -89,8 +89,31 @@ class Probe:
     nearest: Paths | None = None
 
     @cached_property
+    def _kinds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Kinds of paths, by interactions and order (C, 2), and the kind (P,) of each path.
+
+        Every question sums over kinds: paths are gone through once, however many sets of effects are asked.
+        """
+        kinds = np.stack([self.paths.mechanisms, self.paths.order], axis=1)
+        return np.unique(kinds, axis=0, return_inverse=True)
+
+    @cached_property
+    def _power(self) -> np.ndarray:
+        """(ports, C, R)."""
+        kinds, which = self._kinds
+        power, count = np.abs(self.paths.gain.astype(np.complex128)) ** 2, len(self.paths)
+        cell = which.reshape(-1) * count + self.paths.owner
+        return np.stack([
+            np.bincount(cell, weights=one, minlength=len(kinds) * count).reshape(-1, count) for one in power.T
+        ])  # fmt: skip
+
+    @cached_property
     def _channels(self) -> np.ndarray:
-        return self._channel(self.effects)
+        """(C, R, ports x M, K)."""
+        kinds, which = self._kinds
+        parts = (self.paths.select(which.reshape(-1) == i) for i in range(len(kinds)))
+        asked = self.frequency_hz, self.elements, self.wavelength
+        return np.stack([part.responses(*asked) for part in parts])
 
     @cached_property
     def _images(self) -> tuple[np.ndarray, np.ndarray]:
@@ -106,12 +129,13 @@ class Probe:
 
     def shares(self, kept: Effects) -> np.ndarray:
         """Share of each receiver's power that is lost (R,)."""
-        full = self.paths.received_power()
-        return 1 - self.paths.under(kept).received_power() / np.where(full > 0, full, 1)
+        full, ports = self._power.sum((0, 1)), len(self._power) if kept.polarisation else 1
+        return 1 - self._power[:ports, self._allowed(kept)].sum((0, 1)) / np.where(full > 0, full, 1)
 
     def nmse(self, kept: Effects) -> np.ndarray:
         """NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
-        full, rest = self._channels, self._channel(kept)
+        full, rest = self._channels.sum(0), self._channels[self._allowed(kept)].sum(0)
+        rest = rest if kept.polarisation else rest[:, : len(self.elements)]
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         error += (np.abs(full[:, rest.shape[1] :]) ** 2).sum((1, 2))
         energy = (np.abs(full) ** 2).sum((1, 2))
@@ -129,8 +153,8 @@ class Probe:
         error, rival = (((image - full) ** 2).mean((1, 2)) for image in (left, near))
         return error / np.maximum(rival, 1e-12)
 
-    def _channel(self, kept: Effects) -> np.ndarray:
-        return self.paths.under(kept).responses(self.frequency_hz, self.elements, self.wavelength)
+    def _allowed(self, kept: Effects) -> np.ndarray:
+        return kept.allows(*self._kinds[0].T)
 
     def _render(self, paths: Paths) -> np.ndarray:
         return spectra(paths, self.spectrum, self.frequency_hz, self.wavelength)[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -14,13 +13,19 @@ from scipy.stats import binom
 
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.engine import Engine
 
 log = logging.getLogger(__name__)
 
-TIMED = 48  # probes that times are measured on
-REPEATS = 2
-TIMING_NOISE = 0.1  # a competing process moves a measured time by more than this
+# Share of a trace's processor time that goes with an effect, in the conference room and the street canyon
+# (docs/simulate.md). It ranks sets of effects; what a choice saves is measured on the rows of the file.
+PRICE = {
+    "line_of_sight": 0.0, "specular": 0.1, "refraction": 0.0, "diffraction": 0.25, "edge_diffraction": 0.08,
+    "diffuse": 0.05, "polarisation": 0.01,
+}  # fmt: skip
+BOUNCES = 0.75  # and with the bounces, to equal parts
+SIMILAR = 0.1  # of prices, within which the set of fewer effects is taken
+FIRST_LOOK = 0.5  # share of the probes
+SPENT = 1 / 3  # of the permitted probability of error, at the first look
 
 
 @dataclass(frozen=True)
@@ -30,9 +35,10 @@ class AutoSettings:
     Attributes:
         deliverable: the requirement, as text (`attribution.Deliverable.parse`).
         quantile: share of receivers for which it must hold.
-        probes: receivers the decision is measured on, at least 16, spread out.
+        probes: receivers the decision is measured on at most, at least 16, spread out.
         confidence: with which the quantile must follow from them (`allowed_failures`).
-        held_back: other receivers on which the choice is then verified.
+        held_back: other receivers on which the choice is then verified, at most.
+        reuse: whether a decision for the same scene, transmitters, area, band and requirement is taken over.
         full: what "everything on" means.
     """
 
@@ -41,6 +47,7 @@ class AutoSettings:
     probes: int = 128
     confidence: float = 0.85
     held_back: int = 128
+    reuse: bool = True
     full: Effects = field(default_factory=lambda: Effects(depth=5))
 
     def __post_init__(self) -> None:
@@ -49,6 +56,11 @@ class AutoSettings:
         if not 0 < self.confidence < 1:
             raise ValueError(f"effects.confidence={self.confidence}: expected a share between 0 and 1")
         Deliverable.parse(self.deliverable, self.quantile)
+
+    @property
+    def required(self) -> Deliverable:
+        """The requirement."""
+        return Deliverable.parse(self.deliverable, self.quantile)
 
 
 @dataclass(frozen=True)
@@ -61,9 +73,9 @@ class EffectRow:
         share_p95: its 95th percentile over the receivers.
         nmse, nmse_p95: of the channel, median and 95th percentile.
         error, error_p95: of the deliverable, likewise.
-        seconds: CPU time of tracing `TIMED` probes without it [s].
+        failures: probes beyond the tolerance.
         reason: expectation from physics; empty where there is none.
-        kept: whether it is simulated.
+        kept: whether the requirement needs it.
     """
 
     effect: str
@@ -73,7 +85,7 @@ class EffectRow:
     nmse_p95: float
     error: float
     error_p95: float
-    seconds: float
+    failures: int
     reason: str
     kept: bool
 
@@ -101,26 +113,31 @@ class Choice:
     """The decision of `auto` and the measurements behind it.
 
     Attributes:
-        effects: to simulate.
+        effects: that the requirement needs.
         deliverable: the requirement, as text.
         table: one row per effect.
-        seconds_all, seconds_chosen: the same with everything and with the choice [s].
-        seconds: what deciding cost in all [s].
+        probes: receivers that it took.
+        seconds: that deciding took, tracing the probes included, which are rows of the file [s].
+        row_all, row_chosen: CPU seconds of a row with everything and with the choice, compiling excluded;
+            None where none was traced so.
         verdict: filled by `verify`.
+        reused: whether it was taken over from an earlier run.
     """
 
     effects: Effects
     deliverable: str
     table: tuple[EffectRow, ...]
-    seconds_all: float
-    seconds_chosen: float
-    seconds: float
+    probes: int
+    seconds: float = 0.0
+    row_all: float | None = None
+    row_chosen: float | None = None
     verdict: Verification | None = None
+    reused: bool = False
 
     @property
-    def saved(self) -> float:
-        """Share of the tracing time that the choice saves against everything."""
-        return 1 - self.seconds_chosen / self.seconds_all if self.seconds_all > 0 else 0.0
+    def saved(self) -> float | None:
+        """Share of the tracing time that the choice saves against everything; None where not measured."""
+        return None if not (self.row_all and self.row_chosen) else 1 - self.row_chosen / self.row_all
 
     @staticmethod
     def from_dict(stored: Mapping[str, Any]) -> Choice:
@@ -133,42 +150,42 @@ class Choice:
 
 
 def decide(
-    engine: Engine,
-    receivers: np.ndarray,
-    settings: AutoSettings,
-    probe: Probe,
-    explain: Callable[[Probe], Mapping[str, str]],
-) -> Choice:
-    """Measure on `receivers` (R, 3) [m] and choose the cheapest effects that meet the requirement.
+    probe: Probe, settings: AutoSettings, explain: Callable[[Probe], Mapping[str, str]], last: bool = True
+) -> Choice | None:
+    """The cheapest effects that meet the requirement; None where more probes are needed to say.
 
     Args:
-        engine: traces.
-        receivers: the probes.
+        probe: receivers traced with everything: the first look's, or all probes.
         settings: requirement and confidence.
-        probe: the same receivers traced with everything.
         explain: prior reasons by effect.
+        last: whether these are all probes, so that an effect that is not clearly out stays in.
+
+    Raises:
+        ValueError: nothing reaches any of them.
     """
-    begin = time.perf_counter()
-    full = probe.effects
-    deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
-    reached = probe.reached
+    full, deliverable, reached = probe.effects, settings.required, probe.reached
     if not reached.any():
+        if not last:
+            return None
         raise ValueError(
             "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
         )
+    heard = int(reached.sum())
+    first, all_ = (first_look(heard), heard) if last else (heard, round(heard / FIRST_LOOK))
+    early, late = allowed_failures(first, all_, settings.quantile, settings.confidence)
+    most = late if last else early
     dropped = removals(full)
     errors = {name: probe.errors(kept, deliverable)[reached] for name, kept in dropped.items()}
-    failures = allowed_failures(int(reached.sum()), settings.quantile, settings.confidence)
+    failures = {name: int((error > deliverable.tolerance).sum()) for name, error in errors.items()}
+    removable = tuple(name for name, failed in failures.items() if failed <= most)
+    if not last and any(most < failed <= late for failed in failures.values()):
+        return None
+    sets = sorted(combinations(full, removable), key=lambda some: price(some, full))
 
-    def holds(error: np.ndarray) -> bool:
-        return bool((error > deliverable.tolerance).sum() <= failures)
+    def holds(some: Effects) -> bool:
+        return bool((probe.errors(some, deliverable)[reached] > deliverable.tolerance).sum() <= most)
 
-    removable = tuple(name for name, error in errors.items() if holds(error))
-    timed = receivers[:TIMED]
-    seconds_all = _timed(engine, timed, full)
-    seconds = {name: _timed(engine, timed, less) for name, less in dropped.items()}
-    costs = {s: _estimate(s, full, seconds, seconds_all) for s in combinations(full, removable)}
-    chosen = _cheapest(costs, lambda some: holds(probe.errors(some, deliverable)[reached]), full)
+    chosen = _cheapest(sets, holds, full)
     why, table = explain(probe), []
     for name, less in dropped.items():
         share, nmse, error = probe.shares(less)[reached], probe.nmse(less)[reached], errors[name]
@@ -176,65 +193,67 @@ def decide(
         kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, name))
         table.append(EffectRow(
             name, float(share.mean()), _p95(share), float(np.median(nmse)), _p95(nmse),
-            float(np.median(error)), _p95(error), seconds[name], why.get(effect, ""), kept,
+            float(np.median(error)), _p95(error), failures[name], why.get(effect, ""), kept,
         ))  # fmt: skip
-    seconds_chosen = seconds_all if chosen == full else _timed(engine, timed, chosen)
-    return Choice(
-        chosen, str(deliverable), tuple(table), seconds_all, seconds_chosen, time.perf_counter() - begin
-    )
+    return Choice(chosen, str(deliverable), tuple(table), len(reached))
 
 
 def verify(choice: Choice, settings: AutoSettings, held_back: Probe) -> Choice:
     """The choice with its verification on held-back receivers, by path attribution in a full run."""
-    deliverable = Deliverable.parse(settings.deliverable, settings.quantile)
+    deliverable = settings.required
     errors = held_back.errors(choice.effects, deliverable)[held_back.reached]
+    if not len(errors):
+        return choice
     met = float((errors <= deliverable.tolerance).mean())
     kept = met >= deliverable.quantile
     verdict = Verification(len(errors), met, float(np.median(errors)), _p95(errors), kept)
     return replace(choice, verdict=verdict)
 
 
-def allowed_failures(probes: int, quantile: float, confidence: float) -> int:
-    """Most probes that may exceed the tolerance while the requirement still follows.
+def first_look(receivers: int) -> int:
+    """How many of so many receivers are looked at first."""
+    return math.ceil(FIRST_LOOK * receivers)
 
-    The largest c with P(Binomial(probes, 1 - quantile) <= c) <= 1 - confidence: were it violated, so few
-    failures would be that unlikely. 0 where even none proves nothing (too few probes).
+
+def allowed_failures(first: int, all_: int, quantile: float, confidence: float) -> tuple[int, int]:
+    """Most receivers beyond the tolerance, at the first look and among all, for the requirement to follow.
+
+    A test in two stages: were the requirement violated, it would pass one of them with a probability of at
+    most 1 - confidence, a third of which the first look spends (exact binomial probabilities; the first look
+    has -1 where it proves nothing). 0 at the last look where even none proves nothing.
     """
-    return max(0, int(binom.ppf(1 - confidence, probes, 1 - quantile)) - 1)
+    wrong, risk = 1 - quantile, 1 - confidence
+    early = int(binom.ppf(risk * SPENT, first, wrong))
+    early -= binom.cdf(early, first, wrong) > risk * SPENT
+
+    def passes(late: int) -> float:
+        between = np.arange(early + 1, late + 1)
+        rest = binom.pmf(between, first, wrong) * binom.cdf(late - between, all_ - first, wrong)
+        return float(binom.cdf(early, first, wrong) + rest.sum())
+
+    late = max(early, 0)
+    while late < all_ and passes(late + 1) <= risk:
+        late += 1
+    return int(early), late
 
 
-def _cheapest(costs: Mapping[Effects, float], holds: Callable[[Effects], bool], full: Effects) -> Effects:
-    """The cheapest set that meets the requirement; of sets with similar costs, the smallest."""
+def price(some: Effects, full: Effects) -> float:
+    """Expected time of tracing with `some`, 1 with everything."""
+    off = [name for name in full.on if name not in some.on]
+    off += ["polarisation"] if full.polarisation and not some.polarisation else []
+    bounces = 1 - BOUNCES + BOUNCES * some.depth / max(full.depth, 1)
+    return bounces * math.prod(1 - PRICE[name] for name in off)
+
+
+def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effects) -> Effects:
+    """The cheapest set that meets the requirement; of sets with similar prices, the smallest."""
     found: list[Effects] = []
-    for some in sorted(costs, key=lambda s: costs[s]):
-        if found and costs[some] > (1 + TIMING_NOISE) * costs[found[0]]:
+    for some in sets:
+        if found and price(some, full) > (1 + SIMILAR) * price(found[0], full):
             break
         if holds(some):
             found.append(some)
-    return min(found, key=lambda s: (len(s.on), s.polarisation, s.depth, costs[s]), default=full)
-
-
-def _timed(engine: Engine, receivers: np.ndarray, effects: Effects) -> float:
-    """CPU seconds of a warm trace, the best of `REPEATS`; the first compiles."""
-    engine.trace(receivers, effects)
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.process_time()
-        engine.trace(receivers, effects)
-        seconds.append(time.process_time() - start)
-    return min(seconds)
-
-
-def _estimate(some: Effects, full: Effects, seconds: Mapping[str, float], everything: float) -> float:
-    """Seconds of a combination, as if what each removal saves multiplied; the choice itself is then timed.
-
-    Leaving an effect out never costs time: a measurement that says so is noise.
-    """
-    saved = [f"depth > {some.depth}"] if some.depth < full.depth else []
-    saved += [name for name in full.on if name in seconds and name not in some.on]
-    if full.polarisation and not some.polarisation:
-        saved.append("polarisation")
-    return everything * math.prod(min(seconds[name] / everything, 1.0) for name in saved)
+    return min(found, key=lambda s: (len(s.on), s.polarisation, s.depth), default=full)
 
 
 def _p95(values: np.ndarray) -> float:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
-from gsparc.simulate.attribution import Probe
+from gsparc.simulate.paths import Paths
+from gsparc.simulate.settings import Campaign
 from gsparc.simulate.spectrum import spectra
 
 
@@ -33,11 +34,30 @@ class Convergence:
         return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
 
 
-def compare(first: Probe, second: Probe) -> Convergence:
-    """How far two runs of the same receivers are apart."""
-    channels = [p.paths.responses(p.frequency_hz, p.elements, p.wavelength) for p in (first, second)]
-    nmse = float((np.abs(channels[0] - channels[1]) ** 2).sum() / (np.abs(channels[0]) ** 2).sum())
-    images = [spectra(p.paths, p.spectrum, p.frequency_hz, p.wavelength)[0] for p in (first, second)]
+def compare(
+    csi: np.ndarray,
+    spectrum: np.ndarray,
+    peak: np.ndarray,
+    again: Paths,
+    campaign: Campaign,
+    wavelength: float,
+) -> Convergence:
+    """How far receivers of a file are from the same under another seed.
+
+    Args:
+        csi: (n, A, K) of the file, without noise.
+        spectrum, peak: (n, H, W) uint8 and (n,) of the file.
+        again: the same receivers traced again.
+        campaign: band, arrays and spectra.
+        wavelength: at the carrier [m].
+    """
+    frequency = campaign.scene.frequency_hz
+    other = again.responses(frequency, campaign.csi.elements(wavelength), wavelength)
+    energy = max(float((np.abs(csi) ** 2).sum()), np.finfo(float).tiny)
+    nmse = float((np.abs(csi - other) ** 2).sum() / energy)
+    # Each image by its own largest value, or all by the largest of these receivers.
+    share = 1.0 if campaign.spectrum.normalisation == "max" else (peak / peak.max())[:, None, None]
+    images = [spectrum / 255 * share, spectra(again, campaign.spectrum, frequency, wavelength)[0]]
     squared = ((images[0] - images[1]) ** 2).mean((1, 2))
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
     return Convergence(

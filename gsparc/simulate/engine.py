@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import Paths
+
+
+@runtime_checkable
+class HasTriangles(Protocol):
+    """Its objects are triangles."""
+
+    def triangles(self) -> np.ndarray:
+        """(n, 3, 3) [m] of all objects."""
 
 
 class Engine(Protocol):
@@ -33,6 +41,9 @@ class Engine(Protocol):
 
     def versions(self) -> dict[str, str]:
         """Versions of the solver's packages."""
+
+    def fingerprint(self) -> str:
+        """Hash of the geometry, and of which material is where."""
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Material properties of the scene, for provenance and physical expectations."""

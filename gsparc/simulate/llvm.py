@@ -16,9 +16,13 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from functools import lru_cache
+from hashlib import sha256
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from rich.console import Console
+
+from gsparc.data.files import platform_cache, whole_file
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 FETCHED = Path(sys.prefix) / "lib" / "llvm19" / "libLLVM.so.19.1"
@@ -63,13 +67,35 @@ def fault(library: Path) -> str | None:
     """
     if not library.exists():
         return "no such file"
+    seal = _seal(library)
+    if seal.exists():
+        return None
     environment = {**os.environ, VARIABLE: str(library)}
     solve = [sys.executable, "-c", TINY_SOLVE]
     tried = subprocess.run(solve, env=environment, capture_output=True, text=True, timeout=300)
     lines = tried.stderr.strip().splitlines() or ["no message"]
     words = next((line for line in lines if "LLVM" in line), lines[-1]).strip()
+    if tried.returncode == 0:
+        with whole_file(seal) as partial:
+            partial.touch()
+        return None
     died = f"killed by signal {-tried.returncode}" if tried.returncode < 0 else f"exit {tried.returncode}"
-    return f"a tiny solve failed ({died}: {words[:160]})" if tried.returncode else None
+    return f"a tiny solve failed ({died}: {words[:160]})"
+
+
+def _seal(library: Path) -> Path:
+    """An empty file that is there once a solve worked with this library and these versions of the solver."""
+    stat = library.stat()
+    parts = [str(library.resolve()), stat.st_mtime_ns, stat.st_size, sys.executable]
+    parts += [_version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
+    return platform_cache() / "llvm" / sha256(repr(parts).encode()).hexdigest()[:32]
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
 
 
 def prepare(fetch_missing: bool = False) -> Path:

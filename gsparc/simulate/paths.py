@@ -48,6 +48,13 @@ class Paths:
         counts = np.bincount(self.owner[kept], minlength=len(self))
         return Paths(starts(counts), *(getattr(self, name)[kept] for name in ARRAYS))
 
+    def take(self, receivers: np.ndarray) -> Paths:
+        """Receivers (n,) alone, in this order."""
+        counts = np.diff(self.offsets)[receivers]
+        first = np.repeat(self.offsets[receivers] - starts(counts)[:-1], counts)
+        rows = first + np.arange(counts.sum())
+        return Paths(starts(counts), *(getattr(self, name)[rows] for name in ARRAYS))
+
     def under(self, effects: Effects) -> Paths:
         """What remains of a full simulation under these switches."""
         kept = self.select(effects.allows(self.mechanisms, self.order))

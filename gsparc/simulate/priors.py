@@ -11,18 +11,17 @@ from gsparc.simulate.attribution import Probe
 
 
 def reasons(
-    probe: Probe, transmitter: np.ndarray, receivers: np.ndarray, materials: Mapping[str, Mapping[str, Any]]
+    probe: Probe, distances: np.ndarray, materials: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, str]:
     """Why an effect should or should not matter, by its name; absent where there is no short one.
 
     Args:
         probe: everything on.
-        transmitter: (3,) [m].
-        receivers: (R, 3) [m], those of the probe.
+        distances: (R,) [m] between the ends.
         materials: of the scene; `permittivity`, `thickness_m` and `scattering` are read where given.
     """
     wavelength, paths = probe.wavelength, probe.paths
-    distance = float(np.median(np.linalg.norm(receivers - transmitter, axis=1)))
+    distance = float(np.median(distances))
     sight = paths.per_receiver((paths.order == 0).astype(float)) > 0
     zone = f"first Fresnel zone {np.sqrt(wavelength * distance) / 2:.2g} m wide at {distance:.3g} m"
     rough = [m["scattering"] ** 2 for m in materials.values() if m.get("scattering")]

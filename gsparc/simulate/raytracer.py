@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +21,16 @@ from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
 from gsparc.simulate.paths import ARRAYS, Paths, join
+from gsparc.simulate.scenes.shipped import shipped
 from gsparc.simulate.scenes.solid import Solid
+from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
 
 log = logging.getLogger(__name__)
 
 CANDIDATES_PER_RECEIVER = 20_000
 # Two tables of this, 512 MB; Sionna's own (1e6 at least) loses a tenth of the paths of 200 receivers.
 HASHES = 64_000_000
+GROUND_LEVEL = 0.7  # least share of the ground's area that is level
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
 MATERIALS = {  # thickness [m] and scattering coefficient, where a scene gives none
     "concrete": (0.20, 0.20), "brick": (0.12, 0.25), "plasterboard": (0.025, 0.10), "wood": (0.03, 0.15),
@@ -60,6 +65,7 @@ class RayTracer:
         carrier_hz: [Hz].
         sampling: effort of the solver.
         scattering: scattering coefficient of all materials instead of `MATERIALS`; None for those.
+        antenna: of the transmitter.
 
     Raises:
         SimulatorMissing: no Sionna, or no LLVM that works.
@@ -76,15 +82,22 @@ class RayTracer:
         carrier_hz: float,
         sampling: Sampling = Sampling(),
         scattering: float | None = None,
+        antenna: Antenna = ISOTROPIC,
     ) -> None:
         llvm.prepare()
         self.sampling = sampling
         self.wavelength = LIGHT / carrier_hz
         self._scene = _load(source, carrier_hz, scattering)
-        self.transmitter = np.asarray(transmitter, dtype=np.float64)
-        self._ports = 0
+        self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
+        self._arrays: list[tuple[int, str]] = []  # what the scene's antennas are, shared by `at`
         self.retried = 0  # batches traced again because candidates were cut off
         self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
+
+    def at(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
+        """The same scene with the transmitter elsewhere."""
+        other = copy(self)
+        other.transmitter, other.antenna = np.asarray(transmitter, dtype=np.float64), antenna
+        return other
 
     def supported(self, effects: Effects) -> Effects:
         """Everything."""
@@ -95,6 +108,15 @@ class RayTracer:
         from importlib.metadata import version
 
         return {name: version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+
+    def fingerprint(self) -> str:
+        """Of vertices, faces and material of every object."""
+        digest = sha256()
+        for name, thing in sorted(self._scene.objects.items()):
+            digest.update(f"{name} {thing.radio_material.name};".encode())
+            digest.update(thing.mi_mesh.vertex_positions_buffer().numpy().tobytes())
+            digest.update(thing.mi_mesh.faces_buffer().numpy().tobytes())
+        return digest.hexdigest()
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """ITU name, thickness [m] and scattering coefficient of every material in use."""
@@ -126,9 +148,9 @@ class RayTracer:
     def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
-        limit = min(CANDIDATES_PER_RECEIVER * boost * len(receivers), LARGEST_BUFFER)
-        if effects.depth == 0:
-            limit = max(limit, len(receivers))
+        # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
+        batch = max(self.sampling.batch, len(receivers))
+        limit = min(CANDIDATES_PER_RECEIVER * boost * batch, LARGEST_BUFFER)
         paths = self._solve(receivers, effects, seed, limit)
         if paths is not None:
             return paths
@@ -176,17 +198,23 @@ class RayTracer:
         import mitsuba as mi
         import sionna.rt as rt
 
-        scene = self._scene
-        if ports != self._ports:
+        scene, wanted = self._scene, (ports, self.antenna.pattern)
+        if self._arrays != [wanted]:
 
-            def one(polarisation: str) -> Any:
-                return rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarisation)
+            def one(pattern: str, polarisation: str) -> Any:
+                return rt.PlanarArray(num_rows=1, num_cols=1, pattern=pattern, polarization=polarisation)
 
-            scene.tx_array, scene.rx_array, self._ports = one("V"), one("V" if ports == 1 else "VH"), ports
+            scene.tx_array = one(self.antenna.pattern, "V")
+            scene.rx_array = one("iso", "V" if ports == 1 else "VH")
+            self._arrays[:] = [wanted]
         for name in list(scene.receivers):
             scene.remove(name)
         if not scene.transmitters:
-            scene.add(rt.Transmitter("tx", position=mi.Point3f(*map(float, self.transmitter))))
+            scene.add(rt.Transmitter("tx", position=mi.Point3f(0, 0, 0)))
+        tx = scene.get("tx")
+        tx.position = mi.Point3f(*map(float, self.transmitter))
+        turn = np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0])
+        tx.orientation = mi.Point3f(*map(float, turn))
         for i, place in enumerate(receivers):
             scene.add(rt.Receiver(f"rx{i}", position=mi.Point3f(*map(float, place))))
 
@@ -199,14 +227,66 @@ class RayTracer:
         axes = np.concatenate([np.eye(3), -np.eye(3)])
         return np.all([self._distance(points, axis) > gap for axis in axes], axis=0)
 
+    def triangles(self) -> np.ndarray:
+        """(n, 3, 3) [m] of all objects."""
+        return np.concatenate([corners for corners in self._objects().values()])
+
+    def box(self) -> np.ndarray:
+        """(2, 3) lower and upper corner of everything [m]."""
+        corners = self.triangles().reshape(-1, 3)
+        return np.stack([corners.min(0), corners.max(0)])
+
+    def _objects(self) -> dict[str, np.ndarray]:
+        """Triangles (n, 3, 3) of each object."""
+        found = {}
+        for name, thing in self._scene.objects.items():
+            vertices = thing.mi_mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
+            found[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
+        return found
+
+    def surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Highest surface (n,) [m] at places (n, 2) [m], -inf where there is none, and whether it is ground.
+
+        The ground is the widest object whose area is mostly level; without one all is.
+        """
+        import mitsuba as mi
+
+        top = self.box()[1, 2] + 1.0
+        above = np.column_stack([across, np.full(len(across), top)])
+        hit = self._hit(above, np.array([0.0, 0.0, -1.0]))
+        ground, height = self._ground(), top - hit.t.numpy().astype(np.float64)
+        if ground is None:
+            return height, np.isfinite(height)
+        # Mitsuba compares shapes by pointer.
+        shape = mi.ShapePtr(self._scene.objects[ground].mi_mesh)
+        return height, (hit.shape == shape).numpy()
+
+    def _ground(self) -> str | None:
+        widest, size = None, 0.0
+        for name, corners in self._objects().items():
+            normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            level, area = np.abs(normal[:, 2]).sum(), np.linalg.norm(normal, axis=1).sum()
+            if level > GROUND_LEVEL * area and level > size:
+                widest, size = name, float(level)
+        return widest
+
+    def has_open_sky(self, area: np.ndarray) -> bool:
+        """Whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low."""
+        low, top = self.box()[:, 2]
+        height = self.surface(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))[0]
+        return bool((height[np.isfinite(height)] < (low + top) / 2).mean() > 0.05)
+
     def _distance(self, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
+        return self._hit(points, direction).t.numpy()
+
+    def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:
         import mitsuba as mi
 
         origin = mi.Point3f(
             *(mi.Float(np.ascontiguousarray(points[:, i], dtype=np.float32)) for i in range(3))
         )
         ray = mi.Ray3f(origin, mi.Vector3f(*map(float, direction)))
-        return self._scene.mi_scene.ray_intersect(ray).t.numpy()
+        return self._scene.mi_scene.ray_intersect(ray)
 
 
 class _CountingGenerator:
@@ -282,7 +362,7 @@ def _load_file(source: str | Path) -> Any:
         except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
             first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
             raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
-    known = sorted(n for n in dir(rt.scene) if str(getattr(rt.scene, n)).endswith(".xml"))
+    known = shipped()
     if source not in known:
         raise ValueError(f"scene.builtin={source}: Sionna has no such scene; there are {', '.join(known)}")
     return rt.load_scene(getattr(rt.scene, str(source)))

@@ -14,14 +14,14 @@ def choice_table(choice: Choice) -> Table:
     """A row per effect: its share of power, errors without it, its cost, kept or dropped."""
     table = Table(title=f"requirement: {choice.deliverable}", caption=verdict(choice), caption_justify="left")
     table.add_column("left out")
-    for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "CPU s"):
+    for name in ("power %", "p95", "NMSE", "p95", "error", "p95", "probes off"):
         table.add_column(name, justify="right")
     table.add_column("")
     for row in choice.table:
         table.add_row(
             row.effect.replace("_", " "),
             f"{row.share:.1%}", f"{row.share_p95:.1%}", f"{row.nmse:.2g}", f"{row.nmse_p95:.2g}",
-            f"{row.error:.2g}", f"{row.error_p95:.2g}", f"{row.seconds:.1f}",
+            f"{row.error:.2g}", f"{row.error_p95:.2g}", str(row.failures),
             "kept" if row.kept else "dropped",
             style="bold" if row.kept else None,
         )  # fmt: skip
@@ -36,10 +36,12 @@ def reasons(choice: Choice) -> list[str]:
 
 def verdict(choice: Choice) -> str:
     """What was chosen, what it saves, and whether the requirement is met on held-back receivers."""
-    chosen = (
-        f"simulated: {choice.effects}; tracing takes {choice.seconds_chosen:.1f} CPU s instead of "
-        f"{choice.seconds_all:.1f} on the probes ({choice.saved:.0%} saved)"
-    )
+    chosen = f"needed: {choice.effects}" + (", as decided before" if choice.reused else "")
+    if choice.saved is not None and choice.row_chosen and choice.row_all:
+        chosen += (
+            f"; a receiver takes {choice.row_chosen * 1e3:.0f} CPU ms instead of {choice.row_all * 1e3:.0f} "
+            f"({choice.saved:.0%} saved)"
+        )
     found = choice.verdict
     if found is None:
         return chosen
@@ -56,11 +58,12 @@ def figures(outcome: Outcome) -> dict[str, Any]:
     facts: dict[str, Any] = {
         "dataset/name": made.data.site.name,
         "dataset/sha256": made.data.site.sha256,
-        "dataset/receivers": len(outcome.receivers),
+        "dataset/receivers": len(outcome.survey.places),
+        "dataset/rows": len(outcome.survey),
         "effects": str(outcome.effects),
         **{f"scene/{name}": value for name, value in made.facts.items()},
         **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
-        "time/receivers_per_s": len(outcome.receivers) / max(outcome.seconds["trace"], 1e-9),
+        "time/receivers_per_s": len(outcome.survey) / max(outcome.seconds["trace"], 1e-9),
     }
     if outcome.convergence is not None:
         facts["dataset/convergence_error"] = outcome.convergence.nmse
@@ -71,12 +74,12 @@ def figures(outcome: Outcome) -> dict[str, Any]:
             "auto/decide_s": choice.seconds,
             **{
                 f"auto/{k}": getattr(choice, k)
-                for k in ("deliverable", "seconds_all", "seconds_chosen", "saved")
+                for k in ("deliverable", "probes", "row_all", "row_chosen", "saved", "reused")
             },
         }
         for row in choice.table:
             name = row.effect.replace(" > ", "_over_")
-            for k in ("share", "nmse", "nmse_p95", "error_p95", "seconds", "kept"):
+            for k in ("share", "nmse", "nmse_p95", "error_p95", "failures", "kept"):
                 facts[f"auto/{name}/{k}"] = getattr(row, k)
         if choice.verdict is not None:
             facts |= {f"auto/verdict/{k}": v for k, v in vars(choice.verdict).items()}

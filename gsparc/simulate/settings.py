@@ -67,9 +67,3 @@ class Campaign:
             raise ValueError("shard is at least 1, check at least 0")
         if self.check_seed == self.sampling.seed:
             raise ValueError("check_seed must differ from sampling.seed")
-        auto = self.effects
-        if isinstance(auto, AutoSettings) and self.scene.num_receivers < auto.probes + auto.held_back:
-            raise ValueError(
-                f"effects=auto needs {auto.probes} + {auto.held_back} receivers, the scene has "
-                f"{self.scene.num_receivers}; lower effects.probes and effects.held_back (16 at least)"
-            )

@@ -81,10 +81,14 @@ class Shards:
         with whole_file(self.path(number)) as partial, partial.open("wb") as file:
             np.savez(file, allow_pickle=False, **arrays)
 
-    def get(self, number: int) -> dict[str, np.ndarray]:
-        """The arrays of a finished shard."""
+    def numbers(self) -> list[int]:
+        """Numbers of the shards that are there."""
+        return sorted(int(path.stem.removeprefix("shard_")) for path in self.folder.glob("shard_*.npz"))
+
+    def get(self, number: int, *names: str) -> dict[str, np.ndarray]:
+        """The arrays of a finished shard; `names` alone where given."""
         with np.load(self.path(number), allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
+            return {name: file[name] for name in names or file.files}
 
     def remove(self) -> None:
         """After the dataset is written."""

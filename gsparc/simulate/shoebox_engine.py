@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -62,6 +63,10 @@ class ShoeboxEngine:
             np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,
         )
+
+    def fingerprint(self) -> str:
+        """Of the room."""
+        return sha256(repr(self.room).encode()).hexdigest()
 
     def versions(self) -> dict[str, str]:
         """Part of this package."""

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -143,6 +144,47 @@ def test_killed_half_way_and_resumed(tmp_path, monkeypatch):
     assert about == other and len(np.unique(two["rx_position"], axis=0)) == 60
 
 
+MASTS = [{"name": "a", "position_m": [1.0, 1.5, 2.6]}, {"name": "b", "position_m": [5.0, 4.0, 2.5]}]
+
+
+def test_several_transmitters_are_stations_and_every_pair_is_there_once(tmp_path, monkeypatch):
+    """Killed and gone on with; a place is tested on with all transmitters or with none."""
+    several = replace(SCENE, transmitter_m=None, transmitters=MASTS)
+    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=3))
+    real, left = ShoeboxEngine.trace, [5]
+
+    def dies(self, receivers, *rest, **named):
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return real(self, receivers, *rest, **named)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(ShoeboxEngine, "trace", dies)
+        simulate(plan(scene=several, effects=asked), tmp_path / "two.h5")
+    assert (tmp_path / "two.h5.parts").exists()
+    outcome = simulate(plan(scene=several, effects=asked), tmp_path / "two.h5")
+    stored, _ = arrays(tmp_path / "two.h5")
+    pairs = np.column_stack([stored["station"], stored["rx_position"]])
+    assert len(np.unique(pairs, axis=0)) == len(pairs) == 120 and "tx_position" not in stored
+    alone = simulate(plan(effects=outcome.effects), tmp_path / "one.h5")
+    of_a, _ = arrays(tmp_path / "one.h5")
+    np.testing.assert_array_equal(stored["csi"][:60], of_a["csi"])
+    assert alone.survey.places.tolist() == outcome.survey.places.tolist()
+    read = load({"name": "sionna", "file": str(tmp_path / "two.h5"), "target": "csi"})
+    assert read.site.stations.name == ("a", "b") and read.site.static_end == "tx"
+    learn, test = (set(read.place[rows]) for rows in read.release_split)
+    assert not learn & test
+    floor_plan(outcome, tmp_path / "plan.png")
+
+
+def test_a_walk_keeps_its_times(tmp_path):
+    walk = {"kind": "trajectory", "points_m": [[0.5, 0.5], [5.5, 0.5]], "speed_m_s": 1.0, "every_s": 0.2}
+    simulate(plan(scene=replace(SCENE, receivers=walk)), tmp_path / "walk.h5")
+    stored, _ = arrays(tmp_path / "walk.h5")
+    np.testing.assert_allclose(stored["time_s"], np.arange(26) * 0.2)
+
+
 def test_parts_of_another_simulation_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(campaigns, "_trace_all", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
@@ -191,11 +233,50 @@ def test_auto_decides_once_verifies_and_is_drawn(tmp_path):
         assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
+def test_probes_are_rows_of_the_file_and_a_decision_is_kept(tmp_path, monkeypatch):
+    """No row is traced twice, and the next set of receivers of the same scene asks no probes."""
+    real, traced = ShoeboxEngine.trace, []
+
+    def counts(self, receivers, effects, seed=None):
+        traced.append((len(receivers), effects.depth))
+        return real(self, receivers, effects, seed)
+
+    monkeypatch.setattr(ShoeboxEngine, "trace", counts)
+    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    first = simulate(plan(effects=asked), tmp_path / "first.h5")
+    assert sum(count for count, _ in traced) == 60 and first.effects.depth < 4
+    chosen, _ = arrays(tmp_path / "first.h5")
+    simulate(plan(effects=first.effects), tmp_path / "same.h5")
+    same, _ = arrays(tmp_path / "same.h5")
+    for name in chosen:  # what probes kept of their full trace is what a run with the choice finds
+        np.testing.assert_array_equal(chosen[name], same[name], err_msg=name)
+    traced.clear()
+    again = simulate(plan(effects=asked, scene=replace(SCENE, seed=3)), tmp_path / "again.h5")
+    assert again.choice.reused and again.effects == first.effects
+    assert sum(count for count, _ in traced) == 60 and {depth for _, depth in traced} == {first.effects.depth}
+    moved = replace(SCENE, transmitter_m=(1.0, 1.4, 2.6))
+    assert not simulate(plan(effects=asked, scene=moved), tmp_path / "moved.h5").choice.reused
+    fresh = replace(asked, reuse=False)
+    assert not simulate(plan(effects=fresh), tmp_path / "fresh.h5").choice.reused
+
+
+def test_where_few_are_left_everything_is_kept(tmp_path):
+    asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
+    outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
+    assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
+
+
 @pytest.mark.parametrize("changes, words", [
     ({"builder": "x"}, "exactly one of"),
     ({"num_receivers": 3}, "at least 20"),
     ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
     ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
+    ({"transmitter_m": (9.0, 1.0)}, "three finite numbers"),
+    ({"transmitters": [{"position_m": [1, 1, 1]}]}, "not both"),
+    ({"transmitter_m": None, "transmitters": []}, "empty list"),
+    ({"transmitter_m": None, "transmitters": [{"position_m": [1, 1, 1], "sectors": 3}]}, "isotropic"),
+    ({"over": "sea"}, "expected one of zero"),
+    ({"receivers": {"knd": "grid"}}, "no such setting"),
 ])  # fmt: skip
 def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
     with pytest.raises(ValueError, match=words):

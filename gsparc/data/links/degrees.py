@@ -19,7 +19,7 @@ def in_metres(check: Checker) -> Georeference | None:
     if "latitude" not in arrays:
         if "station_latitude" in arrays:
             return check.refuse("station_latitude", "given without latitude and longitude of the other end")
-        return None
+        return _stated(check)
     if "station_position" in arrays:
         return check.refuse(
             "station_position", "in metres beside places in degrees; expected station_latitude"
@@ -41,6 +41,17 @@ def in_metres(check: Checker) -> Georeference | None:
         f"positions are metres east and north of {origin.latitude:g}, {origin.longitude:g} degrees"
     )
     return origin
+
+
+def _stated(check: Checker) -> Georeference | None:
+    """The origin of positions in metres, where attributes of the file say where on Earth it lies."""
+    given = [check.raw.attributes.get(f"origin_{name}") for name in ("latitude", "longitude")]
+    if given == [None, None]:
+        return None
+    try:
+        return Georeference(*(float(value) for value in given))  # type: ignore[arg-type]
+    except (TypeError, ValueError) as error:
+        return check.refuse("origin_latitude", f"with origin_longitude {given}: expected degrees ({error})")
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:

@@ -1,8 +1,9 @@
-"""From the config group `scene` to an engine and receiver positions."""
+"""From the config group `scene` to transmitters and receivers in a scene, ready to trace."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,61 +11,92 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.instantiate import known_keys
+from gsparc.data.links.georeference import Georeference
 from gsparc.simulate.engine import Engine
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.placement import clear_of, place
+from gsparc.simulate.scenes.osm import Town, read_town
+from gsparc.simulate.scenes.placement import clear_of
+from gsparc.simulate.scenes.receivers import layout, receivers
+from gsparc.simulate.scenes.solid import Solid
+from gsparc.simulate.scenes.transmitters import Antenna, Transmitter, stations
 from gsparc.simulate.shoebox import Room
 from gsparc.simulate.shoebox_engine import ShoeboxEngine
+from gsparc.simulate.survey import Survey
+
+log = logging.getLogger(__name__)
 
 BUILDERS = {"conference_room": conference_room}
+SOURCES = ("builder", "builtin", "xml", "file", "room")
+OVER = ("zero", "ground", "roofs")
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
+WIDEST_M = 400.0  # of an area that nobody states
+MAST_M = 10.0  # height of a transmitter that nobody states, above what stands in the middle
+CEILING = 0.85  # and its share of the height of a closed room
 
 
 @dataclass(frozen=True)
 class SceneSettings:
-    """One scene, chosen by exactly one of `builder`, `builtin`, `xml`, `room`.
+    """One scene, chosen by exactly one of `SOURCES`.
 
     Attributes:
         name: of the dataset.
-        transmitter_m: (3,) [m].
-        area_m: [[x, y], [x, y]] lower and upper corner of where receivers are [m].
-        height_m: lowest and highest height of a receiver [m].
-        num_receivers: how many.
-        test_share: of them held out for testing, drawn at random.
+        num_receivers: how many, over an area.
         carrier_hz, bandwidth_hz, subcarriers: the band; subcarriers from end to end [Hz].
+        transmitter_m: (3,) of the only one [m]; None, without `transmitters`: in the middle, which is said.
+        transmitters: settings of `transmitters.Mast` each, in place of `transmitter_m`.
+        area_m: [[x, y], [x, y]] lower and upper corner of where receivers are [m]; None: the middle, at most
+            400 m wide, which is said.
+        height_m: lowest and highest height of a receiver [m].
+        over: what heights count from: the world's `zero`, the `ground` (what stands there is kept off) or
+            `roofs` (the highest surface, whatever it is).
+        receivers: settings of `receivers.Layout`; None: drawn over the area.
+        test_share: of the places held out for testing, drawn at random.
         builder: a procedure of ours (`conference_room`).
         builtin: a scene that comes with Sionna.
         xml: a Mitsuba or Sionna scene file.
+        file: an extract of OpenStreetMap.
         room: of the shoebox engine: size_m, reflection (one number or six), boxes_m.
-        open_sky: receivers stand where nothing is above them.
+        open_sky: receivers stand where nothing is above them; None: where the scene has no ceiling.
         scattering: scattering coefficient of all materials without one; None: by material.
         seed: of the procedure and of the receivers.
     """
 
     name: str
-    transmitter_m: tuple[float, float, float]
-    area_m: tuple[tuple[float, float], tuple[float, float]]
-    height_m: tuple[float, float]
     num_receivers: int
     carrier_hz: float
     bandwidth_hz: float
     subcarriers: int
+    transmitter_m: tuple[float, float, float] | None = None
+    transmitters: Sequence[Mapping[str, Any]] | None = None
+    area_m: tuple[tuple[float, float], tuple[float, float]] | None = None
+    height_m: tuple[float, float] = (1.2, 1.8)
+    over: str = "zero"
+    receivers: Mapping[str, Any] | None = None
     test_share: float = 0.3
     builder: str | None = None
     builtin: str | None = None
     xml: str | None = None
+    file: str | None = None
     room: Mapping[str, Any] | None = None
-    open_sky: bool = False
+    open_sky: bool | None = False
     scattering: float | None = None
     seed: int = 0
 
     def __post_init__(self) -> None:
-        named = [k for k in ("builder", "builtin", "xml", "room") if getattr(self, k) is not None]
+        named = [k for k in SOURCES if getattr(self, k) is not None]
         if len(named) != 1:
             found = ", ".join(named) or "none"
-            raise ValueError(f"scene: give exactly one of builder, builtin, xml, room; got {found}")
-        if self.num_receivers < 20:
+            raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {found}")
+        if self.transmitter_m is not None and self.transmitters is not None:
+            raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
+        if self.transmitters is not None and not self.transmitters:
+            raise ValueError("scene.transmitters: an empty list; expected a transmitter or more")
+        if self.transmitter_m is not None and not _three(self.transmitter_m):
+            raise ValueError(f"scene.transmitter_m={self.transmitter_m}: expected three finite numbers [m]")
+        if self.over not in OVER:
+            raise ValueError(f"scene.over={self.over}: expected one of {', '.join(OVER)}")
+        if layout(self.receivers).kind == "area" and self.num_receivers < 20:
             raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least 20")
         if not (self.carrier_hz > 0 and self.bandwidth_hz >= 0 and self.subcarriers >= 1):
             raise ValueError("scene: carrier_hz is positive, bandwidth_hz at least 0, subcarriers at least 1")
@@ -88,35 +120,157 @@ def from_config(config: Mapping[str, Any]) -> SceneSettings:
     return SceneSettings(**known_keys(config, SceneSettings, "scene", "setting"))
 
 
-def build(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, np.ndarray]:
-    """The engine, and receivers (S, 3) float64 [m].
+def build(scene: SceneSettings, sampling: Sampling) -> Survey:
+    """The scene with its transmitters and receivers.
 
     Raises:
         ValueError: no such scene, or no place for the receivers.
         SimulatorMissing: the scene needs Sionna and it is not here.
     """
-    engine, allowed = _engine(scene, sampling)
-    receivers = place(scene.num_receivers, np.array(scene.area_m), scene.height_m, allowed, scene.seed)
-    return engine, receivers
-
-
-def _engine(scene: SceneSettings, sampling: Sampling) -> tuple[Engine, Callable[[np.ndarray], np.ndarray]]:
-    transmitter = np.array(scene.transmitter_m, dtype=np.float64)
     if scene.room is not None:
-        boxes = np.array(scene.room.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
-        reflection = np.array(scene.room.get("reflection", -0.7), dtype=np.complex128)
-        room = Room.uniform(scene.room["size_m"], reflection, occluders=boxes)
-        return ShoeboxEngine(room, transmitter, scene.carrier_hz), room.contains
+        return _shoebox(scene)
+    town = None if scene.file is None else read_town(scene.file, scene.carrier_hz)
+    for note in () if town is None else town.notes:
+        log.info("%s: %s", scene.file, note)
+    source, solids = _source(scene, town)
+    tracer = RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering)
+    box = tracer.box()[:, :2] if town is None else town.box
+    area = _area(scene, box)
+    ground: _Around | _Clear = _Around(scene, tracer, area) if solids is None else _Clear(solids)
+    georeference = None if town is None else town.georeference
+    masts = _masts(scene, tracer, ground, area, georeference)
+    streets = () if town is None else town.streets
+    how = layout(scene.receivers)
+    placed = receivers(
+        how, scene.num_receivers, area, scene.height_m, scene.seed, ground, streets, georeference
+    )
+    engines = [tracer.at(mast.position, mast.antenna) for mast in masts]
+    return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
+
+
+def _shoebox(scene: SceneSettings) -> Survey:
+    """Our own exact image sources, whose transmitters are isotropic."""
+    assert scene.room is not None
+    boxes = np.array(scene.room.get("boxes_m") or np.zeros((0, 2, 3)), dtype=np.float64)
+    reflection = np.array(scene.room.get("reflection", -0.7), dtype=np.complex128)
+    room = Room.uniform(scene.room["size_m"], reflection, occluders=boxes)
+    area = _area(scene, np.stack([np.zeros(2), np.array(scene.room["size_m"][:2], dtype=np.float64)]))
+    middle = np.append(area.mean(0), CEILING * float(scene.room["size_m"][2]))
+    masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
+    if any(mast.antenna.pattern != "iso" for mast in masts):
+        raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
+    engines: list[Engine] = [ShoeboxEngine(room, mast.position, scene.carrier_hz) for mast in masts]
+    placed = receivers(
+        layout(scene.receivers), scene.num_receivers, area, scene.height_m, scene.seed, _Clear(room.contains)
+    )
+    return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
+
+
+def _source(scene: SceneSettings, town: Town | None) -> tuple[Sequence[Solid] | str | Path, Any]:
+    """What the ray tracer loads, and the test of free places where objects know where nobody stands."""
+    if town is not None:
+        return town.solids, None
     if scene.builder is not None:
         if scene.builder not in BUILDERS:
             raise ValueError(f"scene.builder={scene.builder}: expected one of {', '.join(BUILDERS)}")
         solids = BUILDERS[scene.builder](scene.seed)
-        return RayTracer(solids, transmitter, scene.carrier_hz, sampling, scene.scattering), clear_of(solids)
-    source: str | Path = scene.builtin if scene.builtin is not None else Path(str(scene.xml))
-    tracer = RayTracer(source, transmitter, scene.carrier_hz, sampling, scene.scattering)
+        return solids, clear_of(solids)
+    return (scene.builtin if scene.builtin is not None else Path(str(scene.xml))), None
 
-    def allowed(points: np.ndarray) -> np.ndarray:
-        free = tracer.clear_of_surfaces(points, CLEARANCE)
-        return free & tracer.under_open_sky(points) if scene.open_sky else free
 
-    return tracer, allowed
+def _area(scene: SceneSettings, box: np.ndarray) -> np.ndarray:
+    """(2, 2) [m] where receivers are."""
+    if scene.area_m is not None:
+        return np.array(scene.area_m, dtype=np.float64)
+    middle, half = box.mean(0), np.minimum(np.ptp(box, axis=0), WIDEST_M) / 2
+    area = np.round(np.stack([middle - half, middle + half]), 1)
+    log.info("no scene.area_m: %s m taken, the middle of the scene", area.tolist())
+    return area
+
+
+def _stated(
+    scene: SceneSettings, surface: Any, georeference: Georeference | None
+) -> list[Transmitter] | None:
+    if scene.transmitters is not None:
+        return stations(scene.transmitters, surface, georeference)
+    if scene.transmitter_m is not None:
+        return [Transmitter("tx", np.array(scene.transmitter_m, dtype=np.float64))]
+    return None
+
+
+def _masts(
+    scene: SceneSettings,
+    tracer: RayTracer,
+    ground: _Around | _Clear,
+    area: np.ndarray,
+    georeference: Georeference | None,
+) -> list[Transmitter]:
+    """Transmitters as stated, or one in the middle."""
+    stated = _stated(scene, lambda across: tracer.surface(across)[0], georeference)
+    if stated is not None:
+        return stated
+    middle = area.mean(0)
+    if isinstance(ground, _Around) and ground.open_sky:
+        high = float(tracer.surface(middle[None])[0][0]) + MAST_M
+    else:
+        low, top = tracer.box()[:, 2]
+        high = float(low + CEILING * (top - low))
+    position = np.round(np.append(middle, high), 1)
+    log.info("no scene.transmitter_m: %s m taken, in the middle", position.tolist())
+    return [Transmitter("tx", position, Antenna())]
+
+
+class _Clear:
+    """Places that a test of the objects allows; heights count from zero.
+
+    Args:
+        test: (n, 3) [m] -> (n,) bool.
+    """
+
+    def __init__(self, test: Any) -> None:
+        self._test = test
+
+    def lift(self, points: np.ndarray) -> np.ndarray:
+        """As they are."""
+        return points
+
+    def allowed(self, points: np.ndarray) -> np.ndarray:
+        """See `receivers.Ground`."""
+        return np.asarray(self._test(points))
+
+
+class _Around:
+    """Places about the surfaces of a scene that rays find.
+
+    Args:
+        scene: `over` and `open_sky`.
+        tracer: of the scene.
+        area: (2, 2) [m] that is looked at for a ceiling.
+    """
+
+    def __init__(self, scene: SceneSettings, tracer: RayTracer, area: np.ndarray) -> None:
+        self._over, self._tracer = scene.over, tracer
+        self.open_sky = tracer.has_open_sky(area) if scene.open_sky is None else scene.open_sky
+        if not self.open_sky:
+            self._over = "zero"
+
+    def lift(self, points: np.ndarray) -> np.ndarray:
+        """From heights above the ground or roofs to z [m]."""
+        if self._over == "zero":
+            return points
+        return points + [0.0, 0.0, 1.0] * self._tracer.surface(points[:, :2])[0][:, None]
+
+    def allowed(self, points: np.ndarray) -> np.ndarray:
+        """See `receivers.Ground`."""
+        free = self._tracer.clear_of_surfaces(points, CLEARANCE)
+        if self._over == "ground":
+            free &= self._tracer.surface(points[:, :2])[1]
+        return free & self._tracer.under_open_sky(points) if self.open_sky else free
+
+
+def _three(values: Sequence[float]) -> bool:
+    try:
+        found = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return found.shape == (3,) and bool(np.isfinite(found).all())

@@ -1,0 +1,227 @@
+"""How a run comes to its effects: looked up, or by probes until it is clear, which are rows of the file."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.files import platform_cache, whole_file
+from gsparc.simulate import auto, priors
+from gsparc.simulate.attribution import Probe
+from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.paths import Paths, join
+from gsparc.simulate.scenes.placement import neighbours
+from gsparc.simulate.settings import Campaign
+from gsparc.simulate.survey import Survey
+
+log = logging.getLogger(__name__)
+
+OWN = ("name", "num_receivers", "test_share", "seed")  # of a scene's settings: not of what is decided
+
+
+@dataclass(frozen=True)
+class Changed:
+    """Errors by what the requirement does not need, at held-back receivers.
+
+    Attributes:
+        rows: (n,) of the survey.
+        errors: (n,) of the deliverable, in the unit of its tolerance.
+    """
+
+    rows: np.ndarray
+    errors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Decision:
+    """What `auto` decided.
+
+    Attributes:
+        choice: what the requirement needs.
+        effects: what is simulated: that, or everything where few rows are left, whose saving would not pay
+            for compiling the solver for other effects.
+        changed: errors at held-back receivers; None where there are none.
+        rows: (n,) of the survey, those that were traced.
+        paths: of these rows, with `effects`.
+    """
+
+    choice: Choice
+    effects: Effects
+    changed: Changed | None = None
+    rows: np.ndarray | None = None
+    paths: Paths | None = None
+
+    def note(self) -> dict[str, Any]:
+        """What a resumed run reads; without paths, which are in a shard."""
+        changed = None if self.changed is None else [v.tolist() for v in vars(self.changed).values()]
+        return {"choice": asdict(self.choice), "effects": asdict(self.effects), "changed": changed}
+
+    @staticmethod
+    def of(note: Mapping[str, Any]) -> Decision:
+        """Inverse of `note`."""
+        rows, errors = note["changed"] or ([], [])
+        changed = Changed(np.array(rows, dtype=int), np.array(errors)) if rows else None
+        return Decision(Choice.from_dict(note["choice"]), Effects(**note["effects"]), changed)
+
+
+class Traced:
+    """Rows traced with everything, each once, and what they cost.
+
+    Attributes:
+        cold: CPU seconds of the first group, which compiles; None before.
+        warm: of a row afterwards; None where there was one group only.
+    """
+
+    def __init__(self, survey: Survey, effects: Effects) -> None:
+        self.survey, self.effects = survey, effects
+        self.rows = np.zeros(0, dtype=np.int64)
+        self._parts: list[Paths] = []
+        self.cold: float | None = None
+        self._first = self._later = 0
+        self._spent = 0.0
+
+    def paths(self, rows: np.ndarray) -> Paths:
+        """Paths of rows (n,); those not traced before are."""
+        missing = np.setdiff1d(rows, self.rows)
+        if len(missing):
+            begin = time.process_time()
+            self._parts.append(self.survey.trace(missing, self.effects))
+            self.rows, cost = np.concatenate([self.rows, missing]), time.process_time() - begin
+            if self.cold is None:
+                self.cold, self._first = cost, len(missing)
+            else:
+                self._spent, self._later = self._spent + cost, self._later + len(missing)
+        at = np.argsort(self.rows)
+        return join(self._parts).take(at[np.searchsorted(self.rows[at], rows)])
+
+    @property
+    def warm(self) -> float | None:
+        """CPU seconds of a row once compiled."""
+        return self._spent / self._later if self._later else None
+
+    def pays(self, left: int, saved: float) -> bool:
+        """Whether saving a share of the time of the rows that are left pays for compiling anew [s]."""
+        if self.warm is None or self.cold is None:
+            return left > 0
+        compiling = max(self.cold - self._first * self.warm, 0.0) if self.survey.engine.random else 0.0
+        return left * self.warm * saved > compiling
+
+
+def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decision:
+    """Look the decision up, or take it and store it."""
+    begin = time.perf_counter()
+    stored = platform_cache() / "scenes" / f"{_key(campaign, settings, survey)}.json"
+    if settings.reuse and stored.exists():
+        choice = Choice.from_dict(json.loads(stored.read_text(encoding="utf-8")))
+        log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
+        choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
+        return Decision(choice, survey.engine.supported(choice.effects))
+    full = survey.engine.supported(settings.full)
+    traced = Traced(survey, full)
+    probes, held = _groups(survey, settings, campaign.scene.seed)
+    choice = _look(campaign, settings, survey, traced, probes)
+    changed, saved = None, 1 - auto.price(choice.effects, full)
+    if choice.effects == full:
+        log.info("auto: everything is needed")
+    else:
+        log.info("auto: %s; verifying on held-back receivers", choice.effects)
+        choice, changed = _verify(campaign, settings, traced, choice, held)
+    effects = choice.effects
+    if effects != full and not traced.pays(len(survey) - len(traced.rows), saved):
+        log.info("auto: everything is simulated: for the receivers that are left, compiling anew costs more")
+        effects = full
+    choice = replace(choice, seconds=time.perf_counter() - begin, row_all=traced.warm)
+    _remember(stored, choice)
+    rows = np.sort(traced.rows)
+    return Decision(choice, effects, changed, rows, traced.paths(rows).under(effects))
+
+
+def remember(campaign: Campaign, settings: AutoSettings, survey: Survey, choice: Choice) -> None:
+    """Store a decision anew, with what rows were measured to cost."""
+    _remember(platform_cache() / "scenes" / f"{_key(campaign, settings, survey)}.json", choice)
+
+
+def _groups(survey: Survey, settings: AutoSettings, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Probes and held-back rows, both spread out, the first of each spread out as well."""
+    wanted = settings.probes + settings.held_back
+    chosen = survey.spread(wanted, seed)
+    share = settings.probes / wanted
+    # Farthest-point order: taking every so many leaves both groups spread out.
+    turn = np.floor(np.arange(1, len(chosen) + 1) * share) > np.floor(np.arange(len(chosen)) * share)
+    return chosen[turn], chosen[~turn]
+
+
+def _look(
+    campaign: Campaign, settings: AutoSettings, survey: Survey, traced: Traced, probes: np.ndarray
+) -> Choice:
+    """The first look and, where it leaves something open, the last."""
+    materials = survey.engine.materials()
+    choice = None
+    for count in (auto.first_look(len(probes)), len(probes)):
+        rows = probes[:count]
+        log.info("auto: %d probes with %s", count, traced.effects)
+
+        def why(probe: Probe, rows: np.ndarray = rows) -> dict[str, str]:
+            return priors.reasons(probe, survey.distances()[rows], materials)
+
+        choice = auto.decide(_probe(campaign, traced, rows), settings, why, last=count == len(probes))
+        if choice is not None:
+            return choice
+    raise AssertionError("the last look decides")
+
+
+def _verify(
+    campaign: Campaign, settings: AutoSettings, traced: Traced, choice: Choice, held: np.ndarray
+) -> tuple[Choice, Changed]:
+    """On the first half of the held-back rows, and on all where that does not prove the requirement."""
+    for count in (auto.first_look(len(held)), len(held)):
+        probe = _probe(campaign, traced, held[:count])
+        choice = auto.verify(choice, settings, probe)
+        errors = probe.errors(choice.effects, settings.required)
+        failed = int((errors[probe.reached] > settings.required.tolerance).sum())
+        early, _ = auto.allowed_failures(count, len(held), settings.quantile, settings.confidence)
+        if failed <= early:
+            break
+    return choice, Changed(held[:count], errors)
+
+
+def _probe(campaign: Campaign, traced: Traced, rows: np.ndarray) -> Probe:
+    """Rows traced with everything, and their nearest others where the requirement is about spectra."""
+    survey, nearest = traced.survey, None
+    if isinstance(campaign.effects, AutoSettings) and campaign.effects.required.kind == "spectrum":
+        owner, place = np.divmod(rows, len(survey.places))
+        nearest = traced.paths(owner * len(survey.places) + neighbours(survey.places, place))
+    wavelength = survey.engine.wavelength
+    elements, frequency = campaign.csi.elements(wavelength), campaign.scene.frequency_hz
+    return Probe(
+        traced.paths(rows), traced.effects, frequency, wavelength, elements, campaign.spectrum, nearest
+    )
+
+
+def _key(campaign: Campaign, settings: AutoSettings, survey: Survey) -> str:
+    """Hash of geometry, materials, transmitters, where receivers are, band, solver and requirement."""
+    scene = {name: value for name, value in asdict(campaign.scene).items() if name not in OWN}
+    asked = {name: value for name, value in asdict(settings).items() if name != "reuse"}
+    about: dict[str, Any] = {
+        "geometry": survey.engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
+        "materials": survey.engine.materials(), "versions": survey.engine.versions(), "scene": scene,
+        "asked": asked, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
+        "samples": campaign.sampling.samples, "names": survey.names,
+    }  # fmt: skip
+    if settings.required.kind != "coverage":
+        about |= {"csi": asdict(campaign.csi), "spectrum": asdict(campaign.spectrum)}
+    return hashlib.sha256(json.dumps(about, sort_keys=True, default=str).encode()).hexdigest()[:32]
+
+
+def _remember(stored: Path, choice: Choice) -> None:
+    with whole_file(stored) as partial:
+        partial.write_text(json.dumps(asdict(choice), indent=1), encoding="utf-8")

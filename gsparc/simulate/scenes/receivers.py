@@ -1,0 +1,226 @@
+"""Receivers over an area, on a grid, along streets or a trajectory, or out of a file."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import pandas as pd
+
+from gsparc.data.errors import DataError
+from gsparc.data.instantiate import known_keys
+from gsparc.data.links.georeference import Georeference
+from gsparc.data.query_places import read_query_places
+from gsparc.data.tables import is_table
+from gsparc.simulate.scenes.placement import place
+
+log = logging.getLogger(__name__)
+
+KINDS = ("area", "grid", "streets", "lines", "trajectory", "file")
+INSIDE = ("drop", "refuse")
+MOST = 1_000_000  # places
+
+
+class Ground(Protocol):
+    """What receivers stand on, and where they may."""
+
+    def lift(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) of places whose z counts from the ground (or roof), from the world's zero [m]."""
+
+    def allowed(self, points: np.ndarray) -> np.ndarray:
+        """Which of places (n, 3) [m], world, are not in, on or above what stands there (n,) bool."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The settings `scene.receivers`.
+
+    Attributes:
+        kind: `area` (drawn at random), `grid`, `streets` (of a map), `lines` (through `points_m`),
+            `trajectory` (through `points_m` at `speed_m_s`, a place every `every_s`) or `file`.
+        spacing_m: of a grid, and along streets and lines [m].
+        points_m: corners [[x, y], ...] of a line or trajectory; of several lines a list of those.
+        speed_m_s, every_s: of a trajectory.
+        file: a table with x, y and z, or latitude, longitude and height, and perhaps `time_s`.
+        inside: places in or on something that stands there are left out (`drop`) or an error (`refuse`);
+            None: an error out of a file, else left out.
+    """
+
+    kind: str = "area"
+    spacing_m: float = 5.0
+    points_m: Sequence[Any] | None = None
+    speed_m_s: float = 1.4
+    every_s: float = 1.0
+    file: str | None = None
+    inside: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"scene.receivers.kind={self.kind}: expected one of {', '.join(KINDS)}")
+        if self.inside not in (None, *INSIDE):
+            raise ValueError(f"scene.receivers.inside={self.inside}: expected {' or '.join(INSIDE)}")
+        for name in ("spacing_m", "speed_m_s", "every_s"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise ValueError(f"scene.receivers.{name}={getattr(self, name)}: expected a positive number")
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Receivers.
+
+    Attributes:
+        places: (R, 3) float64 [m], world.
+        time_s: (R,) when a receiver was there; None where that has no meaning.
+    """
+
+    places: np.ndarray
+    time_s: np.ndarray | None = None
+
+
+def layout(config: Mapping[str, Any] | None) -> Layout:
+    """Settings from `scene.receivers`.
+
+    Raises:
+        ValueError: a setting that does not exist or cannot be.
+    """
+    return Layout(**known_keys(config or {}, Layout, "scene.receivers", "setting"))
+
+
+def receivers(
+    how: Layout,
+    count: int,
+    area: np.ndarray,
+    height: Sequence[float],
+    seed: int,
+    ground: Ground,
+    streets: Sequence[np.ndarray] = (),
+    georeference: Georeference | None = None,
+) -> Placed:
+    """Places of the layout that stand nowhere else than on the ground.
+
+    Args:
+        how: the layout.
+        count: of receivers over an area.
+        area: (2, 2) [m] lower and upper corner in x and y.
+        height: lowest and highest, drawn for each, but out of a file [m].
+        seed: of places and heights.
+        ground: of the scene.
+        streets: (n, 2) [m] each, of a map.
+        georeference: of the world's origin.
+
+    Raises:
+        ValueError: no places, or places inside of something where that is refused.
+    """
+    if how.kind == "area":
+
+        def allowed(points: np.ndarray) -> np.ndarray:
+            return ground.allowed(ground.lift(points))
+
+        return Placed(ground.lift(place(count, area, height, allowed, seed)))
+    if how.kind == "file":
+        flat, time_s = _of_file(how, georeference, float(np.mean(height)))
+        names = [f"row {i}" for i in range(len(flat))]
+    else:
+        across, time_s = _along(how, area, streets)
+        if not 0 < len(across) <= MOST:
+            raise ValueError(f"scene.receivers: {len(across)} places; expected 1 to {MOST:,}")
+        drawn = np.random.default_rng(seed).uniform(min(height), max(height), len(across))
+        flat = np.column_stack([across, drawn])
+        names = [f"({x:.1f}, {y:.1f})" for x, y in across]
+    points = ground.lift(flat)
+    free = ground.allowed(points)
+    if not free.all():
+        first, number = names[int(np.argmin(free))], int((~free).sum())
+        inside = f"{number} of {len(free)} receivers stand in or on something, the first at {first}"
+        if how.inside == "refuse" or (how.inside is None and how.kind == "file"):
+            raise ValueError(
+                f"scene.receivers: {inside}; scene.receivers.inside=drop leaves them out, "
+                "scene.over=roofs means heights above roofs"
+            )
+        log.warning("%s: left out", inside)
+    if free.sum() < 2:
+        raise ValueError("scene.receivers: fewer than two places are free; is the area inside a building?")
+    return Placed(points[free], None if time_s is None else time_s[free])
+
+
+def _along(
+    how: Layout, area: np.ndarray, streets: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Places (n, 2) [m] of a grid or along lines; times (n,) [s] of a trajectory."""
+    if how.kind == "grid":
+        low, high = area
+        counts = np.floor((high - low) / how.spacing_m).astype(int) + 1
+        if counts.prod() > MOST:
+            raise ValueError(f"scene.receivers.spacing_m={how.spacing_m:g}: {counts.prod():,} places")
+        axes = [np.arange(n) * how.spacing_m + start for n, start in zip(counts, low, strict=True)]
+        return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), None
+    if how.kind == "streets":
+        if not streets:
+            raise ValueError("scene.receivers.kind=streets: this scene has no streets; use lines or grid")
+        walked = np.concatenate([_steps(line, how.spacing_m) for line in streets])
+        inside = ((walked >= area[0]) & (walked <= area[1])).all(1)
+        return walked[inside], None
+    lines = _lines(how)
+    if how.kind == "lines":
+        return np.concatenate([_steps(line, how.spacing_m) for line in lines]), None
+    if len(lines) > 1:
+        raise ValueError("scene.receivers.points_m: a trajectory is one line")
+    walked = _steps(lines[0], how.speed_m_s * how.every_s)
+    return walked, np.arange(len(walked)) * how.every_s
+
+
+def _lines(how: Layout) -> list[np.ndarray]:
+    given = how.points_m
+    try:
+        nested = given is not None and np.ndim(given[0]) == 2
+        lines = [np.array(line, dtype=np.float64) for line in (given if nested else [given])]  # type: ignore[union-attr]
+    except (TypeError, ValueError, IndexError):
+        lines = []
+    if not lines or any(x.ndim != 2 or x.shape[1] != 2 or len(x) < 2 for x in lines):
+        raise ValueError("scene.receivers.points_m: expected [[x, y], [x, y], ...] of two corners or more")
+    if not all(np.isfinite(line).all() for line in lines):
+        raise ValueError("scene.receivers.points_m: expected finite numbers")
+    return lines
+
+
+def _steps(line: np.ndarray, spacing: float) -> np.ndarray:
+    """Places (n, 2) every `spacing` [m] along a line (c, 2), from its start."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    if along[-1] / spacing > MOST:
+        raise ValueError(f"scene.receivers: over {MOST:,} places along {along[-1]:.3g} m")
+    steps = np.arange(0.0, along[-1] + 1e-9, spacing)
+    return np.column_stack([np.interp(steps, along, line[:, i]) for i in range(2)])
+
+
+def _of_file(
+    how: Layout, georeference: Georeference | None, height: float
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """Places (n, 3) and times (n,) of a file; heights that it does not give are the middle of the scene's."""
+    if how.file is None:
+        raise ValueError("scene.receivers.file is missing; expected a table with x and y, or degrees")
+    try:
+        asked = read_query_places(how.file, ["rx"])
+    except DataError as error:
+        raise ValueError(f"scene.receivers.file: {error}") from None
+    for note in asked.notes:
+        log.info("%s: %s", how.file, note)
+    there = asked.ends["rx"]
+    across = there.across
+    if there.degrees:
+        if georeference is None:
+            raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
+        across = georeference.from_degrees(*across.T)
+    above = np.full(len(across), height) if there.height is None else there.height
+    time_s = None
+    if is_table(how.file) and Path(how.file).suffix == ".csv":
+        table = pd.read_csv(how.file)
+        if "time_s" in table:
+            time_s = pd.to_numeric(table["time_s"], errors="coerce").to_numpy(np.float64)
+            if not np.isfinite(time_s).all():
+                row = int(np.argmin(np.isfinite(time_s)))
+                raise ValueError(f"{how.file}, time_s, row {row}: expected seconds")
+    return np.column_stack([across, above]), time_s

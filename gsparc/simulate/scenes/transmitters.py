@@ -1,0 +1,132 @@
+"""Where transmitters stand, how their antennas radiate, and sectors of one mast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.instantiate import known_keys
+from gsparc.data.links.georeference import Georeference
+
+PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1
+
+
+@dataclass(frozen=True)
+class Antenna:
+    """What a transmitter radiates, vertically polarised.
+
+    Attributes:
+        pattern: one of `PATTERNS`.
+        azimuth_deg: of its boresight, from x counter-clockwise.
+        downtilt_deg: of its boresight below the horizon.
+    """
+
+    pattern: str = "iso"
+    azimuth_deg: float = 0.0
+    downtilt_deg: float = 0.0
+
+
+ISOTROPIC = Antenna()
+
+
+@dataclass(frozen=True)
+class Transmitter:
+    """One station.
+
+    Attributes:
+        name: in the file.
+        position: (3,) [m], world.
+        antenna: its pattern and where it looks.
+    """
+
+    name: str
+    position: np.ndarray
+    antenna: Antenna = ISOTROPIC
+
+
+@dataclass(frozen=True)
+class Mast:
+    """An entry of `scene.transmitters`.
+
+    Attributes:
+        name: None: numbered.
+        position_m: [x, y, z] in the world.
+        position_deg: [latitude, longitude] instead, of scenes on Earth; then `height_m` is needed.
+        height_m: above what is there, a roof or the ground.
+        pattern: one of `PATTERNS`; None: `iso`, or `tr38901` of sectors.
+        azimuth_deg, downtilt_deg: see `Antenna`; of the first sector.
+        sectors: antennas at equal angles around the mast, each a station.
+    """
+
+    name: str | None = None
+    position_m: Sequence[float] | None = None
+    position_deg: Sequence[float] | None = None
+    height_m: float | None = None
+    pattern: str | None = None
+    azimuth_deg: float = 0.0
+    downtilt_deg: float = 0.0
+    sectors: int = 1
+
+
+def stations(
+    entries: Sequence[Mapping[str, Any]],
+    surface: Callable[[np.ndarray], np.ndarray] | None,
+    georeference: Georeference | None,
+) -> list[Transmitter]:
+    """All sectors of all entries of `scene.transmitters`.
+
+    Args:
+        entries: settings of `Mast`.
+        surface: (n, 2) [m] -> (n,) [m] height of what is there; None where a scene has no such thing.
+        georeference: of the world's origin; None where the scene is nowhere on Earth.
+
+    Raises:
+        ValueError: an entry with an unknown setting, without a place, or two of one name.
+    """
+    found: list[Transmitter] = []
+    for number, entry in enumerate(entries):
+        where = f"scene.transmitters[{number}]"
+        mast = Mast(**known_keys(entry, Mast, where, "setting"))
+        if not 1 <= mast.sectors <= 12:
+            raise ValueError(f"{where}.sectors={mast.sectors}: expected 1 to 12")
+        pattern = mast.pattern or ("tr38901" if mast.sectors > 1 else "iso")
+        if pattern not in PATTERNS:
+            raise ValueError(f"{where}.pattern={pattern}: expected one of {', '.join(PATTERNS)}")
+        position = _position(mast, where, surface, georeference)
+        name = mast.name or f"tx{number}"
+        for sector in range(mast.sectors):
+            azimuth = (mast.azimuth_deg + 360 * sector / mast.sectors) % 360
+            called = name if mast.sectors == 1 else f"{name}-{sector + 1}"
+            found.append(Transmitter(called, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
+    names = [one.name for one in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"scene.transmitters: {twice[0]!r} twice; expected a name for each")
+    return found
+
+
+def _position(
+    mast: Mast,
+    where: str,
+    surface: Callable[[np.ndarray], np.ndarray] | None,
+    georeference: Georeference | None,
+) -> np.ndarray:
+    """(3,) [m], world."""
+    given = [n for n in ("position_m", "position_deg") if getattr(mast, n) is not None]
+    if len(given) != 1:
+        raise ValueError(f"{where}: give position_m=[x,y,z] or position_deg=[latitude,longitude]")
+    values = np.array(getattr(mast, given[0]), dtype=np.float64)
+    if values.shape not in ((2,), (3,)) or not np.isfinite(values).all():
+        raise ValueError(f"{where}.{given[0]}={values.tolist()}: expected two or three finite numbers")
+    if given[0] == "position_deg":
+        if georeference is None:
+            raise ValueError(f"{where}.position_deg: this scene is nowhere on Earth; give position_m")
+        values = georeference.from_degrees(values[:1], values[1:2])[0]
+    if len(values) == 3:
+        return values
+    if mast.height_m is None or surface is None:
+        raise ValueError(f"{where}: give height_m, above what stands there, or three coordinates in metres")
+    return np.append(values, surface(values[None])[0] + mast.height_m)

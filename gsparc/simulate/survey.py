@@ -1,0 +1,77 @@
+"""Every pair of a receiver and a transmitter of one scene: the rows of a dataset, and how they are traced."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.data.links.georeference import Georeference
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.engine import Engine
+from gsparc.simulate.paths import Paths, join
+from gsparc.simulate.scenes.placement import spread
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Row `t * R + r` is receiver r with transmitter t.
+
+    Attributes:
+        engines: (T,) one per transmitter, of the same scene.
+        places: (R, 3) float64 [m] receivers, world.
+        names: (T,) of the transmitters.
+        time_s: (R,) when a receiver was at its place; None where that has no meaning.
+        georeference: of the world's origin; None where the scene is nowhere on Earth.
+    """
+
+    engines: Sequence[Engine]
+    places: np.ndarray
+    names: tuple[str, ...] = ("tx",)
+    time_s: np.ndarray | None = None
+    georeference: Georeference | None = None
+
+    def __len__(self) -> int:
+        return len(self.engines) * len(self.places)
+
+    @property
+    def engine(self) -> Engine:
+        """That of the first transmitter, for what all share."""
+        return self.engines[0]
+
+    @property
+    def transmitters(self) -> np.ndarray:
+        """(T, 3) [m]."""
+        return np.stack([engine.transmitter for engine in self.engines])
+
+    @property
+    def station(self) -> np.ndarray:
+        """The transmitter (S,) of each row."""
+        return np.repeat(np.arange(len(self.engines)), len(self.places))
+
+    @property
+    def receivers(self) -> np.ndarray:
+        """The receiver's place (S, 3) [m] of each row."""
+        return np.tile(self.places, (len(self.engines), 1))
+
+    def distances(self) -> np.ndarray:
+        """Between the ends of each row (S,) [m]."""
+        return np.linalg.norm(self.receivers - self.transmitters[self.station], axis=1)
+
+    def spread(self, count: int, seed: int) -> np.ndarray:
+        """At most `count` rows far apart, transmitters by turns."""
+        order, turns = spread(self.places, min(count, len(self.places)), seed), len(self.engines)
+        rounds = [
+            order + (np.arange(len(order)) + shift) % turns * len(self.places) for shift in range(turns)
+        ]
+        return np.concatenate(rounds)[:count]
+
+    def trace(self, rows: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
+        """Paths of rows (n,), in their order."""
+        owner, place = np.divmod(rows, len(self.places))
+        order = np.argsort(owner, kind="stable")
+        parts = [
+            self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
+        ]
+        return join(parts).take(np.argsort(order, kind="stable"))

@@ -1,0 +1,118 @@
+"""Transmitters with sectors, and receivers on a grid, along lines, trajectories and out of files."""
+
+import numpy as np
+import pytest
+
+from gsparc.data.links.georeference import Georeference
+from gsparc.simulate.scenes.receivers import Layout, receivers
+from gsparc.simulate.scenes.transmitters import stations
+
+AREA = np.array([[0.0, 0.0], [20.0, 10.0]])
+SOMEWHERE = Georeference(40.0, -30.0)
+
+
+class Hut:
+    """Ground at z = 5 with a hut of 4 x 4 m in the corner."""
+
+    def lift(self, points):
+        return points + np.array([0, 0, 5.0])
+
+    def allowed(self, points):
+        return ~((points[:, 0] < 4) & (points[:, 1] < 4))
+
+
+def laid(georeference=None, streets=(), **settings):
+    return receivers(Layout(**settings), 30, AREA, (1.0, 2.0), 0, Hut(), streets, georeference)
+
+
+def test_sectors_are_stations_at_equal_angles():
+    entries = [
+        {"name": "mast", "position_m": [1, 2, 30], "sectors": 3, "azimuth_deg": 300, "downtilt_deg": 6},
+        {"position_m": [5, 5], "height_m": 2},
+        {"name": "b", "position_deg": [40.001, -30.0], "height_m": 1.5, "pattern": "dipole"},
+    ]
+    found = stations(entries, lambda across: np.full(len(across), 7.0), SOMEWHERE)
+    assert [one.name for one in found] == ["mast-1", "mast-2", "mast-3", "tx1", "b"]
+    assert [one.antenna.azimuth_deg for one in found[:3]] == [300, 60, 180]
+    assert {one.antenna.pattern for one in found[:3]} == {"tr38901"} and found[3].antenna.pattern == "iso"
+    np.testing.assert_allclose(found[3].position, [5, 5, 9])
+    np.testing.assert_allclose(found[4].position, [0, 111.03, 8.5], atol=0.02)
+
+
+@pytest.mark.parametrize("entry, words", [
+    ({"postion_m": [0, 0, 1]}, "no such setting"),
+    ({}, "give position_m"),
+    ({"position_m": [0, 0, 1], "position_deg": [1, 2]}, "give position_m"),
+    ({"position_m": [0, 0]}, "height_m"),
+    ({"position_m": [0, float("nan"), 1]}, "finite"),
+    ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn: expected one of iso"),
+    ({"position_m": [0, 0, 1], "sectors": 0}, "1 to 12"),
+    ({"position_deg": [95.0, 0.0], "height_m": 2}, "outside -90 to 90"),
+])  # fmt: skip
+def test_transmitters_that_cannot_be_are_refused(entry, words):
+    with pytest.raises(ValueError, match=words) as raised:
+        stations([entry], lambda across: np.zeros(len(across)), SOMEWHERE)
+    assert "\n" not in str(raised.value)
+
+
+def test_two_transmitters_of_one_name_are_refused():
+    with pytest.raises(ValueError, match="'a' twice"):
+        stations([{"name": "a", "position_m": [0, 0, 1]}] * 2, None, None)
+
+
+def test_a_grid_leaves_out_what_stands_there():
+    found = laid(kind="grid", spacing_m=2.0)
+    assert len(found.places) == 11 * 6 - 4 and found.time_s is None
+    assert (found.places[:, 2] >= 6).all() and (found.places[:, 2] <= 7).all()
+    with pytest.raises(ValueError, match=r"4 of 66 receivers .*\(0\.0, 0\.0\)"):
+        laid(kind="grid", spacing_m=2.0, inside="refuse")
+
+
+def test_a_trajectory_has_times():
+    found = laid(kind="trajectory", points_m=[[0, 8], [10, 8], [10, 2]], speed_m_s=2.0, every_s=0.5)
+    np.testing.assert_allclose(found.time_s, np.arange(17) * 0.5)
+    np.testing.assert_allclose(found.places[[0, 10, 16], :2], [[0, 8], [10, 8], [10, 2]])
+
+
+def test_streets_and_lines_have_a_place_every_so_many_metres():
+    streets = [np.array([[-5.0, 9.0], [30.0, 9.0]]), np.array([[10.0, 0.0], [10.0, 8.0]])]
+    found = laid(streets=streets, kind="streets", spacing_m=2.0)
+    assert (found.places[:, :2] >= 0).all() and (found.places[:, 0] <= 20).all() and len(found.places) == 15
+    several = laid(kind="lines", points_m=[[[0, 9], [20, 9]], [[10, 0], [10, 8]]], spacing_m=5.0)
+    assert len(several.places) == 5 + 2
+
+
+def test_receivers_out_of_a_table_in_degrees_with_times(tmp_path):
+    east, north = np.array([6.0, 12.0, 18.0]), np.array([5.0, 5.0, 5.0])
+    latitude, longitude = SOMEWHERE.to_degrees(np.stack([east, north], 1))
+    rows = [f"{a:.8f},{b:.8f},1.5,{t}" for a, b, t in zip(latitude, longitude, (0, 2, 5), strict=True)]
+    (tmp_path / "walk.csv").write_text("\n".join(["latitude,longitude,height,time_s", *rows]))
+    found = laid(SOMEWHERE, kind="file", file=str(tmp_path / "walk.csv"))
+    np.testing.assert_allclose(found.places, np.stack([east, north, np.full(3, 6.5)], 1), atol=0.01)
+    np.testing.assert_allclose(found.time_s, [0, 2, 5])
+    with pytest.raises(ValueError, match="nowhere on Earth"):
+        laid(kind="file", file=str(tmp_path / "walk.csv"))
+    (tmp_path / "hut.csv").write_text("x,y,z\n6,6,1\n7,7,1\n1,1,1\n")
+    with pytest.raises(ValueError, match="1 of 3 receivers stand in or on something, the first at row 2"):
+        laid(kind="file", file=str(tmp_path / "hut.csv"))
+    assert len(laid(kind="file", file=str(tmp_path / "hut.csv"), inside="drop").places) == 2
+
+
+@pytest.mark.parametrize("settings, words", [
+    ({"kind": "circle"}, "expected one of area"),
+    ({"inside": "maybe"}, "drop or refuse"),
+    ({"kind": "grid", "spacing_m": 0.0}, "positive"),
+    ({"kind": "grid", "spacing_m": 1e-4}, "places"),
+    ({"kind": "lines"}, "two corners or more"),
+    ({"kind": "lines", "points_m": [[0, 0], [1, "x"]]}, "two corners or more"),
+    ({"kind": "lines", "points_m": [[0, 0], [float("inf"), 1]]}, "finite"),
+    ({"kind": "trajectory", "points_m": [[[0, 0], [1, 1]], [[2, 2], [3, 3]]]}, "one line"),
+    ({"kind": "streets"}, "no streets"),
+    ({"kind": "file"}, "file is missing"),
+    ({"kind": "file", "file": "nowhere.csv"}, "nowhere.csv"),
+    ({"kind": "lines", "points_m": [[0, 0], [1, 1]]}, "fewer than two places"),
+])  # fmt: skip
+def test_receivers_that_cannot_be_are_refused(settings, words):
+    with pytest.raises(ValueError, match=words) as raised:
+        laid(**settings)
+    assert "\n" not in str(raised.value)
