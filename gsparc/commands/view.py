@@ -1,4 +1,4 @@
-"""`gsparc view ckpt=FILE`: the field in three dimensions, in a browser, or saved as a page, a picture or splats."""
+"""`gsparc view ckpt=FILE`: the field in three dimensions, in a browser or saved."""
 
 from __future__ import annotations
 

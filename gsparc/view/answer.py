@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.schema import End
+from gsparc.data.schema import Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.maps.levels import predicted
 from gsparc.methods.export import Paths
@@ -17,6 +17,7 @@ from gsparc.methods.method import HasPaths
 from gsparc.methods.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown
+NEAREST_M = 0.1  # where a distance law ends
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,18 @@ class Answer:
         confidence: in [0, 1]; None where the method has none.
         spectrum: (H, W) in [0, 1]; None of other kinds.
         response: (A, K) complex channel; None of other kinds.
-        paths: gains (N,) complex, excess and absolute delays, directions; None where there are none.
+        strongest: azimuth and elevation in the world of the strongest direction of a spectrum [degrees].
+        paths: None where there are none.
     """
 
-    ends: Mapping[End, np.ndarray]
+    ends: Mapping[str, np.ndarray]
     query_ms: float
     level_db: float | None = None
     spread_db: float | None = None
     confidence: float | None = None
     spectrum: np.ndarray | None = None
     response: np.ndarray | None = None
+    strongest: tuple[float, float] | None = None
     paths: Rays | None = None
 
 
@@ -58,7 +61,7 @@ class Rays:
     towards: np.ndarray | None
 
 
-def ask(predictor: Predictor, ends: Mapping[End, np.ndarray]) -> Answer:
+def ask(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
     """Ask about one place (two where both ends move).
 
     Args:
@@ -73,20 +76,33 @@ def ask(predictor: Predictor, ends: Mapping[End, np.ndarray]) -> Answer:
     mean = np.asarray(getattr(predictor, kind)(**ends))
     query_ms = (time.perf_counter() - start) * 1e3
     said = predictor.predict(**{end: np.atleast_2d(place) for end, place in ends.items()})
-    still = {} if site.static_end is None or site.static_position is None else {
-        site.static_end: site.static_position + site.origin
-    }  # fmt: skip
+    still: dict[str, np.ndarray] = {}
+    if site.static_end is not None and site.static_position is not None:
+        still[site.static_end] = site.static_position + site.origin
     level = spread = None
     if kind != "spectrum":
         level, spread = (float(value[0]) for value in predicted(said, kind))
     return Answer(
         {**still, **ends}, query_ms, level, spread,
         None if said.confidence is None else float(said.confidence[0]),
-        mean if kind == "spectrum" else None, mean if kind == "csi" else None, _rays(predictor, ends),
+        mean if kind == "spectrum" else None, mean if kind == "csi" else None,
+        _strongest(mean, site) if kind == "spectrum" else None, _rays(predictor, ends),
     )  # fmt: skip
 
 
-def _rays(predictor: Predictor, ends: Mapping[End, np.ndarray]) -> Rays | None:
+def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
+    """Of a direction (3,) [degrees]."""
+    x, y, z = towards
+    return float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arctan2(z, np.hypot(x, y))))
+
+
+def _strongest(spectrum: np.ndarray, site: Site) -> tuple[float, float]:
+    assert site.grid is not None
+    towards = site.grid.directions().numpy().reshape(-1, 3)[int(spectrum.argmax())]
+    return azimuth_elevation(towards if site.rx_rotation is None else site.rx_rotation @ towards)
+
+
+def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
     if predictor.site.kind != "csi" or not isinstance(predictor.method, HasPaths):
         return None
     try:
@@ -110,28 +126,34 @@ class Usual:
         slope: [dB per decade].
         spread_db: of what was measured about it.
         tree: of measured places, world.
+        distance_m: (n,) of what was measured; empty without a static end.
+        level_db: (n,) there.
     """
 
     at_one: float
     slope: float
     spread_db: float
     tree: cKDTree
+    distance_m: np.ndarray
+    level_db: np.ndarray
 
 
 def usual(places: np.ndarray, level_db: np.ndarray, still: np.ndarray | None) -> Usual:
     """The distance law of measured levels (n,) [dB] at places (n, 3) [m]; NaN without a static end."""
     known = np.isfinite(level_db)
     tree = cKDTree(places)
-    if still is None or known.sum() < 3:
-        return Usual(np.nan, np.nan, np.nan, tree)
-    far = np.log10(np.maximum(np.linalg.norm(places[known] - still, axis=1), 0.1))
-    slope, at_one = np.polyfit(far, level_db[known], 1) if np.ptp(far) > 0 else (0.0, level_db[known].mean())
-    spread = float(np.std(level_db[known] - at_one - slope * far))
-    return Usual(float(at_one), float(-slope), spread, tree)
+    level = level_db[known]
+    if still is None or len(level) < 3:
+        return Usual(np.nan, np.nan, np.nan, tree, np.zeros(0), level)
+    distance = np.maximum(np.linalg.norm(places[known] - still, axis=1), NEAREST_M)
+    far = np.log10(distance)
+    slope, at_one = np.polyfit(far, level, 1) if np.ptp(far) > 0 else (0.0, level.mean())
+    spread = float(np.std(level - at_one - slope * far))
+    return Usual(float(at_one), float(-slope), spread, tree, distance, level)
 
 
 def reasons(
-    answer: Answer, moving: End, known: Usual | None, objects: SiteObjects, origin: np.ndarray
+    answer: Answer, moving: str, known: Usual | None, objects: SiteObjects, origin: np.ndarray
 ) -> list[str]:
     """Why the level is what it is, one line each, of what is measured and what the model holds.
 
@@ -148,18 +170,19 @@ def reasons(
         far = float(np.linalg.norm(here - there))
         said.append(f"{far:.3g} m from the other end")
         if known is not None and answer.level_db is not None and np.isfinite(known.at_one):
-            plain = known.at_one - known.slope * np.log10(max(far, 0.1))
+            plain = known.at_one - known.slope * np.log10(max(far, NEAREST_M))
             gap = answer.level_db - plain
             how = "as usual" if abs(gap) <= known.spread_db else "weaker" if gap < 0 else "stronger"
             said.append(
-                f"distance alone: {plain:.1f} dB; here {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} ({how}, "
-                f"measured levels spread {known.spread_db:.1f} dB)"
+                f"distance alone: {plain:.1f} dB; here {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} "
+                f"({how}, measured levels spread {known.spread_db:.1f} dB)"
             )
         if len(objects.means):
             crossed = crossed_losses(objects, here - origin, there - origin)
             strong = crossed[np.abs(crossed) >= 0.5]
             said.append(
-                f"the straight path crosses {len(strong)} Gaussians that take {crossed.sum():.1f} dB by the model"
+                f"the straight path crosses {len(strong)} Gaussians that take {crossed.sum():.1f} dB "
+                "by the model"
             )
     if known is not None:
         said.append(f"nearest measurement: {known.tree.query(here)[0]:.3g} m away")
@@ -167,8 +190,7 @@ def reasons(
         rays = answer.paths
         more = ""
         if rays.towards is not None:
-            x, y, z = rays.towards[0]
-            more = f" from azimuth {np.degrees(np.arctan2(y, x)):.0f}°, elevation {np.degrees(np.arcsin(z)):.0f}°"
+            more = " from azimuth {:.0f}°, elevation {:.0f}°".format(*azimuth_elevation(rays.towards[0]))
         said.append(
             f"{len(rays.gain_db)} paths within {SILENT_DB:g} dB; strongest {rays.gain_db[0]:.1f} dB at "
             f"{rays.delay_ns[0]:.1f} ns{more}"

@@ -17,18 +17,20 @@ from gsparc.maps.floor_plan import FloorPlan
 from gsparc.methods.method import HasGaussians
 from gsparc.ops import Pose
 from gsparc.view.answer import SILENT_DB, Answer
-from gsparc.view.scene import Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.view.scene import EXTENT, Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats
 from gsparc.view.viewed import Measured, Viewed
 
 log = logging.getLogger(__name__)
 
+WORDS = ("transmitter", "receiver")  # that stand still
+MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
 DIRECTIONS = 9000  # of a sphere of power, at most
 QUERIES = 16  # places at which Gaussians are asked what they emit
 RANGE_DB = 30.0  # of emissions that are told apart
-RADIUS = 0.09  # of a sphere of power, of the extent of the site
+RADIUS = 0.08  # of a sphere of power, of the extent of the site
 SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
-REACH = 1.5  # of the extent, that rays are drawn to at most
+REACH = 0.8  # of the extent, that rays are drawn to at most
 VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
     "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
 )  # fmt: skip
@@ -66,7 +68,7 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
         measured: of that station.
     """
     frame = Frame.around(extent_of(viewed, given))
-    extent = 10.0 / frame.scale
+    extent = EXTENT / frame.scale
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
     notes = list(viewed.notes)
@@ -79,15 +81,16 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
     for name in viewed.stations:
         place = viewed.still(name)
         if place is not None:
-            parts.append(Mark(f"station {name or ''}".strip(), place, name or (viewed.site.static_end or "")))
+            named = len(viewed.stations) <= MOST_NAMES or name == station
+            text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
+            parts.append(Mark(f"station {name or ''}".strip(), place, text))
     objects = viewed.asked(station).method.objects()
     parts += _object_parts(objects, viewed.site, legends, frame)
     cloud = cloud_of(viewed, station, measured)
     if cloud is not None:
         parts += _cloud_parts(cloud, legends, extent)
     hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
-    low, high = (viewed.box() * 1.0).round(2)
-    parts.append(_box_lines(low, high))
+    parts.append(_box_lines(*viewed.box()))
     title = f"{viewed.site.name}, {viewed.predictor.method.label}"
     return Scene(
         title if station is None else f"{title}: {station}",
@@ -101,7 +104,7 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
 
 def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
     chosen = np.linspace(0, len(measured.places) - 1, min(len(measured.places), MOST_POINTS)).astype(int)
-    places, values, errors = measured.places[chosen], measured.values[chosen], measured.errors[chosen]
+    places, values = measured.places[chosen], measured.values[chosen]
     size = dot_size(places, extent)
     legends[VALUES] = Legend.over(measured.label, values)
     parts: list[Part] = [Points(VALUES, places, legends[VALUES].of(values), size)]
@@ -126,19 +129,15 @@ def dot_size(places: np.ndarray, extent: float) -> float:
 def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> list[Part]:
     legend, colours = cloud_colours(cloud)
     legends[GAUSSIANS] = legends[SPLATS] = legend
+    size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
     return [
-        Points(
-            GAUSSIANS,
-            cloud.means,
-            colours,
-            float(np.clip(extent / 40 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 400, extent / 60)),
-        ),
+        Points(GAUSSIANS, cloud.means, colours, size),
         Splats(SPLATS, cloud.means, cloud.covariances(), colours, SHADE * cloud.opacities),
     ]
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
-    """What colours mean, and those (N, 3) uint8 of Gaussians: emissions in dB below the strongest, or losses."""
+    """What colours mean, and those (N, 3) uint8 of Gaussians: losses, or emissions below the strongest."""
     if "[dB]" in cloud.label:
         most = max(float(np.abs(cloud.strengths).max(initial=0.0)), 1e-3)
         legend = Legend(cloud.label, -most, most, "PuOr_r")
@@ -166,9 +165,8 @@ def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> 
     half = objects.turns / 2
     quats = np.column_stack([np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)])
     share = 1 - 10 ** (-np.abs(objects.losses) / 20)
-    found = GaussianCloud(
-        objects.means, objects.scales, quats, share, objects.losses, "loss through the middle [dB]"
-    )
+    label = "loss through the middle [dB]"
+    found = GaussianCloud(objects.means, objects.scales, quats, share, objects.losses, label)
     return _moved(found, site.origin)
 
 
@@ -196,7 +194,7 @@ def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]
 
 def _object_parts(objects: SiteObjects, site: Site, legends: dict[str, Legend], frame: Frame) -> list[Part]:
     parts: list[Part] = []
-    reach = 10.0 / frame.scale
+    reach = EXTENT / frame.scale
     for number, plane in enumerate(objects.planes):
         parts.append(_plane_faces(f"mirror {number}", plane, frame.middle - site.origin, site.origin, reach))
     for number, box in enumerate(objects.boxes + site.origin):
@@ -305,7 +303,7 @@ def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
 
 
 def start_place(viewed: Viewed, measured: Measured | None) -> np.ndarray:
-    """World place (3,) [m] where the moving end first stands: the measured one nearest to the middle of all."""
+    """World place (3,) [m] where the moving end first stands: the measured one nearest to their median."""
     if measured is None:
         return viewed.box().mean(axis=0)
     middle = np.median(measured.places, axis=0)

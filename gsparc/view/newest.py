@@ -65,9 +65,10 @@ class Newest:
                     return
                 key = next((key for key, (urgent, _) in self._jobs.items() if urgent), next(iter(self._jobs)))
                 entry = self._jobs[key]
-                step = self._begun.get(key)
+                begun = self._begun.get(key)
+            step: Iterator[object] = iter(())
             try:
-                step = entry[1]() if step is None else step
+                step = begun or entry[1]()
                 next(step)
                 done = False
             except StopIteration:

@@ -1,16 +1,21 @@
-"""Small pictures of an answer: a spectrum as a map of directions, a channel over its band, delays of paths."""
+"""Small pictures of an answer: a spectrum by direction, a channel over its band, its paths, a power."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import panels
-from gsparc.view.answer import Answer
+from gsparc.ops import SphereGrid
+from gsparc.view.answer import Answer, Usual
 from gsparc.view.scene import Legend
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
 MOST_LINES = 4  # antennas whose responses are drawn
+RED = "#D62728"  # of the end that moves
+MOST_DOTS = 1500  # measured levels that are drawn
 FLOOR_DB = -60.0  # below the largest entry of a channel, where its response ends
 
 
@@ -30,25 +35,26 @@ def response_db(response: np.ndarray) -> np.ndarray:
 def tones_mhz(site: Site, count: int) -> np.ndarray:
     """Frequencies (count,) [MHz]; numbers of subcarriers where they are not known."""
     known = site.subcarriers_hz
-    return (
-        np.arange(count, dtype=np.float64)
-        if known is None or len(known) != count
-        else np.asarray(known) / 1e6
-    )
+    if known is None or len(known) != count:
+        return np.arange(count, dtype=np.float64)
+    return np.asarray(known, np.float64) / 1e6
 
 
-def draw_answer(axis, answer: Answer, site: Site, unit: str = "dB") -> None:  # type: ignore[no-untyped-def]
-    """A spectrum, a response over the band or over antennas, or a level as a bar, into matplotlib axes."""
+def degrees_of(grid: SphereGrid) -> tuple[float, float, float, float]:
+    """Least and largest azimuth and elevation of a grid's pixels [degrees]."""
+    left = grid.first_azimuth - grid.azimuth_step / 2
+    low = grid.first_elevation - grid.elevation_step / 2
+    edges = left, left + grid.width * grid.azimuth_step, low, low + grid.height * grid.elevation_step
+    return tuple(float(edge) for edge in np.degrees(edges))  # type: ignore[return-value]
+
+
+def draw_answer(axis: Any, answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> None:
+    """Into matplotlib axes: a spectrum; a channel over its band, its paths or its antennas; or a power among
+    those that were measured, by distance or by how many they are."""
     if answer.spectrum is not None:
-        axis.imshow(
-            answer.spectrum,
-            origin="lower",
-            extent=(0, 360, 0, 90),
-            aspect="auto",
-            cmap="inferno",
-            vmin=0,
-            vmax=1,
-        )
+        assert site.grid is not None
+        how: dict[str, Any] = {"origin": "lower", "extent": degrees_of(site.grid), "aspect": "auto"}
+        axis.imshow(answer.spectrum, cmap=SPECTRUM.colours, vmin=0, vmax=1, **how)
         axis.grid(False)
         axis.set(xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction")
     elif answer.response is not None and answer.response.shape[1] > 1:
@@ -56,14 +62,39 @@ def draw_answer(axis, answer: Answer, site: Site, unit: str = "dB") -> None:  # 
         for line in response_db(answer.response):
             axis.plot(x, line)
         axis.set(xlabel="frequency [MHz]", ylabel="dB", title="channel over the band")
-    elif answer.response is not None:
+    elif answer.paths is not None and len(answer.paths.gain_db):
+        bottom = answer.paths.gain_db.min() - 3
+        axis.vlines(answer.paths.delay_ns, bottom, answer.paths.gain_db)
+        axis.plot(answer.paths.delay_ns, answer.paths.gain_db, "o", ms=4)
+        axis.set(xlabel="delay [ns]", ylabel="dB", title="paths", ylim=(bottom, None))
+    elif answer.response is not None and len(answer.response) > 1:
         axis.plot(response_db_of_antennas(answer.response), "o-", ms=3)
         axis.set(xlabel="antenna", ylabel="dB", title="channel over antennas")
-    elif answer.level_db is not None:
-        wide = answer.spread_db or 0.0
-        axis.barh([0], [2 * wide], left=[answer.level_db - wide], color="0.8", height=0.4)
-        axis.plot([answer.level_db], [0], "|", ms=30, mew=3)
-        axis.set(yticks=[], xlabel=f"received power [{unit}]", title="power with its deviation")
+    else:
+        _draw_level(axis, answer, known, unit)
+
+
+def _draw_level(axis: Any, answer: Answer, known: Usual | None, unit: str) -> None:
+    label = f"received power [{unit}]"
+    if known is None or not len(known.level_db) or answer.level_db is None:
+        axis.errorbar([0], [answer.level_db or np.nan], [answer.spread_db or 0.0], fmt="o", color=RED)
+        axis.set(xticks=[], ylabel=label)
+        return
+    ends = list(answer.ends.values())
+    if len(known.distance_m) and len(ends) == 2:
+        few = np.linspace(0, len(known.level_db) - 1, min(len(known.level_db), MOST_DOTS)).astype(int)
+        axis.plot(known.distance_m[few], known.level_db[few], ".", ms=3, color="0.7", label="measured")
+        far = np.geomspace(known.distance_m.min(), known.distance_m.max(), 50)
+        axis.plot(far, known.at_one - known.slope * np.log10(far), color="0.3", label="distance alone")
+        here = float(np.linalg.norm(ends[0] - ends[1]))
+        axis.errorbar([here], [answer.level_db], [answer.spread_db or 0.0], fmt="o", color=RED, label="here")
+        axis.set(xlabel="distance [m]", ylabel=label, xscale="log")
+        axis.legend(loc="lower left")
+    else:
+        axis.hist(known.level_db, 40, color="0.75")
+        axis.axvline(answer.level_db, color=RED, label="here")
+        axis.set(xlabel=label, ylabel="measured places")
+        axis.legend()
 
 
 def response_db_of_antennas(response: np.ndarray) -> np.ndarray:
@@ -72,10 +103,10 @@ def response_db_of_antennas(response: np.ndarray) -> np.ndarray:
     return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
 
 
-def panel_image(answer: Answer, site: Site, unit: str = "dB") -> np.ndarray:
+def panel_image(answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> np.ndarray:
     """`draw_answer` as a picture (h, w, 3) uint8."""
     figure, axes = panels(3.6, 2.2)
-    draw_answer(axes[0, 0], answer, site, unit)
+    draw_answer(axes[0, 0], answer, site, known, unit)
     figure.set_dpi(110)
     canvas = figure.canvas
     canvas.draw()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,8 @@ from gsparc.methods.predictor import Predictor
 from gsparc.view.scene import Legend, Sheet
 
 FIRST = 400  # cells of the first, coarsest picture, about
-CHUNK = 256  # cells of a step: what a drag waits for at most
+STEP_S = 0.03  # of a step: what a drag waits for [s]
+LEAST = 16  # cells of a step
 
 
 @dataclass(frozen=True)
@@ -45,10 +47,18 @@ def lifted(grid: Grid, height: float) -> Grid:
     return replace(grid, height=height)
 
 
+def thinned(grid: Grid, most: int) -> Grid:
+    """At most about `most` cells along the longer side, of every n-th row and column."""
+    every = max(1, -(-max(grid.shape) // most))
+    return Grid(
+        grid.x[::every], grid.y[::every], grid.height, grid.step * every, grid.inside[::every, ::every]
+    )
+
+
 def refining(
     predictor: Predictor, grid: Grid, other: Sequence[float] | None = None
 ) -> Iterator[Plane | None]:
-    """Planes of ever smaller strides; None between them, after every `CHUNK` cells.
+    """Planes of ever smaller strides; None between them, about every `STEP_S`.
 
     Args:
         predictor: of one station where there are several.
@@ -59,13 +69,16 @@ def refining(
     level = np.full(grid.shape, np.nan)
     stride = 1 << max(0, int(np.ceil(np.log2(max(np.sqrt(nx * ny / FIRST), 1.0)))))
     row, column = np.mgrid[0:ny, 0:nx]
-    done = np.zeros(grid.shape, bool)
+    done, chunk = np.zeros(grid.shape, bool), LEAST
     while stride:
         chosen = (row % stride == 0) & (column % stride == 0) & ~done & grid.inside
-        cells = np.flatnonzero(chosen)
-        for start in range(0, len(cells), CHUNK):
-            part = cells[start : start + CHUNK]
+        cells, start = np.flatnonzero(chosen), 0
+        while start < len(cells):
+            begin, part = time.perf_counter(), cells[start : start + chunk]
             level.reshape(-1)[part] = _levels(predictor, grid.places(part), other)
+            start += len(part)
+            took = time.perf_counter() - begin
+            chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
             yield None
         done |= chosen
         yield Plane(grid, _spread(level, stride, grid), stride)
@@ -90,13 +103,8 @@ def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
 
 def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, opacity: float = 0.9) -> Sheet:
     """A picture of values (ny, nx) over the cells, clear where they are not finite."""
-    image = np.concatenate(
-        [
-            legend.of(values),
-            np.where(np.isfinite(values), round(255 * opacity), 0)[..., None].astype(np.uint8),
-        ],
-        axis=-1,
-    )
+    clear = np.where(np.isfinite(values), round(255 * opacity), 0)[..., None].astype(np.uint8)
+    image = np.concatenate([legend.of(values), clear], axis=-1)
     left, right, low, high = grid.extent
     return Sheet(
         name, np.array([left, high, grid.height]), np.array([right - left, 0.0, 0.0]),

@@ -81,7 +81,7 @@ class Faces:
 
 @dataclass(frozen=True)
 class Sheet:
-    """A picture (h, w, 3 or 4) uint8 that lies in space: its upper left corner, its upper edge, its left edge.
+    """A picture (h, w, 3 or 4) uint8 that lies in space: its upper left corner, its upper and its left edge.
 
     Attributes:
         corner, right, down: (3,) [m], world.

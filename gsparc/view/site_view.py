@@ -95,7 +95,8 @@ class SiteView:
     def starts(self, name: str | None) -> dict[str, np.ndarray]:
         """World places (3,) where the ends that move first stand."""
         viewed, first = self.viewed, self.viewed.moving[-1]
-        found = {first: self.at if self.at is not None else start_place(viewed, self.station(name).measured)}
+        at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
+        found: dict[str, np.ndarray] = {first: at}
         if len(viewed.moving) > 1:
             other = (viewed.site.box + viewed.site.origin).mean(axis=0)
             if viewed.data is not None:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
-from gsparc.data.schema import End
 from gsparc.view.answer import Answer
 from gsparc.view.scene import Legend
 
@@ -18,15 +17,13 @@ def headline(answer: Answer, unit: str = "dB") -> str:
     if answer.level_db is not None:
         spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
         said.append(f"{answer.level_db:.1f}{spread} {unit}")
-    if answer.spectrum is not None:
-        row, column = divmod(int(answer.spectrum.argmax()), answer.spectrum.shape[1])
-        tall, wide = answer.spectrum.shape
-        said.append(f"strongest at azimuth {360 * (column + 0.5) / wide:.0f}°, row {row} of {tall}")
+    if answer.strongest is not None:
+        said.append("strongest from azimuth {:.0f}°, elevation {:.0f}°".format(*answer.strongest))
     said.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
     return ", ".join(said)
 
 
-def answer_markdown(answer: Answer, moving: tuple[End, ...], reasons: Iterable[str], unit: str = "dB") -> str:
+def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
     """An answer and why, for a panel."""
     lines = [f"**{headline(answer, unit)}**", ""]
     lines += [

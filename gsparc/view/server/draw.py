@@ -11,7 +11,8 @@ from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, S
 
 THICKNESS = 1.5  # of lines [pixels]
 STATION = (40, 40, 40)
-ABOVE = (0.25, -1.15, 0.95)  # where a camera first stands, in widths of the site
+ABOVE = (0.15, -0.95, 0.8)  # where a camera first stands, in widths of the site
+ASIDE = np.array([0.15, 0.0, 0.0])
 
 
 def draw(api: Any, frame: Frame, part: Part, visible: bool = True) -> Any:
@@ -35,19 +36,20 @@ def draw(api: Any, frame: Frame, part: Part, visible: bool = True) -> Any:
     if isinstance(part, Splats):
         return api.add_gaussian_splats(
             name, frame.drawn(part.means), np.float32(part.covariances * frame.scale**2), part.colours,
-            np.float32(part.opacities)[:, None], visible=visible,
+            part.opacities.astype(np.float32)[:, None], visible=visible,
         )  # fmt: skip
     if isinstance(part, Faces):
         return api.add_mesh_simple(
-            name, frame.drawn(part.vertices), part.triangles, color=part.colour, opacity=part.opacity, side="double",
-            flat_shading=True, cast_shadow=False, receive_shadow=False, visible=visible,
+            name, frame.drawn(part.vertices), part.triangles, color=part.colour, opacity=part.opacity,
+            side="double", flat_shading=True, cast_shadow=False, receive_shadow=False, visible=visible,
         )  # fmt: skip
     if isinstance(part, Sheet):
         return _sheet(api, frame, part, visible)
     assert isinstance(part, Mark)
     place = frame.drawn(part.place)
     ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=place, visible=visible)
-    api.add_label(f"{name}/name", part.text, position=(0.0, 0.0, 0.02 * EXTENT), anchor="bottom-center")
+    if part.text:
+        api.add_label(f"{name}/name", part.text, position=(0.0, 0.0, 0.02 * EXTENT), anchor="bottom-center")
     return ball
 
 
@@ -63,8 +65,8 @@ def _sheet(api: Any, frame: Frame, part: Sheet, visible: bool) -> Any:
     turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(scalar_first=True)
     middle = part.corner + (part.right + part.down) / 2
     return api.add_image(
-        path_of(part.name), part.image, float(wide * frame.scale), float(tall * frame.scale), cast_shadow=False,
-        receive_shadow=False, wxyz=turn, position=frame.drawn(middle), visible=visible,
+        path_of(part.name), part.image, float(wide * frame.scale), float(tall * frame.scale),
+        cast_shadow=False, receive_shadow=False, wxyz=turn, position=frame.drawn(middle), visible=visible,
     )  # fmt: skip
 
 
@@ -76,14 +78,14 @@ def floor(api: Any, scene: Scene, box: np.ndarray) -> float:
     side *= next(n for n in (5, 2, 1) if n * side <= wide / 5)
     middle = np.array([*frame.middle[:2], box[0, 2] - 1e-3 * wide])
     api.add_grid(
-        "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale, section_size=5 * side * frame.scale,
-        position=frame.drawn(middle), shadow_opacity=0.0,
+        "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale,
+        section_size=5 * side * frame.scale, position=frame.drawn(middle), shadow_opacity=0.0,
     )  # fmt: skip
     return float(side)
 
 
-def first_view(camera: Any, scene: Scene) -> None:
-    """Look at the site from the south and above."""
-    camera.position = tuple(EXTENT * np.array(ABOVE))
-    camera.look_at = (0.0, 0.0, 0.0)
+def first_view(camera: Any) -> None:
+    """Look at the site from the south and above, past the panel that lies at the right."""
+    camera.position = tuple(EXTENT * (np.array(ABOVE) + ASIDE))
+    camera.look_at = tuple(EXTENT * ASIDE)
     camera.up = (0.0, 0.0, 1.0)

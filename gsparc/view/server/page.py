@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from gsparc.view.answer import Answer, ask
+from gsparc.view.answer import Answer, Usual, ask
 from gsparc.view.building import SPHERE, rays_of
 from gsparc.view.panel import panel_image
 from gsparc.view.plane import refining, sheet
@@ -22,9 +22,9 @@ from gsparc.view.words import ENDS, headline, legend_html
 STEPS = 24  # places of the walk
 PAUSE_S = 0.6  # at each
 LIMITS = (
-    "A saved scene: nothing is computed here. Drag to turn, scroll to come nearer; the bar at the bottom plays "
-    "{steps} recorded places of the {end}. To drag it anywhere, change the operating point or lift the plane: "
-    "gsparc view ckpt=FILE."
+    "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at the bottom "
+    "plays {steps} recorded places of the {end}. To drag it anywhere, to change the operating point or to "
+    "lift the plane: gsparc view ckpt=FILE."
 )
 
 
@@ -49,7 +49,7 @@ def _recorded(server: Any, view: SiteView) -> tuple[str, str]:
     one, viewed, api = view.station(name), view.viewed, server.scene
     scene, moving = one.scene, viewed.moving[-1]
     api.set_up_direction("+z")
-    first_view(server.initial_camera, scene)
+    first_view(server.initial_camera)
     for part in scene.parts:
         if part.name not in scene.hidden:
             draw(api, scene.frame, part)
@@ -62,7 +62,7 @@ def _recorded(server: Any, view: SiteView) -> tuple[str, str]:
         legends.append(legend)
         draw(api, scene.frame, sheet("plane", view.grid, plane.level_db, legend))
     places = walk(view, name, STEPS)
-    answers = [ask(viewed.asked(name), {**view.starts(name), moving: place}) for place in places]  # type: ignore[arg-type]
+    answers = [ask(viewed.asked(name), {**view.starts(name), moving: place}) for place in places]
     recorder = server.get_scene_serializer()
     dot = api.add_icosphere("/end", radius=0.016 * EXTENT, color=(214, 39, 40))
     label = api.add_label("/end/says", "", position=(0, 0, 0.03 * EXTENT), anchor="bottom-center")
@@ -77,7 +77,7 @@ def _recorded(server: Any, view: SiteView) -> tuple[str, str]:
             draw(api, scene.frame, dots)
         for part in rays_of(answer, view.extent(name)) or ():
             draw(api, scene.frame, part)
-        draw(api, scene.frame, _upright(answer, view, scene.frame.middle, EXTENT / scene.frame.scale))
+        draw(api, scene.frame, _upright(answer, view, one.usual, scene.frame.middle, view.extent(name)))
         recorder.insert_sleep(PAUSE_S)
     said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=len(places), end=ENDS[moving])]
     return recorder.as_html(), _beside(scene.title, said, legends)
@@ -89,9 +89,9 @@ def _other(view: SiteView) -> list[float] | None:
     return [float(value) for value in view.starts(None)["tx"]]
 
 
-def _upright(answer: Answer, view: SiteView, middle: np.ndarray, extent: float) -> Sheet:
+def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.ndarray, extent: float) -> Sheet:
     """The panel of an answer, standing behind the site."""
-    image = panel_image(answer, view.viewed.site, view.unit)
+    image = panel_image(answer, view.viewed.site, known, view.unit)
     wide = 0.55 * extent
     tall = wide * image.shape[0] / image.shape[1]
     corner = middle + np.array([-0.5 * wide, 0.62 * extent, 0.1 * extent + tall])

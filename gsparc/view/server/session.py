@@ -59,7 +59,7 @@ class Session:
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
         self._draw_still()
-        first_view(client.camera, self.scene)
+        first_view(client.camera)
         self._panel()
         self._add_gizmos()
         self.wanted()
@@ -96,7 +96,7 @@ class Session:
     def _add_gizmos(self) -> None:
         for end, place in self.places.items():
             gizmo = self.client.scene.add_transform_controls(
-                f"/{end}", scale=0.11 * EXTENT, disable_rotations=True, depth_test=False,
+                f"/{end}", scale=0.2 * EXTENT, disable_rotations=True, depth_test=False,
                 position=self.scene.frame.drawn(place),
             )  # fmt: skip
             self.client.scene.add_icosphere(f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40))
@@ -132,7 +132,7 @@ class Session:
             self.way = None
             if last:
                 self.way = gui.add_slider("fast to accurate", 0, last, 1, last)
-                self._on(self.way, lambda value: self.wanted())
+                self._on(self.way, self._way_changed)
             self.speed = gui.add_markdown("")
         self._layers_panel(gui)
         with gui.add_folder("Colours"):
@@ -229,6 +229,11 @@ class Session:
         self.nodes[SPLATS].visible = value == "ellipsoids"
         self._legends()
 
+    def _way_changed(self, value: int) -> None:
+        self.queries.clear()
+        self.delays.clear()
+        self.wanted()
+
     def _station_changed(self, value: str) -> None:
         self.station = value
         self.work.ask((self.client.client_id, "station"), self._show_station, urgent=True)
@@ -323,10 +328,11 @@ class Session:
             lines, x, label = response_db_of_antennas(response)[None], np.arange(len(response)), "antenna"
         data = (np.asarray(x, np.float64), *(np.asarray(line, np.float64) for line in lines))
         if self.curve is None:
-            series = (uplot.Series(label=label),) + tuple(
+            each = [
                 uplot.Series(label=f"{n}" if len(lines) > 1 else "dB", stroke=COLOURS[n], width=2)
                 for n in range(len(lines))
-            )
+            ]
+            series = (uplot.Series(label=label), *each)
             self.curve = self._plot(data, series, "channel [dB]", label)
         else:
             self.curve.data = data
@@ -383,11 +389,11 @@ class Session:
             legend = legend or Legend.over(f"predicted power [{self.view.unit}]", plane.level_db)
             self.plane = plane
             self._lay(sheet(PLANE, grid, plane.level_db, legend))
-            cells = int(grid.inside.sum())
+            asked = "all asked" if plane.stride == 1 else f"every {plane.stride}th asked"
             self.progress.content = (
-                f"{cells} cells of {grid.step:.3g} m, " + ("all asked" if plane.stride == 1 else f"every {plane.stride}th asked")
-                + f", {time.perf_counter() - begin:.1f} s"
-            )  # fmt: skip
+                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m, {asked}, "
+                f"{time.perf_counter() - begin:.1f} s"
+            )
             yield
 
     def _lay(self, part: Any) -> None:
