@@ -12,7 +12,7 @@ from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, S
 THICKNESS = 1.5  # of lines [pixels]
 STATION = (40, 40, 40)
 ABOVE = (0.15, -0.95, 0.8)  # where a camera first stands, in widths of the site
-ASIDE = np.array([0.15, 0.0, 0.0])
+ASIDE = 0.15  # how far east of the site it looks, where a panel covers what lies there
 
 
 def draw(api: Any, frame: Frame, part: Part, visible: bool = True) -> Any:
@@ -84,8 +84,9 @@ def floor(api: Any, scene: Scene, box: np.ndarray) -> float:
     return float(side)
 
 
-def first_view(camera: Any) -> None:
-    """Look at the site from the south and above, past the panel that lies at the right."""
-    camera.position = tuple(EXTENT * (np.array(ABOVE) + ASIDE))
-    camera.look_at = tuple(EXTENT * ASIDE)
+def first_view(camera: Any, aside: float = ASIDE) -> None:
+    """Look at the site from the south and above, `aside` widths past its middle."""
+    east = np.array([aside, 0.0, 0.0])
+    camera.position = tuple(EXTENT * (np.array(ABOVE) + east))
+    camera.look_at = tuple(EXTENT * east)
     camera.up = (0.0, 0.0, 1.0)

@@ -28,28 +28,29 @@ LIMITS = (
 )
 
 
-def page(view: SiteView) -> str:
+def page(view: SiteView, steps: int = STEPS) -> str:
     """The page as text; about 1 MB, most of it the viewer.
 
     Args:
         view: the model; its first station is shown.
+        steps: places of the walk.
     """
     with contextlib.redirect_stdout(io.StringIO()):  # viser's banner, of a server that nobody is to visit
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
-            text, notes = _recorded(server, view)
+            text, notes = _recorded(server, view, steps)
         finally:
             server.stop()
     before, end, after = text.rpartition("</body>")
     return before + notes + end + after
 
 
-def _recorded(server: Any, view: SiteView) -> tuple[str, str]:
+def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     name = view.viewed.stations[0]
     one, viewed, api = view.station(name), view.viewed, server.scene
     scene, moving = one.scene, viewed.moving[-1]
     api.set_up_direction("+z")
-    first_view(server.initial_camera)
+    first_view(server.initial_camera, 0.0)
     for part in scene.parts:
         if part.name not in scene.hidden:
             draw(api, scene.frame, part)
@@ -61,7 +62,7 @@ def _recorded(server: Any, view: SiteView) -> tuple[str, str]:
         legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
         draw(api, scene.frame, sheet("plane", view.grid, plane.level_db, legend))
-    places = walk(view, name, STEPS)
+    places = walk(view, name, steps)
     answers = [ask(viewed.asked(name), {**view.starts(name), moving: place}) for place in places]
     recorder = server.get_scene_serializer()
     dot = api.add_icosphere("/end", radius=0.016 * EXTENT, color=(214, 39, 40))
@@ -92,9 +93,9 @@ def _other(view: SiteView) -> list[float] | None:
 def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.ndarray, extent: float) -> Sheet:
     """The panel of an answer, standing behind the site."""
     image = panel_image(answer, view.viewed.site, known, view.unit)
-    wide = 0.55 * extent
+    wide = 0.9 * extent
     tall = wide * image.shape[0] / image.shape[1]
-    corner = middle + np.array([-0.5 * wide, 0.62 * extent, 0.1 * extent + tall])
+    corner = middle + np.array([-0.5 * wide, 0.75 * extent, 0.15 * extent + tall])
     return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
