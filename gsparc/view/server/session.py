@@ -54,6 +54,7 @@ class Session:
         self.asked_s = time.perf_counter()
         self.delays: deque[float] = deque(maxlen=KEPT)
         self.queries: deque[float] = deque(maxlen=KEPT)
+        self.answers = 0  # that were shown
         self.plane: Plane | None = None
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
@@ -78,8 +79,9 @@ class Session:
         for node in self.nodes.values():
             node.remove()
         self.nodes = {
-            part.name: draw(api, self.scene.frame, part, part.name not in self.scene.hidden)
+            part.name: draw(api, self.scene.frame, part)
             for part in self.scene.parts
+            if part.name not in self.scene.hidden
         }
         self.cell = floor(api, self.scene, self.view.viewed.box())
         if self.sphere is not None:
@@ -219,15 +221,21 @@ class Session:
         self._move(moving, place)
 
     def _points_changed(self, value: str) -> None:
-        for name, shown in ((VALUES, "values"), (ERRORS, "errors")):
-            if name in self.nodes:
-                self.nodes[name].visible = value == shown
+        self._seen(VALUES, value == "values")
+        self._seen(ERRORS, value == "errors")
         self._legends()
 
     def _gaussians_changed(self, value: str) -> None:
-        self.nodes[GAUSSIANS].visible = value == "points"
-        self.nodes[SPLATS].visible = value == "ellipsoids"
+        self._seen(GAUSSIANS, value == "points")
+        self._seen(SPLATS, value == "ellipsoids")
         self._legends()
+
+    def _seen(self, name: str, visible: bool) -> None:
+        """Show or hide a part; what is hidden at first is sent when it is first shown."""
+        if name in self.nodes:
+            self.nodes[name].visible = visible
+        elif visible and (part := self.scene.part(name)) is not None:
+            self.nodes[name] = draw(self.client.scene, self.scene.frame, part)
 
     def _way_changed(self, value: int) -> None:
         self.queries.clear()
@@ -255,16 +263,12 @@ class Session:
         self.work.ask((self.client.client_id, PLANE), self._planes)
 
     def _show_station(self) -> Iterator[None]:
-        shown = {
-            name: node.visible
-            for name, node in self.nodes.items()
-            if name in (VALUES, ERRORS, GAUSSIANS, SPLATS)
-        }
+        choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
+        shown = {name: self.nodes[name].visible for name in choices if name in self.nodes}
         with self.client.atomic():
             self._draw_still()
             for name, visible in shown.items():
-                if name in self.nodes:
-                    self.nodes[name].visible = visible
+                self._seen(name, visible)
         self.title.content = f"**{self.scene.title}**"
         self._legends()
         self.wanted()
@@ -283,6 +287,7 @@ class Session:
             self.said.content = f"**{error}**"
             return
         self._show(answer)
+        self.answers += 1
         self.queries.append(answer.query_ms)
         self.delays.append((time.perf_counter() - since) * 1e3)
         self.speed.content = (
