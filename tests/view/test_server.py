@@ -9,6 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from campaigns import compose, spectra
+
+import gsparc
+from gsparc.commands.train import train
+from gsparc.maps.pictures import layers
+from gsparc.view.site_view import SiteView
+from gsparc.view.viewed import open_viewed
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -69,6 +76,35 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
     session._gaussians_changed("ellipsoids")
     assert session.nodes["splats"].visible and not session.nodes["gaussians"].visible
+
+
+def test_the_sphere_of_a_receiver_that_moves_goes_with_it(visit, tmp_path):
+    file = spectra(tmp_path / "rx.npz", moving="rx")
+    train(
+        compose("dataset=own", f"dataset.file={file}", "model=idw", "baselines=[]", "logger=none"), tmp_path
+    )
+    session = visit(SiteView(open_viewed(tmp_path / "model.ckpt")))
+    drag(session, "rx", [0.2, 0.1, -0.3])
+    settle(session)
+    where = session.scene.frame.world(session.nodes["sphere"].position)
+    np.testing.assert_allclose(where, [0.2, 0.1, -0.3], atol=1e-5)
+
+
+def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
+    found = gsparc.load(power_view.viewed.name).map([0, 0, 80, 60], step_m=8.0, height_m=3.0)
+    made = [layer for layer in layers(found) if not layer.words]
+    view = SiteView(power_view.viewed, grid=power_view.grid, layers=tuple((found.grid, one) for one in made))
+    session = visit(view)
+    settle(session)
+    session.chosen.value = "outage"
+    session.want_plane()
+    settle(session)
+    assert session.nodes["plane"].image.shape[:2] == found.grid.shape
+    assert "probability of less than" in session.legend.content
+    session.chosen.value = "nothing"
+    session.want_plane()
+    settle(session)
+    assert "plane" not in session.nodes
 
 
 def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(visit, power_view):

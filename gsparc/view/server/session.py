@@ -84,16 +84,13 @@ class Session:
             if part.name not in self.scene.hidden
         }
         self.cell = floor(api, self.scene, self.view.viewed.box())
-        if self.sphere is not None:
-            still = self.view.viewed.still(self.station)
-            if still is not None:
-                at = Points(
-                    SPHERE,
-                    still + self.sphere.offsets,
-                    np.zeros((len(self.sphere.rows), 3), np.uint8),
-                    self.sphere.size,
-                )
-                self.nodes[SPHERE] = draw(api, self.scene.frame, at)
+        if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
+            around, black = (
+                self.scene.frame.middle + self.sphere.offsets,
+                np.zeros((len(self.sphere.rows), 3)),
+            )
+            dots = Points(SPHERE, around, black.astype(np.uint8), self.sphere.size)
+            self.nodes[SPHERE] = draw(api, self.scene.frame, dots)
 
     def _add_gizmos(self) -> None:
         for end, place in self.places.items():
@@ -304,12 +301,12 @@ class Session:
             for end in self.vectors:
                 self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
             if answer.spectrum is not None:
-                self._show_spectrum(answer.spectrum)
+                self._show_spectrum(answer.spectrum, answer.ends.get("rx"))
             if answer.response is not None:
                 self._show_response(answer.response)
             self._show_rays(answer)
 
-    def _show_spectrum(self, spectrum: np.ndarray) -> None:
+    def _show_spectrum(self, spectrum: np.ndarray, receiver: np.ndarray | None) -> None:
         image = spectrum_image(spectrum)
         if self.picture is None:
             self.picture = self.client.gui.add_image(
@@ -317,7 +314,8 @@ class Session:
             )
         else:
             self.picture.image = image
-        if self.sphere is not None and SPHERE in self.nodes:
+        if self.sphere is not None and receiver is not None:
+            self.nodes[SPHERE].position = self.scene.frame.drawn(receiver)
             self.nodes[SPHERE].colors = self.sphere.colours(spectrum)
 
     def _show_response(self, response: np.ndarray) -> None:
