@@ -3,7 +3,7 @@
     python bench/viewer.py RUN/model.ckpt --seconds 60 --clients 2
     python bench/viewer.py RUN/model.ckpt --browser --step_m 10
 
-Without `--browser` clients are viser's own scenes without a network; with it Debian's chromium draws, in
+Without `--browser` clients read what a browser would, and draw nothing; with it Debian's chromium draws, in
 software.
 """
 
@@ -12,13 +12,19 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
+import socket
 import sys
+import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import msgspec
 import numpy as np
+import viser
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from gsparc.view.building import Given
 from gsparc.view.server.serve import Server
@@ -56,35 +62,97 @@ def drag(session: Any, place: np.ndarray) -> None:
     asyncio.run(session._dragged(end)(SimpleNamespace(target=session.gizmos[end])))
 
 
+class Hand:
+    """A client without a browser: connects, drags as viser's page does, and reads what comes.
+
+    Attributes:
+        received: megabytes.
+        delays: from a drag to the next message [ms].
+    """
+
+    def __init__(self, server: Server) -> None:
+        before, self.received, self.delays, self.since = set(server.sessions), 0.0, [], 0.0
+        self.socket = connect(
+            server.address.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None, compression=None,
+        )  # fmt: skip
+        camera = {"wxyz": (1.0, 0, 0, 0), "position": (0.0, -9, 8), "fov": 1.3, "near": 0.01, "far": 1e3}
+        sizes = {
+            "image_height": 700,
+            "image_width": 1100,
+            "look_at": (0.0, 0, 0),
+            "up_direction": (0.0, 0, 1),
+        }
+        self.say("ViewerCameraMessage", **camera, **sizes)
+        threading.Thread(target=self.read, daemon=True).start()
+        while not set(server.sessions) - before:
+            time.sleep(0.05)
+        (self.number,) = set(server.sessions) - before
+        self.session = server.sessions[self.number]
+
+    def say(self, kind: str, **fields: object) -> None:
+        """Send a message of viser's."""
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def read(self) -> None:
+        """Until the socket closes."""
+        try:
+            for message in self.socket:
+                self.received += len(message) / 1e6
+                if self.since:
+                    self.delays.append(1e3 * (time.perf_counter() - self.since))
+                    self.since = 0.0
+        except ConnectionClosed:
+            pass
+
+    def drag(self, place: np.ndarray) -> None:
+        """Move the handle of the end that moves."""
+        self.since = self.since or time.perf_counter()
+        at = tuple(float(value) for value in self.session.scene.frame.drawn(place))
+        name = f"/{self.session.view.viewed.moving[-1]}"
+        fields = {"name": name, "wxyz": (1.0, 0, 0, 0), "position": at, "owner": str(self.number)}
+        self.say("TransformControlsUpdateMessage", **fields)
+
+    def vanish(self) -> None:
+        """Without a word."""
+        self.socket.socket.shutdown(socket.SHUT_RDWR)
+
+
 def say(*words: object) -> None:
     """A line of the table."""
     sys.stdout.write("\t".join(str(word) for word in words) + "\n")
     sys.stdout.flush()
 
 
-def steady(server: Server, seconds: float, every: float) -> None:
-    """Drag all clients for a while; medians of each interval."""
-    box, sessions = server.view.viewed.box(), list(server.sessions.values())
-    say("second", "answers", "query ms", "drag to sent ms", "cpu ms per answer", "resident MB", "load")
+def steady(server: Server, hands: list[Hand], seconds: float, every: float) -> None:
+    """Drag all clients for a while; medians of each interval. At half time the last of several vanishes."""
+    box, several = server.view.viewed.box(), len(hands) > 1
+    say("second", "clients", "answers", "query ms", "drag to message ms", "cpu ms an answer", "MB", "load")
     begin, told = time.perf_counter(), 0.0
     clock, answers = time.process_time(), 0
     while (now := time.perf_counter() - begin) < seconds:
-        for session in sessions:
-            drag(session, path_of_hand(box, now))
+        if several and now > seconds / 2:
+            hands.pop().vanish()
+            several = False
+        for hand in hands:
+            hand.drag(path_of_hand(box, now))
         time.sleep(1 / RATE_HZ)
         if now - told >= every:
-            total = sum(session.answers for session in sessions)
-            query = np.median(np.concatenate([session.queries for session in sessions]))
-            delay = np.median(np.concatenate([session.delays for session in sessions]))
+            total = sum(hand.session.answers for hand in hands)
+            query = np.median(np.concatenate([hand.session.queries for hand in hands]))
+            delay = np.median(np.concatenate([hand.delays[-200:] for hand in hands]))
             cpu = 1e3 * (time.process_time() - clock) / max(total - answers, 1)
+            load = f"{os.getloadavg()[0]:.1f}"
+            here = len(server.sessions)
             say(
                 f"{now:.0f}",
+                here,
                 total,
                 f"{query:.2f}",
-                f"{delay:.1f}",
+                f"{delay:.0f}",
                 f"{cpu:.1f}",
                 f"{resident_mb():.0f}",
-                f"{os.getloadavg()[0]:.1f}",
+                load,
             )
             told, clock, answers = now, time.process_time(), total
 
@@ -148,13 +216,10 @@ def main() -> None:
     try:
         if given.browser:
             return browse(server, given.seconds)
-        one = server.server
-        for number in range(given.clients):
-            client = SimpleNamespace(
-                client_id=number, scene=one.scene, gui=one.gui, camera=one.initial_camera, atomic=one.atomic
-            )
-            server._came(client)
-        steady(server, given.seconds, given.every)
+        hands = [Hand(server) for _ in range(given.clients)]
+        while len(server.work):
+            time.sleep(0.1)
+        steady(server, hands, given.seconds, given.every)
     finally:
         server.stop()
 
