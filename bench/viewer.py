@@ -217,7 +217,7 @@ def main() -> None:
         if given.browser:
             return browse(server, given.seconds)
         hands = [Hand(server) for _ in range(given.clients)]
-        while len(server.work):
+        while not all(hand.session.answers for hand in hands):
             time.sleep(0.1)
         steady(server, hands, given.seconds, given.every)
     finally:
