@@ -16,7 +16,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ["ops", "physics", "data", "simulate", "field", "methods", "training", "array", "multipath"]
-ROOMS += ["peers", "auto", "evaluation", "maps", "commands", "callbacks", "conf"]
+ROOMS += ["peers", "auto", "evaluation", "maps", "view", "commands", "callbacks", "conf"]
 # What each room may import; a new arrow is added here, where it can be seen, or it is not made.
 ARROWS = {
     "ops": "",
@@ -32,8 +32,9 @@ ARROWS = {
     "auto": "data methods ops",
     "evaluation": "data methods",
     "maps": "data evaluation methods",
+    "view": "data evaluation maps methods ops",
     "callbacks": "data evaluation field training",
-    "commands": "data evaluation field maps methods multipath ops simulate training",
+    "commands": "data evaluation field maps methods multipath ops simulate training view",
     "conf": "",
 }
 FILES = [
@@ -99,6 +100,29 @@ def test_rooms_import_what_the_list_allows_and_nothing_else(capsys):
 
 def test_few_modules_lie_beside_the_rooms():
     assert {file.name for file in (ROOT / "gsparc").glob("*.py")} == {"__init__.py", "__main__.py"}
+
+
+def test_only_the_viewers_server_imports_viser():
+    used = [file for _, file in FILES if "viser" in {n.split(".")[0] for n in imported(_tree(file))}]
+    assert used and {file.parent for file in used} == {ROOT / "gsparc" / "view" / "server"}
+    kept = ROOT / "gsparc" / "view" / "server"
+    above = {
+        file.relative_to(ROOT).as_posix()
+        for _, file in FILES
+        if file.parent != kept
+        and any(n.startswith("gsparc.view.server") for n in imported(_top(_tree(file))))
+    }
+    assert not above, "imported where it is needed, in a function: the command does without viser"
+
+
+def _tree(file: Path) -> ast.Module:
+    return ast.parse(file.read_text(encoding="utf-8"))
+
+
+def _top(tree: ast.Module) -> ast.Module:
+    """What runs at import."""
+    kept = [node for node in tree.body if isinstance(node, (ast.Import, ast.ImportFrom))]
+    return ast.Module(kept, [])
 
 
 @pytest.mark.parametrize(("room", "file"), FILES, ids=[f"{r}/{f.name}" for r, f in FILES])

@@ -74,6 +74,7 @@ COMMANDS = {
         ),
         Command("link", f"{ROOM}link.command", "rates and block errors with predicted channels: ckpt=FILE"),
         Command("map", f"{ROOM}map", "received power over an area with a promised error: ckpt=FILE"),
+        Command("view", f"{ROOM}view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
         Command(
             "plan", f"{ROOM}plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"
         ),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from gsparc.data.files import whole_file
 from gsparc.maps.area import Grid
 
 REFUSED = -1  # of `best_server`
+ARRAYS = ("power_db", "lower_db", "upper_db", "expected_error_db", "best_server", "sinr_db", "outage")
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,35 @@ class FieldMap:
         }  # fmt: skip
         with whole_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def read(cls, path: str | Path) -> FieldMap:
+        """What `save` wrote; without measured places, stations' places and notes, which it does not hold.
+
+        Raises:
+            DataError: no such file, or not one of a map.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as stored:
+                held = {name: stored[name] for name in stored.files}
+            x, y, inside = held.pop("x"), held.pop("y"), held.pop("inside")
+            step = float(x[1] - x[0]) if len(x) > 1 else float(y[1] - y[0]) if len(y) > 1 else 1.0
+            grid = Grid(x, y, float(held.pop("height")), step, inside)
+            names = tuple(str(name) for name in held.pop("stations"))
+            arrays: dict[str, Any] = {name: held.pop(name) for name in ARRAYS}
+            share, calibrated = float(held.pop("share")), bool(held.pop("calibrated"))
+            threshold = float(held.pop("threshold_db"))
+        except FileNotFoundError:
+            raise DataError(f"map={path}: no such file; expected map.npz of gsparc map") from None
+        except (KeyError, ValueError, OSError, EOFError, BadZipFile):
+            raise DataError(f"map={path}: no map that can be read; expected map.npz of gsparc map") from None
+        facts: dict[str, Any] = {
+            "share": share,
+            "calibrated": calibrated,
+            "threshold_db": threshold,
+            "extra": held,
+        }
+        return cls(grid=grid, stations=names, **arrays, **facts)
 
     def figures(self) -> dict[str, float | int | None]:
         """`map/*` for `summary.json`; shares are of the cells that something is said of."""

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, runtime_chec
 import numpy as np
 from torch import Tensor
 
+from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
@@ -226,6 +227,18 @@ class HasPaths(Protocol):
 
     def paths(self, tx: Tensor, rx: Pose) -> tuple[Tensor, Tensor, Tensor, float]:
         """Gains (B, A, N), delays (B, A, N) [s], directions of arrival (B, N, 3), and the carrier [Hz].
+
+        Raises:
+            ValueError: what was fitted here has none.
+        """
+
+
+@runtime_checkable
+class HasGaussians(Protocol):
+    """What it renders are Gaussians in space."""
+
+    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+        """All of them, with what they emit for tx (B, 3) [m]: the root mean square over these positions.
 
         Raises:
             ValueError: what was fitted here has none.

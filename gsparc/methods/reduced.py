@@ -11,6 +11,7 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
+from gsparc.data.site_objects import SiteObjects
 from gsparc.methods.method import Method, Prediction, Reducible
 from gsparc.methods.pareto import Settings
 from gsparc.ops import Pose
@@ -90,6 +91,10 @@ class View(Method):
     def size(self) -> int:
         """As the inner method's."""
         return self.inner.size()
+
+    def objects(self) -> SiteObjects:
+        """As the inner method's."""
+        return self.inner.objects()
 
     def fit(self, *unused: Any, **named: Any) -> NoReturn:
         """Refused: `TypeError`."""

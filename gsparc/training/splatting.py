@@ -14,6 +14,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -324,6 +325,19 @@ class LearnedField(Method):
         if self.frozen is None or self.frozen.version != int(model.gaussians.version):
             self.frozen = frozen_view(model, rx)
         return self.frozen
+
+    @torch.no_grad()
+    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+        """See `HasGaussians`; their attenuated emissions."""
+        if self.model is None or not self.size():
+            raise ValueError(f"{self.name}: nothing here is rendered from Gaussians")
+        model, square = self.model, torch.zeros(self.size())
+        for i in range(len(tx)):  # one at a time: features of all would be gigabytes
+            square += model.features(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx)[0].square().sum(1)
+        means, quats, scales, opacities = (part.double().numpy() for part in model.gaussians.geometry())
+        quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+        strength = (square / max(len(tx), 1)).sqrt().double().numpy()
+        return GaussianCloud(means, scales, quats, opacities, strength, "emission of a Gaussian")
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The model's own mean, not clamped; see `Differentiable`.

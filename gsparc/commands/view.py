@@ -1,0 +1,132 @@
+"""`gsparc view ckpt=FILE`: the field in three dimensions, in a browser or saved."""
+
+from __future__ import annotations
+
+import logging
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig
+
+from gsparc.commands.map import plan_of
+from gsparc.commands.output import run_directory, show
+from gsparc.commands.settings import RunSettings, plain
+from gsparc.data.errors import DataError
+from gsparc.data.files import whole_file
+from gsparc.data.walls import read_walls
+from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.maps.field_map import FieldMap
+from gsparc.maps.pictures import layers
+from gsparc.methods.timing import machine_facts, peak_memory
+from gsparc.view.building import Given, cloud_colours, cloud_of
+from gsparc.view.ply import write_ply
+from gsparc.view.site_view import SiteView, grid_for
+from gsparc.view.still import draw_still
+from gsparc.view.viewed import open_viewed
+
+log = logging.getLogger(__name__)
+
+SAVED = (".html", ".png", ".ply")
+
+
+def task(config: DictConfig) -> dict[str, Any]:
+    """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
+    RunSettings.of(config)
+    settings, save = plain(config), None if config.save is None else Path(str(config.save))
+    check(save, int(config.port))
+    view = view_of(config, settings)
+    said = [*view.viewed.notes]
+    if save is None:
+        said.append(serve(view, str(config.host), int(config.port)))
+    else:
+        said.append(write(view, save))
+    facts = {
+        "dataset/name": view.viewed.site.name, "dataset/kind": view.viewed.site.kind,
+        "model/name": view.viewed.predictor.method.name, "ckpt": str(config.ckpt),
+        "view/operating_points": len(view.viewed.ways), **provenance(), **machine_facts(), **peak_memory(),
+    }  # fmt: skip
+    write_summary(run_directory() / "summary.json", facts)
+    show(run_directory(), lines=said, before="summary ")
+    return facts
+
+
+def check(save: Path | None, port: int) -> None:
+    """Refuse what cannot be done before anything is read.
+
+    Raises:
+        DataError: an ending that nothing is written with, no such port, or `viser` is needed and not there.
+    """
+    if save is not None and save.suffix.lower() not in SAVED:
+        raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
+    if not 0 <= port < 65536:
+        raise DataError(f"port={port}: a number from 0 to 65535 is needed")
+    if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
+        raise DataError(
+            "viewing in a browser needs viser: pip install 'gsparc[viewer]' "
+            "(save=picture.png and save=gaussians.ply do without)"
+        )
+
+
+def view_of(config: DictConfig, settings: dict[str, Any]) -> SiteView:
+    """Everything that is shown, from a configuration.
+
+    Raises:
+        DataError: a file or a place that cannot be.
+    """
+    plan = plan_of(config)
+    given = Given(plan, None if config.walls is None else read_walls(config.walls))
+    viewed = open_viewed(config.ckpt, settings["dataset"], config.station, str(config.unit))
+    made: tuple[Any, ...] = ()
+    if config.map is not None:
+        found = FieldMap.read(config.map)
+        made = tuple((found.grid, layer) for layer in layers(found, str(config.unit)) if not layer.words)
+    return SiteView(
+        viewed, given, grid_for(viewed, settings, plan), made, _place("at", settings["at"]),
+        _place("other_end", settings["other_end"]),
+    )  # fmt: skip
+
+
+def _place(name: str, given: Any) -> np.ndarray | None:
+    if given is None:
+        return None
+    try:
+        place = np.array([float(value) for value in given])
+    except (TypeError, ValueError):
+        place = np.zeros(0)
+    if place.shape != (3,) or not np.isfinite(place).all():
+        raise DataError(f"{name}={given}: three finite numbers [m] are needed")
+    return place
+
+
+def serve(view: SiteView, host: str, port: int) -> str:
+    """Until Ctrl-C; returns what is said then."""
+    from gsparc.view.server.serve import Server
+
+    server = Server(view, host, port)
+    log.info("open %s in a browser; Ctrl-C ends it", server.address)
+    server.run()
+    return f"{server.address} is closed"
+
+
+def write(view: SiteView, path: Path) -> str:
+    """A page, a picture or a splat file, whole or not at all; returns what is said then."""
+    ending = path.suffix.lower()
+    if ending == ".png":
+        draw_still(view, path)
+    elif ending == ".html":
+        from gsparc.view.server.page import page
+
+        text = page(view)
+        with whole_file(path) as partial:
+            partial.write_text(text, encoding="utf-8")
+    else:
+        name = view.viewed.stations[0]
+        cloud = cloud_of(view.viewed, name, view.station(name).measured)
+        if cloud is None:
+            method = view.viewed.predictor.method.name
+            raise DataError(f"save={path}: {method} of {view.viewed.site.name} holds no Gaussians to write")
+        write_ply(path, cloud, cloud_colours(cloud)[1])
+        return f"{len(cloud)} Gaussians written to {path}"
+    return f"written to {path}"

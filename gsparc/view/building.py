@@ -1,0 +1,310 @@
+"""The scene of a model, and the parts of it that follow a dragged end."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+
+from gsparc.data.gaussian_cloud import GaussianCloud
+from gsparc.data.schema import Site
+from gsparc.data.site_objects import SiteObjects
+from gsparc.data.walls import SceneWalls
+from gsparc.maps.floor_plan import FloorPlan
+from gsparc.methods.method import HasGaussians
+from gsparc.ops import Pose
+from gsparc.view.answer import SILENT_DB, Answer
+from gsparc.view.scene import EXTENT, Faces, Frame, Legend, Lines, Mark, Part, Points, Scene, Sheet, Splats
+from gsparc.view.viewed import Measured, Viewed
+
+log = logging.getLogger(__name__)
+
+WORDS = ("transmitter", "receiver")  # that stand still
+MOST_NAMES = 5  # stations that are named at once
+MOST_POINTS = 20_000  # measured places that are drawn
+DIRECTIONS = 9000  # of a sphere of power, at most
+QUERIES = 16  # places at which Gaussians are asked what they emit
+RANGE_DB = 30.0  # of emissions that are told apart
+RADIUS = 0.08  # of a sphere of power, of the extent of the site
+SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
+REACH = 0.8  # of the extent, that rays are drawn to at most
+VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
+    "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Given:
+    """What is known of a site besides its model.
+
+    Attributes:
+        plan: of the floor, beneath all.
+        walls: known walls and boxes.
+    """
+
+    plan: FloorPlan | None = None
+    walls: SceneWalls | None = None
+
+
+def extent_of(viewed: Viewed, given: Given) -> np.ndarray:
+    """World places (n, 3) [m] that a frame is put around: where was measured, and the ends that stand."""
+    shown = [viewed.box()]
+    shown += [place[None] for name in viewed.stations if (place := viewed.still(name)) is not None]
+    if viewed.site.static_end is None:
+        shown.append(viewed.site.box + viewed.site.origin)
+    return np.concatenate(shown)
+
+
+def build(viewed: Viewed, given: Given, station: str | None, measured: Measured | None) -> Scene:
+    """Everything that stands still, seen from one station.
+
+    Args:
+        viewed: the model.
+        given: what else is known.
+        station: whose measurements and Gaussians are drawn.
+        measured: of that station.
+    """
+    frame = Frame.around(extent_of(viewed, given))
+    extent = EXTENT / frame.scale
+    parts: list[Part] = []
+    legends: dict[str, Legend] = {}
+    notes = list(viewed.notes)
+    if given.plan is not None:
+        parts.append(plan_sheet(given.plan, float(viewed.box()[0, 2])))
+    if given.walls is not None:
+        parts += walls_faces(given.walls)
+    if measured is not None:
+        parts += _measured_parts(measured, legends, extent)
+    for name in viewed.stations:
+        place = viewed.still(name)
+        if place is not None:
+            named = len(viewed.stations) <= MOST_NAMES or name == station
+            text = (name or WORDS[viewed.site.moving_end == "tx"]) if named else ""
+            parts.append(Mark(f"station {name or ''}".strip(), place, text))
+    objects = viewed.asked(station).method.objects()
+    parts += _object_parts(objects, viewed.site, legends, frame)
+    cloud = cloud_of(viewed, station, measured)
+    if cloud is not None:
+        parts += _cloud_parts(cloud, legends, extent)
+    hidden = tuple(name for name in (ERRORS, SPLATS) if any(part.name == name for part in parts))
+    parts.append(_box_lines(*viewed.box()))
+    title = f"{viewed.site.name}, {viewed.predictor.method.label}"
+    return Scene(
+        title if station is None else f"{title}: {station}",
+        frame,
+        tuple(parts),
+        legends,
+        hidden,
+        tuple(notes),
+    )
+
+
+def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
+    chosen = np.linspace(0, len(measured.places) - 1, min(len(measured.places), MOST_POINTS)).astype(int)
+    places, values = measured.places[chosen], measured.values[chosen]
+    size = dot_size(places, extent)
+    legends[VALUES] = Legend.over(measured.label, values)
+    parts: list[Part] = [Points(VALUES, places, legends[VALUES].of(values), size)]
+    if np.isfinite(measured.errors).any():
+        few = np.flatnonzero(np.isfinite(measured.errors))
+        psnr = measured.error_label.startswith("PSNR")
+        legends[ERRORS] = Legend.over(measured.error_label, measured.errors, "magma" if psnr else "magma_r")
+        colours = legends[ERRORS].of(measured.errors[few])
+        parts.append(Points(ERRORS, measured.places[few], colours, 1.4 * size))
+    return parts
+
+
+def dot_size(places: np.ndarray, extent: float) -> float:
+    """Width of dots [m]: the distance between neighbours, within bounds that can be seen."""
+    apart = extent / 100
+    if len(places) > 1:
+        distance = cKDTree(places).query(places[:: max(1, len(places) // 2000)], k=2)[0][:, 1]
+        apart = float(np.median(distance[distance > 0])) if (distance > 0).any() else apart
+    return float(np.clip(apart, extent / 250, extent / 80))
+
+
+def _cloud_parts(cloud: GaussianCloud, legends: dict[str, Legend], extent: float) -> list[Part]:
+    legend, colours = cloud_colours(cloud)
+    legends[GAUSSIANS] = legends[SPLATS] = legend
+    size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
+    return [
+        Points(GAUSSIANS, cloud.means, colours, size),
+        Splats(SPLATS, cloud.means, cloud.covariances(), colours, SHADE * cloud.opacities),
+    ]
+
+
+def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
+    """What colours mean, and those (N, 3) uint8 of Gaussians: losses, or emissions below the strongest."""
+    if "[dB]" in cloud.label:
+        most = max(float(np.abs(cloud.strengths).max(initial=0.0)), 1e-3)
+        legend = Legend(cloud.label, -most, most, "PuOr_r")
+        return legend, legend.of(cloud.strengths)
+    most = float(np.abs(cloud.strengths).max(initial=0.0))
+    level = 20 * np.log10(np.maximum(np.abs(cloud.strengths), most * 1e-6 + 1e-300) / (most or 1.0))
+    legend = Legend(f"{cloud.label} [dB of the strongest]", -RANGE_DB, 0.0, "plasma")
+    return legend, legend.of(level)
+
+
+@torch.no_grad()
+def cloud_of(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
+    """Gaussians in world coordinates: those that are rendered, or those that paths lose power in."""
+    predictor = viewed.asked(station)
+    method, site = predictor.method, predictor.site
+    if isinstance(method, HasGaussians):
+        try:
+            found = method.gaussians(*_queries(site, measured))
+            return _moved(found, site.origin)
+        except ValueError:
+            pass  # of this kind are only some of those that it fits
+    objects = method.objects()
+    if not len(objects.means):
+        return None
+    half = objects.turns / 2
+    quats = np.column_stack([np.cos(half), np.zeros_like(half), np.zeros_like(half), np.sin(half)])
+    share = 1 - 10 ** (-np.abs(objects.losses) / 20)
+    label = "loss through the middle [dB]"
+    found = GaussianCloud(objects.means, objects.scales, quats, share, objects.losses, label)
+    return _moved(found, site.origin)
+
+
+def _moved(cloud: GaussianCloud, by: np.ndarray) -> GaussianCloud:
+    return GaussianCloud(
+        cloud.means + by, cloud.scales, cloud.quats, cloud.opacities, cloud.strengths, cloud.label
+    )
+
+
+def _queries(site: Site, measured: Measured | None) -> tuple[torch.Tensor, Pose]:
+    """Local places of both ends at which emissions are asked."""
+    box = site.box if site.moving_box is None else site.moving_box[:, -3:]
+    places = np.random.default_rng(0).uniform(box[0], box[1], (QUERIES, 3))
+    if measured is not None:
+        places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)] - site.origin
+    still = np.zeros(3) if site.static_position is None else site.static_position
+    still = site.box.mean(0) if site.static_end is None else still
+    rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+    moving, fixed = (torch.from_numpy(np.asarray(x, np.float32)) for x in (places, still))
+    turn = torch.from_numpy(np.asarray(rotation, np.float32))
+    if site.moving_end == "tx":
+        return moving, Pose(fixed, turn)
+    return fixed.expand(len(moving), 3), Pose(moving, turn.expand(len(moving), 3, 3))
+
+
+def _object_parts(objects: SiteObjects, site: Site, legends: dict[str, Legend], frame: Frame) -> list[Part]:
+    parts: list[Part] = []
+    reach = EXTENT / frame.scale
+    for number, plane in enumerate(objects.planes):
+        parts.append(_plane_faces(f"mirror {number}", plane, frame.middle - site.origin, site.origin, reach))
+    for number, box in enumerate(objects.boxes + site.origin):
+        parts.append(_box_faces(f"box {number}", box))
+    return parts
+
+
+def _plane_faces(name: str, plane: np.ndarray, middle: np.ndarray, origin: np.ndarray, reach: float) -> Faces:
+    """A square of a mirror plane around the foot of the site's middle."""
+    normal = plane[:3] / np.linalg.norm(plane[:3])
+    foot = middle - (normal @ middle - plane[3] / np.linalg.norm(plane[:3])) * normal
+    one = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    one /= np.linalg.norm(one)
+    two = np.cross(normal, one)
+    half = reach / 2
+    corners = foot + half * np.array([-one - two, one - two, one + two, two - one]) + origin
+    return Faces(name, corners, np.array([[0, 1, 2], [0, 2, 3]]), (205, 92, 92), 0.12)
+
+
+def _box_faces(name: str, box: np.ndarray) -> Faces:
+    corner = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    return Faces(name, corner, triangles, (31, 119, 180), 0.35)
+
+
+def walls_faces(walls: SceneWalls) -> list[Part]:
+    """Known walls as one mesh, and boxes."""
+    vertices, triangles, count = [], [], 0
+    for face in walls.faces:
+        vertices.append(face)
+        triangles += [[count, count + i, count + i + 1] for i in range(1, len(face) - 1)]
+        count += len(face)
+    parts: list[Part] = []
+    if triangles:
+        parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), (120, 120, 120), 0.25))
+    parts += [_box_faces(f"known box {number}", box) for number, box in enumerate(walls.boxes)]
+    return parts
+
+
+def plan_sheet(plan: FloorPlan, height: float) -> Sheet:
+    """A floor plan at a height [m]."""
+    corners = np.column_stack([plan.corners(), np.full(4, height)])
+    return Sheet("floor plan", corners[0], corners[1] - corners[0], corners[3] - corners[0], plan.image)
+
+
+def _box_lines(low: np.ndarray, high: np.ndarray) -> Lines:
+    """Edges of the box in which was measured."""
+    corner = np.array(
+        [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    )
+    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+    return Lines("box of measurements", corner[np.array(pairs)], np.full((len(pairs), 3), 150, np.uint8))
+
+
+@dataclass(frozen=True)
+class Sphere:
+    """Directions around a receiver in which power is drawn.
+
+    Attributes:
+        rows, columns: of a spectrum, that are drawn.
+        offsets: (n, 3) [m], world, from the receiver.
+        size: of a dot [m].
+    """
+
+    rows: np.ndarray
+    columns: np.ndarray
+    offsets: np.ndarray
+    size: float
+
+    @classmethod
+    def of(cls, site: Site, extent: float) -> Sphere:
+        """Of a site of spectra; not more than `DIRECTIONS`."""
+        assert site.grid is not None
+        directions = site.grid.directions().numpy()
+        every = max(1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS))))
+        row, column = (
+            a.reshape(-1) for a in np.mgrid[0 : directions.shape[0] : every, 0 : directions.shape[1] : every]
+        )
+        turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
+        radius = RADIUS * extent
+        offsets = radius * directions[row, column] @ turn.T
+        return cls(row, column, offsets, radius * 2.2 * np.sqrt(np.pi / max(len(row), 1)) * 1.2)
+
+    def colours(self, spectrum: np.ndarray) -> np.ndarray:
+        """(n, 3) uint8 of a spectrum (H, W) in [0, 1]."""
+        return Legend("", 0.0, 1.0, "inferno").of(spectrum[self.rows, self.columns])
+
+
+def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
+    """Paths as lines from the receiver towards where they come from, as long as their delays, and the sources
+    at the ends of those that are drawn whole.
+
+    A line is straight where the path has bounced: its end is the image of the transmitter.
+    """
+    paths, receiver = answer.paths, answer.ends.get("rx")
+    if paths is None or paths.towards is None or receiver is None:
+        return None
+    length = paths.delay_ns * 0.299792458
+    shown = np.minimum(length, REACH * extent)
+    ends = receiver + paths.towards * shown[:, None]
+    top = paths.gain_db.max(initial=-np.inf)
+    colours = Legend("", top - SILENT_DB, top, "plasma").of(paths.gain_db)
+    segments = np.stack([np.broadcast_to(receiver, ends.shape), ends], axis=1)
+    return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)
+
+
+def start_place(viewed: Viewed, measured: Measured | None) -> np.ndarray:
+    """World place (3,) [m] where the moving end first stands: the measured one nearest to their median."""
+    if measured is None:
+        return viewed.box().mean(axis=0)
+    middle = np.median(measured.places, axis=0)
+    return np.asarray(measured.places[int(np.linalg.norm(measured.places - middle, axis=1).argmin())])

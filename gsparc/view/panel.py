@@ -1,0 +1,113 @@
+"""Small pictures of an answer: a spectrum by direction, a channel over its band, its paths, a power."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.schema import Site
+from gsparc.evaluation.drawing import panels
+from gsparc.ops import SphereGrid
+from gsparc.view.answer import Answer, Usual
+from gsparc.view.scene import Legend
+
+SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
+MOST_LINES = 4  # antennas whose responses are drawn
+RED = "#D62728"  # of the end that moves
+MOST_DOTS = 1500  # measured levels that are drawn
+FLOOR_DB = -60.0  # below the largest entry of a channel, where its response ends
+
+
+def spectrum_image(spectrum: np.ndarray, least_width: int = 360) -> np.ndarray:
+    """A spectrum (H, W) as (h, w, 3) uint8: azimuth to the right, elevation upwards."""
+    times = max(1, -(-least_width // spectrum.shape[1]))
+    return np.repeat(np.repeat(SPECTRUM.of(spectrum[::-1]), times, axis=0), times, axis=1)
+
+
+def response_db(response: np.ndarray) -> np.ndarray:
+    """Of at most `MOST_LINES` antennas (a, K) [dB], from a channel (A, K)."""
+    chosen = response[np.linspace(0, len(response) - 1, min(len(response), MOST_LINES)).astype(int)]
+    power = np.abs(chosen).astype(np.float64) ** 2
+    return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
+
+
+def tones_mhz(site: Site, count: int) -> np.ndarray:
+    """Frequencies (count,) [MHz]; numbers of subcarriers where they are not known."""
+    known = site.subcarriers_hz
+    if known is None or len(known) != count:
+        return np.arange(count, dtype=np.float64)
+    return np.asarray(known, np.float64) / 1e6
+
+
+def degrees_of(grid: SphereGrid) -> tuple[float, float, float, float]:
+    """Least and largest azimuth and elevation of a grid's pixels [degrees]."""
+    left = grid.first_azimuth - grid.azimuth_step / 2
+    low = grid.first_elevation - grid.elevation_step / 2
+    edges = left, left + grid.width * grid.azimuth_step, low, low + grid.height * grid.elevation_step
+    return tuple(float(edge) for edge in np.degrees(edges))  # type: ignore[return-value]
+
+
+def draw_answer(axis: Any, answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> None:
+    """Into matplotlib axes: a spectrum; a channel over its band, its paths or its antennas; or a power among
+    those that were measured, by distance or by how many they are."""
+    if answer.spectrum is not None:
+        assert site.grid is not None
+        how: dict[str, Any] = {"origin": "lower", "extent": degrees_of(site.grid), "aspect": "auto"}
+        axis.imshow(answer.spectrum, cmap=SPECTRUM.colours, vmin=0, vmax=1, **how)
+        axis.grid(False)
+        axis.set(xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction")
+    elif answer.response is not None and answer.response.shape[1] > 1:
+        x = tones_mhz(site, answer.response.shape[1])
+        for line in response_db(answer.response):
+            axis.plot(x, line)
+        axis.set(xlabel="frequency [MHz]", ylabel="dB", title="channel over the band")
+    elif answer.paths is not None and len(answer.paths.gain_db):
+        bottom = answer.paths.gain_db.min() - 3
+        axis.vlines(answer.paths.delay_ns, bottom, answer.paths.gain_db)
+        axis.plot(answer.paths.delay_ns, answer.paths.gain_db, "o", ms=4)
+        axis.set(xlabel="delay [ns]", ylabel="dB", title="paths", ylim=(bottom, None))
+    elif answer.response is not None and len(answer.response) > 1:
+        axis.plot(response_db_of_antennas(answer.response), "o-", ms=3)
+        axis.set(xlabel="antenna", ylabel="dB", title="channel over antennas")
+    else:
+        _draw_level(axis, answer, known, unit)
+
+
+def _draw_level(axis: Any, answer: Answer, known: Usual | None, unit: str) -> None:
+    label = f"received power [{unit}]"
+    if known is None or not len(known.level_db) or answer.level_db is None:
+        axis.errorbar([0], [answer.level_db or np.nan], [answer.spread_db or 0.0], fmt="o", color=RED)
+        axis.set(xticks=[], ylabel=label)
+        return
+    ends = list(answer.ends.values())
+    if len(known.distance_m) and len(ends) == 2:
+        few = np.linspace(0, len(known.level_db) - 1, min(len(known.level_db), MOST_DOTS)).astype(int)
+        axis.plot(known.distance_m[few], known.level_db[few], ".", ms=3, color="0.7", label="measured")
+        far = np.geomspace(known.distance_m.min(), known.distance_m.max(), 50)
+        axis.plot(far, known.at_one - known.slope * np.log10(far), color="0.3", label="distance alone")
+        here = float(np.linalg.norm(ends[0] - ends[1]))
+        axis.errorbar([here], [answer.level_db], [answer.spread_db or 0.0], fmt="o", color=RED, label="here")
+        axis.set(xlabel="distance [m]", ylabel=label, xscale="log")
+        axis.legend(loc="lower left")
+    else:
+        axis.hist(known.level_db, 40, color="0.75")
+        axis.axvline(answer.level_db, color=RED, label="here")
+        axis.set(xlabel=label, ylabel="measured places")
+        axis.legend()
+
+
+def response_db_of_antennas(response: np.ndarray) -> np.ndarray:
+    """Mean over tones (A,) [dB] of a channel (A, K)."""
+    power = (np.abs(response).astype(np.float64) ** 2).mean(axis=1)
+    return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
+
+
+def panel_image(answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> np.ndarray:
+    """`draw_answer` as a picture (h, w, 3) uint8."""
+    figure, axes = panels(3.6, 2.2)
+    draw_answer(axes[0, 0], answer, site, known, unit)
+    figure.set_dpi(110)
+    canvas = figure.canvas
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]

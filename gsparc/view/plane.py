@@ -1,0 +1,120 @@
+"""Predicted power over a plane: coarse at once, then finer, in steps that others may come between."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import Kind
+from gsparc.maps.area import Grid
+from gsparc.maps.levels import MAPPED, predicted
+from gsparc.maps.making import ends_of
+from gsparc.methods.method import Prediction
+from gsparc.methods.predictor import Predictor
+from gsparc.view.scene import Legend, Sheet
+
+FIRST = 400  # cells of the first, coarsest picture, about
+STEP_S = 0.03  # of a step: what a drag waits for [s]
+LEAST = 16  # cells of a step
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A picture of power over a plane, so far.
+
+    Attributes:
+        grid: the cells.
+        level_db: (ny, nx), each cell with the level of the nearest that was asked about.
+        stride: cells between those; 1: all were.
+    """
+
+    grid: Grid
+    level_db: np.ndarray
+    stride: int
+
+
+def has_power(kind: Kind) -> bool:
+    """Whether a level can be mapped."""
+    return kind in MAPPED
+
+
+def lifted(grid: Grid, height: float) -> Grid:
+    """The same cells at another height [m, world]."""
+    return replace(grid, height=height)
+
+
+def thinned(grid: Grid, most: int) -> Grid:
+    """At most about `most` cells along the longer side, of every n-th row and column."""
+    every = max(1, -(-max(grid.shape) // most))
+    return Grid(
+        grid.x[::every], grid.y[::every], grid.height, grid.step * every, grid.inside[::every, ::every]
+    )
+
+
+def refining(
+    predictor: Predictor, grid: Grid, other: Sequence[float] | None = None
+) -> Iterator[Plane | None]:
+    """Planes of ever smaller strides; None between them, about every `STEP_S`.
+
+    Args:
+        predictor: of one station where there are several.
+        grid: the cells.
+        other: (3,) world place of the transmitter where both ends move [m].
+    """
+    ny, nx = grid.shape
+    level = np.full(grid.shape, np.nan)
+    stride = 1 << max(0, int(np.ceil(np.log2(max(np.sqrt(nx * ny / FIRST), 1.0)))))
+    row, column = np.mgrid[0:ny, 0:nx]
+    done, chunk = np.zeros(grid.shape, bool), LEAST
+    while stride:
+        chosen = (row % stride == 0) & (column % stride == 0) & ~done & grid.inside
+        cells, start = np.flatnonzero(chosen), 0
+        while start < len(cells):
+            begin, part = time.perf_counter(), cells[start : start + chunk]
+            level.reshape(-1)[part] = _levels(predictor, grid.places(part), other)
+            start += len(part)
+            took = time.perf_counter() - begin
+            chunk = int(np.clip(chunk * STEP_S / max(took, 1e-6), max(chunk / 2, LEAST), 2 * chunk))
+            yield None
+        done |= chosen
+        yield Plane(grid, _spread(level, stride, grid), stride)
+        stride //= 2
+
+
+def _levels(predictor: Predictor, places: np.ndarray, other: Sequence[float] | None) -> np.ndarray:
+    """Levels (n,) [dB] of the mean alone: deviations cost several times as much."""
+    site = predictor.site
+    ends = ends_of(site, places, other)
+    mean = getattr(predictor, site.kind)(**{end: np.ascontiguousarray(place) for end, place in ends.items()})
+    return predicted(Prediction(torch.from_numpy(np.asarray(mean))), site.kind)[0]
+
+
+def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
+    """Every cell with the level of the asked one whose block it is in."""
+    ny, nx = grid.shape
+    coarse = level[::stride, ::stride]
+    found = np.repeat(np.repeat(coarse, stride, axis=0), stride, axis=1)[:ny, :nx]
+    return np.where(grid.inside, np.where(np.isfinite(level), level, found), np.nan)
+
+
+def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, opacity: float = 0.9) -> Sheet:
+    """A picture of values (ny, nx) over the cells, clear where they are not finite."""
+    clear = np.where(np.isfinite(values), round(255 * opacity), 0)[..., None].astype(np.uint8)
+    image = np.concatenate([legend.of(values), clear], axis=-1)
+    left, right, low, high = grid.extent
+    return Sheet(
+        name, np.array([left, high, grid.height]), np.array([right - left, 0.0, 0.0]),
+        np.array([0.0, low - high, 0.0]), image[::-1],
+    )  # fmt: skip
+
+
+def weakest(plane: Plane) -> np.ndarray | None:
+    """World place (3,) [m] of the cell of least power; None where none is known."""
+    if not np.isfinite(plane.level_db).any():
+        return None
+    cell = int(np.nanargmin(np.where(plane.grid.inside, plane.level_db, np.nan)))
+    return plane.grid.places(np.array([cell]))[0]

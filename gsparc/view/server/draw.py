@@ -1,0 +1,92 @@
+"""Parts of a scene as nodes of `viser`, in drawn units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from gsparc.view.scene import EXTENT, Faces, Frame, Lines, Mark, Part, Points, Scene, Sheet, Splats
+
+THICKNESS = 1.5  # of lines [pixels]
+STATION = (40, 40, 40)
+ABOVE = (0.15, -0.95, 0.8)  # where a camera first stands, in widths of the site
+ASIDE = 0.15  # how far east of the site it looks, where a panel covers what lies there
+
+
+def draw(api: Any, frame: Frame, part: Part, visible: bool = True) -> Any:
+    """Add a part under its name, in place of the one that had it; returns viser's handle."""
+    name = path_of(part.name)
+    if isinstance(part, Points):
+        return api.add_point_cloud(
+            name, frame.drawn(part.places), part.colours, point_size=part.size * frame.scale,
+            point_shape="circle", precision="float32", point_shading="flat", visible=visible,
+        )  # fmt: skip
+    if isinstance(part, Lines):
+        colours = np.repeat(part.colours[:, None], 2, axis=1)
+        return api.add_line_segments(
+            name,
+            frame.drawn(part.segments),
+            colours,
+            thickness=THICKNESS,
+            thickness_units="screen",
+            visible=visible,
+        )
+    if isinstance(part, Splats):
+        return api.add_gaussian_splats(
+            name, frame.drawn(part.means), np.float32(part.covariances * frame.scale**2), part.colours,
+            part.opacities.astype(np.float32)[:, None], visible=visible,
+        )  # fmt: skip
+    if isinstance(part, Faces):
+        return api.add_mesh_simple(
+            name, frame.drawn(part.vertices), part.triangles, color=part.colour, opacity=part.opacity,
+            side="double", flat_shading=True, cast_shadow=False, receive_shadow=False, visible=visible,
+        )  # fmt: skip
+    if isinstance(part, Sheet):
+        return _sheet(api, frame, part, visible)
+    assert isinstance(part, Mark)
+    place = frame.drawn(part.place)
+    ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=place, visible=visible)
+    if part.text:
+        api.add_label(f"{name}/name", part.text, position=(0.0, 0.0, 0.02 * EXTENT), anchor="bottom-center")
+    return ball
+
+
+def path_of(name: str) -> str:
+    """Of a node, without what separates nodes."""
+    return "/" + name.replace("/", " ")
+
+
+def _sheet(api: Any, frame: Frame, part: Sheet, visible: bool) -> Any:
+    """A picture's columns run along x of its node, its rows along y."""
+    wide, tall = np.linalg.norm(part.right), np.linalg.norm(part.down)
+    x, y = part.right / wide, part.down / tall
+    turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(scalar_first=True)
+    middle = part.corner + (part.right + part.down) / 2
+    return api.add_image(
+        path_of(part.name), part.image, float(wide * frame.scale), float(tall * frame.scale),
+        cast_shadow=False, receive_shadow=False, wxyz=turn, position=frame.drawn(middle), visible=visible,
+    )  # fmt: skip
+
+
+def floor(api: Any, scene: Scene, box: np.ndarray) -> float:
+    """A grid beneath the box (2, 3) [m]; returns the side of its cells [m]."""
+    frame = scene.frame
+    wide = EXTENT / frame.scale
+    side = 10.0 ** np.floor(np.log10(wide / 5))
+    side *= next(n for n in (5, 2, 1) if n * side <= wide / 5)
+    middle = np.array([*frame.middle[:2], box[0, 2] - 1e-3 * wide])
+    api.add_grid(
+        "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale,
+        section_size=5 * side * frame.scale, position=frame.drawn(middle), shadow_opacity=0.0,
+    )  # fmt: skip
+    return float(side)
+
+
+def first_view(camera: Any, aside: float = ASIDE) -> None:
+    """Look at the site from the south and above, `aside` widths past its middle."""
+    east = np.array([aside, 0.0, 0.0])
+    camera.position = tuple(EXTENT * (np.array(ABOVE) + east))
+    camera.look_at = tuple(EXTENT * east)
+    camera.up = (0.0, 0.0, 1.0)

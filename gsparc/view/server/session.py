@@ -1,0 +1,412 @@
+"""One client: what it sees, what it may drag, and the answers that follow its hand."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from viser import uplot
+
+from gsparc.view.answer import Answer, ask, reasons
+from gsparc.view.building import (
+    ERRORS,
+    GAUSSIANS,
+    SPHERE,
+    SPLATS,
+    VALUES,
+    cloud_colours,
+    cloud_of,
+    rays_of,
+)
+from gsparc.view.newest import Newest
+from gsparc.view.panel import response_db, response_db_of_antennas, spectrum_image, tones_mhz
+from gsparc.view.plane import Plane, lifted, refining, sheet, weakest
+from gsparc.view.ply import ply_bytes
+from gsparc.view.scene import EXTENT, Legend, Points
+from gsparc.view.server.draw import draw, first_view, floor
+from gsparc.view.site_view import SiteView
+from gsparc.view.words import ENDS, answer_markdown, legend_html
+
+PREDICTED, NOTHING = "predicted power", "nothing"
+PLANE = "plane"
+KEPT = 50  # times that a median is taken of
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+
+
+class Session:
+    """Everything of one client; callbacks only note what is wanted, `Newest` does it in its own thread.
+
+    Args:
+        client: of viser.
+        view: what all clients share.
+        work: does what is asked.
+    """
+
+    def __init__(self, client: Any, view: SiteView, work: Newest) -> None:
+        self.client, self.view, self.work = client, view, work
+        self.site = view.viewed.site
+        self.station = view.viewed.stations[0]
+        self.places = {end: np.asarray(at, np.float64) for end, at in view.starts(self.station).items()}
+        self.asked_s = time.perf_counter()
+        self.delays: deque[float] = deque(maxlen=KEPT)
+        self.queries: deque[float] = deque(maxlen=KEPT)
+        self.answers = 0  # that were shown
+        self.plane: Plane | None = None
+        self.nodes: dict[str, Any] = {}
+        self.gizmos: dict[str, Any] = {}
+        self.sphere = view.sphere(self.station)
+        self._draw_still()
+        first_view(client.camera)
+        self._panel()
+        self._add_gizmos()
+        self.wanted()
+        self.want_plane()
+
+    @property
+    def scene(self) -> Any:
+        """Of the station that is shown."""
+        return self.view.station(self.station).scene
+
+    # -- drawing what stands still -----------------------------------------------------------------
+
+    def _draw_still(self) -> None:
+        api = self.client.scene
+        api.set_up_direction("+z")
+        for node in self.nodes.values():
+            node.remove()
+        self.nodes = {
+            part.name: draw(api, self.scene.frame, part)
+            for part in self.scene.parts
+            if part.name not in self.scene.hidden
+        }
+        self.cell = floor(api, self.scene, self.view.viewed.box())
+        if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
+            around, black = (
+                self.scene.frame.middle + self.sphere.offsets,
+                np.zeros((len(self.sphere.rows), 3)),
+            )
+            dots = Points(SPHERE, around, black.astype(np.uint8), self.sphere.size)
+            self.nodes[SPHERE] = draw(api, self.scene.frame, dots)
+
+    def _add_gizmos(self) -> None:
+        for end, place in self.places.items():
+            gizmo = self.client.scene.add_transform_controls(
+                f"/{end}", scale=0.2 * EXTENT, disable_rotations=True, depth_test=False,
+                position=self.scene.frame.drawn(place),
+            )  # fmt: skip
+            self.client.scene.add_icosphere(f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40))
+            self.client.scene.add_label(
+                f"/{end}/name", ENDS[end], position=(0, 0, 0.03 * EXTENT), anchor="bottom-center"
+            )
+            gizmo.on_update(self._dragged(end))
+            self.gizmos[end] = gizmo
+
+    # -- the panel ---------------------------------------------------------------------------------
+
+    def _panel(self) -> None:
+        gui, viewed = self.client.gui, self.view.viewed
+        gui.configure_theme(control_width="large", show_logo=False, show_share_button=False)
+        self.title = gui.add_markdown(f"**{self.scene.title}**")
+        if len(viewed.stations) > 1:
+            names = tuple(str(name) for name in viewed.stations)
+            self._on(gui.add_dropdown("station", names, initial_value=names[0]), self._station_changed)
+        self.said = gui.add_markdown("asking ...")
+        self.picture: Any = None
+        self.curve: Any = None
+        self.delay_curve: Any = None
+        self.vectors = {}
+        for end, place in self.places.items():
+            vector = gui.add_vector3(f"{ENDS[end]} [m]", tuple(np.round(place, 3)), step=0.01)
+            self._on(vector, self._typed(end))
+            self.vectors[end] = vector
+        row = ["first place"] + (["weakest of plane"] if self.view.grid is not None else [])
+        buttons = gui.add_button_group("go to", row)
+        buttons.on_click(lambda event: self._go(event.target.value))
+        with gui.add_folder("Operating point"):
+            last = len(viewed.ways) - 1
+            self.way = None
+            if last:
+                self.way = gui.add_slider("fast to accurate", 0, last, 1, last)
+                self._on(self.way, self._way_changed)
+            self.speed = gui.add_markdown("")
+        self._layers_panel(gui)
+        with gui.add_folder("Colours"):
+            self.legend = gui.add_html("")
+        with gui.add_folder("Notes", expand_by_default=False):
+            gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
+        self._legends()
+
+    def _layers_panel(self, gui: Any) -> None:
+        with gui.add_folder("Shown"):
+            has = {name: self.scene.part(name) is not None for name in (VALUES, ERRORS, GAUSSIANS)}
+            if has[VALUES]:
+                choices = ("values", *(("errors",) if has[ERRORS] else ()), NOTHING)
+                self.points = gui.add_dropdown("measured points", choices, initial_value="values")
+                self._on(self.points, self._points_changed)
+            if has[GAUSSIANS]:
+                self.gaussians = gui.add_dropdown("Gaussians", ("points", "ellipsoids", NOTHING))
+                self._on(self.gaussians, self._gaussians_changed)
+                button = gui.add_button("download Gaussians as PLY")
+                button.on_click(lambda _: self._download())
+            self.chosen: Any = None
+            if self.view.grid is not None or self.view.layers:
+                names = ((PREDICTED,) if self.view.grid is not None else ()) + tuple(
+                    layer.name for _, layer in self.view.layers
+                )
+                self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
+                self._on(self.chosen, lambda value: self.want_plane())
+                self.progress = gui.add_markdown("")
+            if self.view.grid is not None:
+                low, high = self.view.heights()
+                low, high = min(low, self.view.grid.height), max(high, self.view.grid.height)
+                self.height = gui.add_slider(
+                    "height [m]", low, high, round((high - low) / 100, 4), self.view.grid.height
+                )
+                self._on(self.height, lambda value: self.want_plane())
+
+    def _notes(self) -> list[str]:
+        said = [*self.scene.notes, f"grid: {self.cell:g} m"]
+        if self.site.static_end is not None:
+            said.append(
+                f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
+            )
+        if len(self.view.viewed.ways) == 1:
+            said.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
+        return said
+
+    def _on(self, handle: Any, act: Any) -> None:
+        """Do something with a value that the client changed, not with one that we set."""
+
+        async def changed(event: Any) -> None:
+            if event.client is not None:
+                act(event.target.value)
+
+        handle.on_update(changed)
+
+    # -- what the hand does ------------------------------------------------------------------------
+
+    def _dragged(self, end: str) -> Any:
+        async def moved(event: Any) -> None:
+            self.places[end] = self.scene.frame.world(event.target.position)
+            self.wanted()
+
+        return moved
+
+    def _typed(self, end: str) -> Any:
+        def typed(value: Any) -> None:
+            self._move(end, np.asarray(value, np.float64))
+
+        return typed
+
+    def _move(self, end: str, place: np.ndarray) -> None:
+        self.places[end] = place
+        self.gizmos[end].position = self.scene.frame.drawn(place)
+        self.wanted()
+
+    def _go(self, where: str) -> None:
+        moving = self.view.viewed.moving[-1]
+        place = self.view.starts(self.station)[moving]
+        if where != "first place":
+            found = None if self.plane is None else weakest(self.plane)
+            if found is None:
+                return
+            place = found
+        self._move(moving, place)
+
+    def _points_changed(self, value: str) -> None:
+        self._seen(VALUES, value == "values")
+        self._seen(ERRORS, value == "errors")
+        self._legends()
+
+    def _gaussians_changed(self, value: str) -> None:
+        self._seen(GAUSSIANS, value == "points")
+        self._seen(SPLATS, value == "ellipsoids")
+        self._legends()
+
+    def _seen(self, name: str, visible: bool) -> None:
+        """Show or hide a part; what is hidden at first is sent when it is first shown."""
+        if name in self.nodes:
+            self.nodes[name].visible = visible
+        elif visible and (part := self.scene.part(name)) is not None:
+            self.nodes[name] = draw(self.client.scene, self.scene.frame, part)
+
+    def _way_changed(self, value: int) -> None:
+        self.queries.clear()
+        self.delays.clear()
+        self.wanted()
+
+    def _station_changed(self, value: str) -> None:
+        self.station = value
+        self.work.ask((self.client.client_id, "station"), self._show_station, urgent=True)
+
+    def _download(self) -> None:
+        cloud = cloud_of(self.view.viewed, self.station, self.view.station(self.station).measured)
+        if cloud is not None:
+            self.client.send_file_download("gaussians.ply", ply_bytes(cloud, cloud_colours(cloud)[1]))
+
+    # -- what the worker does ----------------------------------------------------------------------
+
+    def wanted(self) -> None:
+        """Have the present places answered."""
+        self.asked_s = time.perf_counter()
+        self.work.ask((self.client.client_id, "answer"), self._answered, urgent=True)
+
+    def want_plane(self) -> None:
+        """Have the present plane drawn."""
+        self.work.ask((self.client.client_id, PLANE), self._planes)
+
+    def _show_station(self) -> Iterator[None]:
+        choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
+        shown = {name: self.nodes[name].visible for name in choices if name in self.nodes}
+        with self.client.atomic():
+            self._draw_still()
+            for name, visible in shown.items():
+                self._seen(name, visible)
+        self.title.content = f"**{self.scene.title}**"
+        self._legends()
+        self.wanted()
+        self.want_plane()
+        yield
+
+    def _answered(self) -> Iterator[None]:
+        since, places = self.asked_s, {end: at.copy() for end, at in self.places.items()}
+        way = self.view.viewed.ways[-1 if self.way is None else int(self.way.value)]
+        if way.threads is not None and way.threads != torch.get_num_threads():
+            torch.set_num_threads(way.threads)
+        try:
+            predictor = way.predictor if self.station is None else way.predictor.at(self.station)
+            answer = ask(predictor, places)
+        except ValueError as error:
+            self.said.content = f"**{error}**"
+            return
+        self._show(answer)
+        self.answers += 1
+        self.queries.append(answer.query_ms)
+        self.delays.append((time.perf_counter() - since) * 1e3)
+        self.speed.content = (
+            f"{way.label}: query **{np.median(self.queries):.2f} ms**, with confidence, reasons and drawing "
+            f"{np.median(self.delays):.1f} ms (medians of {len(self.queries)})"
+        )
+        yield
+
+    def _show(self, answer: Answer) -> None:
+        one = self.view.station(self.station)
+        why = reasons(answer, self.view.viewed.moving[-1], one.usual, one.objects, self.site.origin)
+        with self.client.atomic():
+            self.said.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
+            for end in self.vectors:
+                self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
+            if answer.spectrum is not None:
+                self._show_spectrum(answer.spectrum, answer.ends.get("rx"))
+            if answer.response is not None:
+                self._show_response(answer.response)
+            self._show_rays(answer)
+
+    def _show_spectrum(self, spectrum: np.ndarray, receiver: np.ndarray | None) -> None:
+        image = spectrum_image(spectrum)
+        if self.picture is None:
+            self.picture = self.client.gui.add_image(
+                image, label="power by direction", jpeg_quality=85, order=self._after()
+            )
+        else:
+            self.picture.image = image
+        if self.sphere is not None and receiver is not None:
+            self.nodes[SPHERE].position = self.scene.frame.drawn(receiver)
+            self.nodes[SPHERE].colors = self.sphere.colours(spectrum)
+
+    def _show_response(self, response: np.ndarray) -> None:
+        if response.size == 1:
+            return
+        if response.shape[1] > 1:
+            lines, x, label = (
+                response_db(response),
+                tones_mhz(self.site, response.shape[1]),
+                "frequency [MHz]",
+            )
+        else:
+            lines, x, label = response_db_of_antennas(response)[None], np.arange(len(response)), "antenna"
+        data = (np.asarray(x, np.float64), *(np.asarray(line, np.float64) for line in lines))
+        if self.curve is None:
+            each = [
+                uplot.Series(label=f"{n}" if len(lines) > 1 else "dB", stroke=COLOURS[n], width=2)
+                for n in range(len(lines))
+            ]
+            series = (uplot.Series(label=label), *each)
+            self.curve = self._plot(data, series, "channel [dB]", label)
+        else:
+            self.curve.data = data
+
+    def _show_rays(self, answer: Answer) -> None:
+        rays = rays_of(answer, self.view.extent(self.station))
+        if rays is not None:
+            for part in rays:
+                self.nodes[part.name] = draw(self.client.scene, self.scene.frame, part)
+        if answer.paths is None or not len(answer.paths.gain_db):
+            return
+        order = np.argsort(answer.paths.delay_ns)
+        data = (answer.paths.delay_ns[order], answer.paths.gain_db[order])
+        if self.delay_curve is None:
+            points = uplot.Series(label="dB", stroke=COLOURS[1], width=0, points={"show": True, "size": 7})
+            self.delay_curve = self._plot(
+                data, (uplot.Series(label="ns"), points), "paths: gain [dB] by delay", "delay [ns]"
+            )
+        else:
+            self.delay_curve.data = data
+
+    def _plot(self, data: Any, series: Any, title: str, label: str) -> Any:
+        return self.client.gui.add_uplot(
+            data, series, title=title, scales={"x": uplot.Scale(time=False)}, height=190,
+            axes=(uplot.Axis(label=label), uplot.Axis()), order=self._after(),
+        )  # fmt: skip
+
+    def _after(self) -> float:
+        return float(self.said.order) + 0.1 + 0.1 * (self.curve is not None)
+
+    def _planes(self) -> Iterator[None]:
+        name = NOTHING if self.chosen is None else self.chosen.value
+        made = next(((grid, layer) for grid, layer in self.view.layers if layer.name == name), None)
+        if made is not None:
+            grid, layer = made
+            self._lay(sheet(PLANE, grid, layer.values, Legend(layer.label, *layer.range(), layer.colours)))
+            self.progress.content = "as `gsparc map` made it"
+        elif name == PREDICTED and self.view.grid is not None:
+            yield from self._predicted_plane()
+        elif PLANE in self.nodes:
+            self.nodes.pop(PLANE).remove()
+        self._legends()
+        yield
+
+    def _predicted_plane(self) -> Iterator[None]:
+        grid = lifted(self.view.grid, float(self.height.value))  # type: ignore[arg-type]
+        predictor = self.view.viewed.asked(self.station)
+        other = self.places["tx"] if self.site.static_end is None else None
+        legend, begin = self.view.station(self.station).power, time.perf_counter()
+        for plane in refining(predictor, grid, None if other is None else other.tolist()):
+            if plane is None:
+                yield
+                continue
+            legend = legend or Legend.over(f"predicted power [{self.view.unit}]", plane.level_db)
+            self.plane = plane
+            self._lay(sheet(PLANE, grid, plane.level_db, legend))
+            asked = "all asked" if plane.stride == 1 else f"every {plane.stride}th asked"
+            self.progress.content = (
+                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m, {asked}, "
+                f"{time.perf_counter() - begin:.1f} s"
+            )
+            yield
+
+    def _lay(self, part: Any) -> None:
+        self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
+
+    def _legends(self) -> None:
+        legends = self.scene.legends
+        shown = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
+        name = NOTHING if self.chosen is None else self.chosen.value
+        shown += [
+            Legend(one.label, *one.range(), one.colours) for _, one in self.view.layers if one.name == name
+        ]
+        self.legend.content = legend_html(shown)

@@ -1,0 +1,128 @@
+"""What all clients share of a model: scenes of stations, each made once, and where planes lie."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from gsparc.data.site_objects import SiteObjects
+from gsparc.maps.area import Grid, grid_of
+from gsparc.maps.pictures import Layer
+from gsparc.view.answer import Usual, usual
+from gsparc.view.building import VALUES, Given, Sphere, build, start_place
+from gsparc.view.plane import has_power
+from gsparc.view.scene import EXTENT, Legend, Scene
+from gsparc.view.viewed import Measured, Viewed
+
+
+@dataclass(frozen=True)
+class StationView:
+    """A scene of one station and what explains its answers.
+
+    Attributes:
+        scene: what stands still.
+        measured: of the station; None without data.
+        usual: what was measured at what distance; None without data.
+        objects: that the model found.
+        power: colours of powers: as those of the measured points, where there are any.
+    """
+
+    scene: Scene
+    measured: Measured | None
+    usual: Usual | None
+    objects: SiteObjects
+    power: Legend | None
+
+
+@dataclass
+class SiteView:
+    """A model as all clients see it.
+
+    Attributes:
+        viewed: the model.
+        given: floor plan and walls.
+        grid: cells of planes; None where no power is predicted.
+        layers: of a map that was made before, with its cells.
+        at: world place where the moving end first stands; None: chosen.
+        other: the same of the transmitter, where both move.
+    """
+
+    viewed: Viewed
+    given: Given = field(default_factory=Given)
+    grid: Grid | None = None
+    layers: tuple[tuple[Grid, Layer], ...] = ()
+    at: np.ndarray | None = None
+    other: np.ndarray | None = None
+    _made: dict[str | None, StationView] = field(default_factory=dict)
+    _lock: Any = field(default_factory=threading.Lock)
+
+    @property
+    def unit(self) -> str:
+        """Of powers."""
+        return self.viewed.unit
+
+    def station(self, name: str | None) -> StationView:
+        """Of a station; made when it is first asked for."""
+        with self._lock:
+            if name not in self._made:
+                self._made[name] = self._make(name)
+            return self._made[name]
+
+    def _make(self, name: str | None) -> StationView:
+        viewed = self.viewed
+        measured = viewed.measured(name)
+        scene = build(viewed, self.given, name, measured)
+        known = None
+        if measured is not None:
+            levels = measured.values if has_power(viewed.site.kind) else np.full(len(measured.values), np.nan)
+            known = usual(measured.places, levels, viewed.still(name))
+        power = scene.legends.get(VALUES) if has_power(viewed.site.kind) else None
+        return StationView(scene, measured, known, viewed.asked(name).method.objects(), power)
+
+    def extent(self, name: str | None) -> float:
+        """Width of the site [m]."""
+        return EXTENT / self.station(name).scene.frame.scale
+
+    def sphere(self, name: str | None) -> Sphere | None:
+        """Directions of a spectrum; None of other kinds."""
+        site = self.viewed.site
+        return None if site.kind != "spectrum" or site.grid is None else Sphere.of(site, self.extent(name))
+
+    def starts(self, name: str | None) -> dict[str, np.ndarray]:
+        """World places (3,) where the ends that move first stand."""
+        viewed, first = self.viewed, self.viewed.moving[-1]
+        at = start_place(viewed, self.station(name).measured) if self.at is None else self.at
+        found: dict[str, np.ndarray] = {first: at}
+        if len(viewed.moving) > 1:
+            other = (viewed.site.box + viewed.site.origin).mean(axis=0)
+            if viewed.data is not None:
+                other = viewed.data.tx[len(viewed.data) // 2] + viewed.site.origin
+            found["tx"] = other if self.other is None else self.other
+        return found
+
+    def heights(self) -> tuple[float, float]:
+        """Between which a plane can be lifted [m]."""
+        box = self.viewed.site.box + self.viewed.site.origin
+        low, high = float(box[0, 2]), float(box[1, 2])
+        return (low, high) if high - low > 0.5 else (low - 1.5, high + 1.5)
+
+
+def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
+    """Cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
+    if not has_power(viewed.site.kind):
+        return None
+    return grid_of(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)
+
+
+def walk(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
+    """At most `count` measured places in the order of measuring, or along the box's diagonal."""
+    measured = view.station(name).measured
+    if measured is None:
+        low, high = view.viewed.box()
+        return [low + (high - low) * share for share in np.linspace(0.1, 0.9, count)]
+    places = measured.places
+    return list(places[np.linspace(0, len(places) - 1, min(count, len(places))).astype(int)])

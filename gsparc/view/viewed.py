@@ -1,0 +1,246 @@
+"""A checkpoint as a viewer needs it: whom to ask, at which operating points, and what was measured."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from gsparc.data.errors import DataError
+from gsparc.data.links.stations import station_number
+from gsparc.data.schema import End, Measurements, Site
+from gsparc.evaluation.open_runs import open_files
+from gsparc.maps import levels
+from gsparc.methods import checkpoint
+from gsparc.methods.confidence import kept as trusted_of
+from gsparc.methods.predictor import Predictor
+from gsparc.methods.reduced import reduced
+from gsparc.methods.stored_front import kept
+
+log = logging.getLogger(__name__)
+
+MOST_ERRORS = 2000  # test rows that errors are drawn of
+CHUNK = 128  # rows of one call
+LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way of answering.
+
+    Attributes:
+        label: the operating point in words, with the accuracy that was shown with it.
+        predictor: answers so.
+        threads: CPU threads; None: as they are.
+    """
+
+    label: str
+    predictor: Predictor
+    threads: int | None = None
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What was measured of one station.
+
+    Attributes:
+        places: (n, 3) world, of the moving end [m].
+        values: (n,) level [dB], or mean of a spectrum; NaN where nothing was heard.
+        label: of the values.
+        errors: (n,) of test rows, NaN for the others.
+        error_label: of the errors.
+    """
+
+    places: np.ndarray
+    values: np.ndarray
+    label: str
+    errors: np.ndarray
+    error_label: str
+
+
+@dataclass(frozen=True)
+class Viewed:
+    """A model, and what is known of its site.
+
+    Attributes:
+        name: of the checkpoint.
+        ways: operating points, the fastest first; at least one.
+        data: in the model's coordinates and units; None where they are gone.
+        test: (n,) rows that were not learned from.
+        stations: that it answers for; one, None, where there is one static end or none.
+        notes: what a reader must know, one line each.
+        unit: of powers.
+    """
+
+    name: str
+    ways: tuple[Way, ...]
+    data: Measurements | None
+    test: np.ndarray
+    stations: tuple[str | None, ...]
+    notes: tuple[str, ...] = ()
+    unit: str = "dB"
+
+    @property
+    def predictor(self) -> Predictor:
+        """As trained."""
+        return next(
+            (way.predictor for way in self.ways if way.predictor.point is None), self.ways[-1].predictor
+        )
+
+    @property
+    def site(self) -> Site:
+        """Of the model."""
+        return self.predictor.site
+
+    @property
+    def moving(self) -> tuple[End, ...]:
+        """Ends that can be dragged."""
+        return ("tx", "rx") if self.site.static_end is None else (self.site.moving_end,)
+
+    def asked(self, station: str | None, way: int = -1) -> Predictor:
+        """Who answers for a station."""
+        predictor = self.ways[way].predictor
+        return predictor if station is None else predictor.at(station)
+
+    def still(self, station: str | None) -> np.ndarray | None:
+        """World place (3,) [m] of the static end; None where it is unknown or moves."""
+        site = self.site if station is None else self.predictor.at(station).site
+        place = site.static_position
+        return None if place is None else place + site.origin
+
+    def box(self) -> np.ndarray:
+        """(2, 3) world corners of where the moving end was [m]."""
+        site = self.site
+        box = site.box if site.moving_box is None else site.moving_box[:, -3:]
+        return np.asarray(box + site.origin)
+
+    def rows(self, station: str | None) -> np.ndarray:
+        """Rows of a station."""
+        if self.data is None:
+            return np.zeros(0, np.int64)
+        if station is None or self.data.station is None or self.site.stations is None:
+            return np.arange(len(self.data))
+        number = self.site.stations.name.index(station)
+        return np.flatnonzero(self.data.station == number)
+
+    def measured(self, station: str | None) -> Measured | None:
+        """Values and errors of a station; None without data."""
+        if self.data is None:
+            return None
+        data, rows = self.data, self.rows(station)
+        places = data.moving[rows][:, -3:] + data.site.origin
+        if data.site.kind == "spectrum":
+            values = np.concatenate(
+                [
+                    data.targets(rows[i : i + CHUNK]).flatten(1).mean(1).numpy()
+                    for i in range(0, len(rows), CHUNK)
+                ]
+            )
+            label, error_label = "mean of a measured spectrum", "PSNR of test rows [dB]"
+        else:
+            values, silent = levels.measured(data, rows)
+            values[silent] = np.nan
+            what = "received power" if data.site.kind == "rssi" else "power of a channel"
+            label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
+        errors = np.full(len(rows), np.nan)
+        held = np.flatnonzero(np.isin(rows, self.test))
+        held = (
+            held[np.linspace(0, len(held) - 1, min(len(held), MOST_ERRORS)).astype(int)]
+            if len(held)
+            else held
+        )
+        for start in range(0, len(held), CHUNK):
+            part = held[start : start + CHUNK]
+            errors[part] = _errors(self.predictor, data, rows[part], values[part])
+        return Measured(places, values, label, errors, error_label)
+
+
+@torch.no_grad()
+def _errors(predictor: Predictor, data: Measurements, rows: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Of rows (n,): |difference of levels| [dB], or PSNR [dB] of spectra."""
+    batch = data.batch(rows)
+    said = predictor.method.answer(batch)
+    if data.site.kind == "spectrum":
+        square = (said.mean - batch.target).square().flatten(1).mean(1).double().numpy()
+        return -10 * np.log10(np.maximum(square, LEAST_RATIO))
+    mean = replace(said, variance=None)
+    return np.abs(levels.predicted(mean, data.site.kind, data.site.target_scale)[0] - values)
+
+
+def open_viewed(
+    path: str | Path,
+    dataset: Mapping[str, Any] | None = None,
+    station: str | int | None = None,
+    unit: str = "dB",
+) -> Viewed:
+    """Read a checkpoint, and its data where they are still there.
+
+    Args:
+        path: of the checkpoint.
+        dataset: settings that replace those stored.
+        station: the only one to show; None: all that the model answers for.
+        unit: of powers.
+
+    Raises:
+        DataError: no station is called that.
+        ValueError: no checkpoint that can be read.
+    """
+    notes: list[str] = []
+    data, test = None, np.zeros(0, np.int64)
+    try:
+        run = open_files([path], dataset)
+        method, stored, data = run.methods[0], run.stored[0], run.data
+        if run.foreign is None:
+            test = run.split.folds[0].test
+        else:
+            notes.append(f"no errors of test rows are drawn: the model was trained on {run.foreign}")
+    except (ValueError, OSError) as error:
+        method, stored = checkpoint.load(path)
+        notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
+    site, trusted = stored.site, trusted_of(stored.extra)
+    points, measured = kept(stored.extra)
+    ways = [
+        Way(
+            f"{point.label}, {point.figure[0]} {point.figure[1]:.4g}",
+            Predictor(
+                reduced(method, point.settings, measured), site, method, point, trusted, None, stored.extra
+            ),
+            point.threads,
+        )
+        for point in sorted(points, key=lambda point: point.p50_ms)
+        if point.settings
+    ]
+    ways.append(Way("as trained", Predictor(method, site, trusted=trusted, extra=stored.extra)))
+    return Viewed(
+        str(path), tuple(ways), data, test, _stations(ways[-1].predictor, station), tuple(notes), unit
+    )
+
+
+def _stations(predictor: Predictor, wanted: str | int | None) -> tuple[str | None, ...]:
+    stations = predictor.site.stations
+    if stations is None:
+        if wanted is not None:
+            raise DataError(
+                f"station={wanted}: the model of {predictor.site.name} has no stations; leave it out"
+            )
+        return (None,)
+    if wanted is not None:
+        number = station_number(wanted, stations.name, len(stations))
+        if number is None:
+            raise DataError(f"station={wanted}: there is none; there are {', '.join(stations.name)}")
+        return (stations.name[number],)
+    found = []
+    for name in stations.name:
+        try:
+            predictor.at(name)
+            found.append(name)
+        except ValueError as error:
+            log.warning("%s is left out: %s", name, error)
+    if not found:
+        raise DataError("the model answers for none of its stations")
+    return tuple(found)

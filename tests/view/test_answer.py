@@ -1,0 +1,69 @@
+"""What is answered at a place, and what is said of why."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsparc.data.site_objects import SiteObjects
+from gsparc.view.answer import Answer, Rays, ask, crossed_losses, reasons, usual
+from gsparc.view.building import rays_of
+
+
+def blocker(loss: float = 10.0, turn: float = 0.0) -> SiteObjects:
+    """One Gaussian in the origin, 2 m along its first axis and 0.5 m across."""
+    parts = np.zeros((1, 3)), np.array([[2.0, 0.5, 1.0]]), np.array([turn]), np.array([loss])
+    return SiteObjects.of(gaussians=parts)
+
+
+def test_a_path_through_the_middle_loses_all_and_one_beside_less():
+    x = np.array([10.0, 0, 0])
+    assert crossed_losses(blocker(), -x, x)[0] == pytest.approx(10)
+    beside = np.array([0, 0.5, 0])  # one standard deviation away
+    assert crossed_losses(blocker(), beside - x, beside + x)[0] == pytest.approx(10 * np.exp(-0.5))
+    assert crossed_losses(blocker(turn=np.pi / 2), beside - x, beside + x)[0] == pytest.approx(
+        10 * np.exp(-0.5 / 16)
+    )
+    assert crossed_losses(blocker(), x, 2 * x)[0] < 1e-4  # both ends on one side of it
+
+
+def test_the_distance_law_of_measurements_is_found_and_missing_ones_left_out():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(1, 100, (200, 3))
+    level = -30 - 25 * np.log10(np.linalg.norm(places, axis=1))
+    level[:20] = np.nan
+    law = usual(places, level, np.zeros(3))
+    assert (law.at_one, law.slope) == (pytest.approx(-30), pytest.approx(25)) and law.spread_db < 1e-6
+    assert np.isnan(usual(places, level, None).at_one)
+
+
+def test_a_weak_place_behind_something_is_explained():
+    rng = np.random.default_rng(0)
+    places = rng.uniform(-20, 20, (200, 3))
+    level = -30 - 20 * np.log10(np.linalg.norm(places, axis=1)) + rng.normal(size=200)
+    here = np.array([10.0, 0, 0])
+    answer = Answer({"rx": here, "tx": -here}, 1.0, level_db=-75.0)
+    law = usual(places, level, np.zeros(3))
+    said = " | ".join(reasons(answer, "rx", law, blocker(), np.zeros(3)))
+    assert "20 m from the other end" in said and "weaker" in said
+    assert "crosses 1 Gaussians that take 10.0 dB" in said and "nearest measurement" in said
+
+
+def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
+    spectrum = ask(spectrum_view.viewed.asked(None), spectrum_view.starts(None))
+    assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None and spectrum.query_ms > 0
+    assert set(spectrum.ends) == {"tx", "rx"}
+    name = power_view.viewed.stations[1]
+    asked, at = power_view.viewed.asked(name), power_view.starts(name)
+    power = ask(asked, at)
+    assert power.level_db == pytest.approx(10 * np.log10(asked.rssi(**at)[0]), abs=1e-3)
+    assert power.spread_db > 0 and power.spectrum is None
+
+
+def test_rays_are_as_long_as_their_delays():
+    towards = np.array([[1.0, 0, 0], [0, 1, 0]])
+    rays = Rays(np.array([-40.0, -50]), np.array([10.0, 20]), towards)
+    lines, ends = rays_of(Answer({"rx": np.ones(3)}, 1.0, paths=rays), 100.0)
+    length = np.linalg.norm(ends.places - 1, axis=1)
+    np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
+    assert lines.segments.shape == (2, 2, 3)

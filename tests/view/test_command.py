@@ -1,0 +1,95 @@
+"""`gsparc view`: what it writes, and what it refuses in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from campaigns import compose
+from matplotlib.image import imread
+from towns import town_model
+
+from gsparc.commands import view as command
+from gsparc.data.errors import DataError
+from gsparc.maps.field_map import FieldMap
+from gsparc.view.building import SPLATS, Given, build
+from gsparc.view.viewed import open_viewed
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A run folder, without Hydra."""
+    monkeypatch.setattr(command, "run_directory", lambda: tmp_path)
+    return tmp_path
+
+
+def view(here, checkpoint, *more):
+    return command.task(compose(f"ckpt='{checkpoint}'", *more, config="view"))
+
+
+def test_a_picture_and_splats_do_without_viser(here, monkeypatch, spectrum_view):
+    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    view(here, town_model(), f"save='{here / 'town.png'}'", "station=east", "step_m=4")
+    picture = imread(here / "town.png")
+    assert picture.shape[1] >= 1200 and picture[..., :3].std() > 0.05
+    facts = view(here, spectrum_view.viewed.name, f"save='{here / 'g.ply'}'")
+    assert b"element vertex 40" in (here / "g.ply").read_bytes() and facts["model/name"] == "gsparc"
+
+
+@pytest.mark.parametrize("more", [[], ["save=page.html"]])
+def test_without_viser_one_line_says_what_to_install(here, monkeypatch, more):
+    monkeypatch.setattr(command, "find_spec", lambda name: None)
+    with pytest.raises(DataError, match=r"pip install 'gsparc\[viewer\]'"):
+        view(here, here / "missing.ckpt", *more)
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (["save=scene.obj"], "expected a name that ends with .html, .png, .ply"),
+        (["port=70000"], "a number from 0 to 65535"),
+        (["save=a.png", "station=nowhere"], "there are west, east"),
+        (["save=a.png", "at=[1,2]"], "three finite numbers"),
+        (["save=a.png", "map=missing.npz"], "expected map.npz of gsparc map"),
+        (["save=a.ply"], "holds no Gaussians to write"),
+    ],
+)
+def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, said):
+    monkeypatch.chdir(here)
+    with pytest.raises(DataError, match=said):
+        view(here, town_model(), *more)
+    assert not [file for file in here.iterdir() if file.suffix in (".png", ".ply", ".html")]
+
+
+def test_a_map_that_was_made_is_read_again(here):
+    import gsparc
+
+    made = gsparc.load(town_model()).map([0, 0, 80, 60], step_m=8.0)
+    made.save(here / "map.npz")
+    found = FieldMap.read(here / "map.npz")
+    np.testing.assert_array_equal(found.power_db, made.power_db)
+    assert found.stations == made.stations and found.grid.step == pytest.approx(8.0)
+    (here / "other.npz").write_bytes(b"no archive")
+    with pytest.raises(DataError, match="no map that can be read"):
+        FieldMap.read(here / "other.npz")
+
+
+def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
+    viewed = open_viewed(town_model(), {"file": str(tmp_path / "gone.npz")})
+    assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
+    scene = build(viewed, Given(), "west", viewed.measured("west"))
+    assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
+
+
+def test_test_rows_have_errors_and_training_rows_have_none(power_view):
+    measured = power_view.viewed.measured("west")
+    held = np.isin(power_view.viewed.rows("west"), power_view.viewed.test)
+    assert held.any() and (np.isfinite(measured.errors) == held).all()
+    assert 1 < measured.errors[held].mean() < 15
+
+
+def test_rendered_gaussians_are_drawn_where_they_lie(spectrum_view):
+    scene = spectrum_view.station(None).scene
+    gaussians = spectrum_view.viewed.predictor.method.fitted().gaussians
+    origin = spectrum_view.viewed.site.origin
+    np.testing.assert_allclose(scene.part(SPLATS).means, gaussians.means.detach().numpy() + origin, atol=1e-6)
+    assert SPLATS in scene.hidden and len(np.unique(scene.part(SPLATS).colours, axis=0)) > 5

@@ -1,0 +1,27 @@
+"""Drawn units and colours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gsparc.view.scene import EXTENT, GREY, Frame, Legend
+
+
+def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
+    places = np.array([[4.5e6, 5.1e5, 0], [4.5e6 + 2000, 5.1e5 + 900, 30]])
+    frame = Frame.around(places)
+    drawn = frame.drawn(places)
+    assert drawn.dtype == np.float32 and np.ptp(drawn, axis=0).max() == EXTENT
+    np.testing.assert_allclose(frame.world(drawn), places, atol=1e-3)
+
+
+def test_one_place_is_a_site_too():
+    frame = Frame.around(np.zeros((1, 3)))
+    assert np.isfinite(frame.drawn(np.ones((2, 3)))).all()
+
+
+def test_values_that_are_not_known_are_grey():
+    legend = Legend.over("level", np.array([np.nan, 0.0, 1.0, np.inf]))
+    found = legend.of(np.array([np.nan, 0.0, 1.0, 5.0]))
+    assert tuple(found[0]) == GREY and (found[2] == found[3]).all() and (found[1] != found[2]).any()
+    assert Legend.over("nothing", np.full(3, np.nan)).high > Legend.over("nothing", np.full(3, np.nan)).low

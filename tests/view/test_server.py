@@ -1,0 +1,173 @@
+"""The server without a browser: a client whose scene and panel are viser's own."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from campaigns import compose, spectra
+
+import gsparc
+from gsparc.commands.train import train
+from gsparc.maps.pictures import layers
+from gsparc.view.site_view import SiteView
+from gsparc.view.viewed import open_viewed
+
+viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
+
+from gsparc.view.newest import Newest  # noqa: E402
+from gsparc.view.server.page import page  # noqa: E402
+from gsparc.view.server.serve import Server  # noqa: E402
+from gsparc.view.server.session import Session  # noqa: E402
+
+
+@pytest.fixture
+def visit():
+    """`visit(view)`: a session of a client on a server that nobody else visits."""
+    server, work = viser.ViserServer(host="127.0.0.1", port=0, verbose=False), Newest()
+
+    def come(view, number=0):
+        client = SimpleNamespace(
+            client_id=number, scene=server.scene, gui=server.gui, camera=server.initial_camera,
+            atomic=server.atomic,
+        )  # fmt: skip
+        return Session(client, view, work)
+
+    yield come
+    work.close()
+    server.stop()
+
+
+def settle(session, seconds=20.0):
+    end = time.monotonic() + seconds
+    while len(session.work) and time.monotonic() < end:
+        time.sleep(0.01)
+    assert not len(session.work), "work is left"
+
+
+def drag(session, end, place):
+    """As viser calls it while a handle is dragged."""
+    session.gizmos[end].position = session.scene.frame.drawn(np.asarray(place))
+    asyncio.run(session._dragged(end)(SimpleNamespace(target=session.gizmos[end])))
+
+
+def test_a_drag_is_answered_with_what_the_model_says_there(visit, power_view):
+    session = visit(power_view)
+    drag(session, "rx", [20.0, 30.0, 1.5])
+    settle(session)
+    said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])
+    asked = power_view.viewed.asked("west")
+    assert said == pytest.approx(10 * np.log10(asked.rssi(rx=[20.0, 30.0, 1.5])[0]), abs=0.06)
+    assert session.vectors["rx"].value == pytest.approx((20.0, 30.0, 1.5), abs=1e-3)
+    assert "query" in session.speed.content and "all asked" in session.progress.content
+
+
+def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view):
+    session = visit(spectrum_view)
+    settle(session)
+    before, panel = session.nodes["sphere"].colors.copy(), session.picture.image.copy()
+    low, high = spectrum_view.viewed.box()
+    drag(session, "tx", low + 0.2 * (high - low))
+    settle(session)
+    assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
+    session._gaussians_changed("ellipsoids")
+    assert session.nodes["splats"].visible and not session.nodes["gaussians"].visible
+
+
+def test_the_sphere_of_a_receiver_that_moves_goes_with_it(visit, tmp_path):
+    file = spectra(tmp_path / "rx.npz", moving="rx")
+    train(
+        compose("dataset=own", f"dataset.file={file}", "model=idw", "baselines=[]", "logger=none"), tmp_path
+    )
+    session = visit(SiteView(open_viewed(tmp_path / "model.ckpt")))
+    drag(session, "rx", [0.2, 0.1, -0.3])
+    settle(session)
+    where = session.scene.frame.world(session.nodes["sphere"].position)
+    np.testing.assert_allclose(where, [0.2, 0.1, -0.3], atol=1e-5)
+
+
+def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
+    found = gsparc.load(power_view.viewed.name).map([0, 0, 80, 60], step_m=8.0, height_m=3.0)
+    made = [layer for layer in layers(found) if not layer.words]
+    view = SiteView(power_view.viewed, grid=power_view.grid, layers=tuple((found.grid, one) for one in made))
+    session = visit(view)
+    settle(session)
+    session.chosen.value = "outage"
+    session.want_plane()
+    settle(session)
+    assert session.nodes["plane"].image.shape[:2] == found.grid.shape
+    assert "probability of less than" in session.legend.content
+    session.chosen.value = "nothing"
+    session.want_plane()
+    settle(session)
+    assert "plane" not in session.nodes
+
+
+def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(visit, power_view):
+    session = visit(power_view)
+    settle(session)
+    first = session.said.content
+    session._station_changed("east")
+    settle(session)
+    assert session.said.content != first and "east" in session.title.content
+    session._go("weakest of plane")
+    settle(session)
+    level = session.plane.level_db
+    said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])
+    assert said == pytest.approx(np.nanmin(level), abs=0.1)
+
+
+def test_a_thousand_drags_leave_nothing_behind(visit, spectrum_view):
+    session = visit(spectrum_view)
+    settle(session)
+    nodes = len(session.client.scene._handle_from_node_name)
+    low, high = spectrum_view.viewed.box()
+    for share in np.linspace(0, 1, 1000):
+        drag(session, "tx", low + share * (high - low))
+    settle(session)
+    assert len(session.client.scene._handle_from_node_name) == nodes
+    assert len(session.delays) <= session.delays.maxlen
+
+
+def test_a_client_that_vanishes_is_forgotten(power_view):
+    server = Server(power_view, port=0)
+    try:
+        one = server.server
+        client = SimpleNamespace(
+            client_id=5, scene=one.scene, gui=one.gui, camera=one.initial_camera, atomic=one.atomic
+        )
+        server._came(client)
+        assert set(server.sessions) == {5}
+        server._went(client)
+        assert not server.sessions
+        end = time.monotonic() + 5
+        while len(server.work) and time.monotonic() < end:
+            time.sleep(0.01)
+        assert not len(server.work)
+        assert server.address.startswith("http://127.0.0.1:")
+    finally:
+        server.stop()
+
+
+def test_a_page_says_what_it_is_and_what_it_cannot_do(power_view):
+    text = page(power_view, steps=2)
+    assert "nothing is computed here" in text and "measured received power" in text
+    assert text.rstrip().endswith("</html>") and len(text) > 500_000
+
+
+@pytest.mark.slow
+def test_a_page_opens_from_its_file_and_asks_for_nothing(browser, tmp_path, spectrum_view):
+    file = tmp_path / "page.html"
+    file.write_text(page(spectrum_view, steps=4), encoding="utf-8")
+    browser.get(file.as_uri())
+    assert "nothing is computed here" in browser.find_element("css selector", "details").text
+    end = time.monotonic() + 30
+    while not browser.find_elements("css selector", "canvas") and time.monotonic() < end:
+        time.sleep(0.2)
+    assert browser.find_elements("css selector", "canvas")
+    asked = browser.execute_script("return performance.getEntriesByType('resource').map(e => e.name)")
+    assert not [name for name in asked if name.startswith(("http:", "https:", "ws:"))]
