@@ -28,8 +28,11 @@ from gsparc.methods.power_process import (
     MOST_ROWS,
     MeanName,
     PowerProcess,
+    Process,
+    approximated,
     conditioned,
     draw,
+    exact,
     fit_powers,
     restored,
 )
@@ -169,7 +172,7 @@ class GaussianProcess(Interpolator, PredictsVariance):
     name = "gp"
     stored = ("mean", "axes", "weights", "lost")
     uses_censored = True
-    powers: PowerProcess | None = None  # None: not powers, or learned by an earlier version
+    powers: Process | None = None  # None: not powers, or learned by an earlier version
 
     def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
         if components < 1:
@@ -211,15 +214,19 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
+    @property
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return approximated(self.name, self.powers)
+
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return self.powers
+        return None if self.powers is None else exact(self.powers)
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
         if self.powers is None:
             return None
-        rows = rows[draw(silent(data, rows), MOST_ROWS, 0)]
         decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
         found = copy.copy(self)
         seen = Rows(data.moving[rows], decibels, silent(data, rows))
