@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
+from gsparc.methods.nearest_process import Values, given
+from gsparc.methods.power_kernel import PowerKernel
+from gsparc.methods.trend import Trend
 
 SIDE_M = 3_000.0
 SCALES = ((6.0, 250.0), (3.0, 40.0), (1.5, 8.0))  # deviation [dB] and wavelength / 2 pi [m] of shadowing
@@ -13,6 +18,8 @@ WAVES = 60  # of each
 NOISE_DB = 1.0
 STATION = (1_400.0, 1_600.0, 25.0)
 TESTED = 2_000
+CITY = Path(__file__).parents[2] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
+STATION_USED, JITTER_M, CITY_NOISE_DB = 11, 15.0, 3.0  # the station most heard of; noise as gp finds it
 
 
 def town(count: int, seed: int = 0) -> Measurements:
@@ -37,3 +44,29 @@ def town(count: int, seed: int = 0) -> Measurements:
         "rssi_db": decibels,
     }  # fmt: skip
     return from_arrays(arrays, {"name": "town"})
+
+
+def city(count: int, seed: int = 0) -> Measurements:
+    """The same of a measured city: places about measured ones, powers those that a process of them predicts.
+
+    Its noise is drawn anew. Measured powers drawn again and again would share the noise they were measured
+    with, and no number of rows would take that away.
+    """
+    with np.load(CITY) as stored:
+        heard = np.flatnonzero(np.isfinite(stored["rssi_db"][:, STATION_USED]))
+        known = np.pad(stored["mobile_position"][heard].astype(float), ((0, 0), (0, 1)))
+        powers = stored["rssi_db"][heard, STATION_USED].astype(float)
+        station = np.append(stored["station_position"][STATION_USED], 0.0)
+    rng, parts = np.random.default_rng([seed, count]), []
+    for part, number in ((rng, count), (np.random.default_rng(2), TESTED)):
+        place = known[part.integers(len(known), size=number)]
+        place[:, :2] += JITTER_M * part.normal(size=(number, 2))
+        parts.append(place)
+    places = np.concatenate(parts)
+    kernel = PowerKernel((80.0, 500.0), (0.3, 0.7), 0.2, 60.0)
+    process = given(Values.of(known, powers), Trend(float(powers.mean())), kernel, None, np.zeros(0), 0)
+    blocks = np.array_split(places, 1 + len(places) // 4000)
+    decibels = np.concatenate([process.mean_and_variance(block)[0] for block in blocks])
+    decibels += CITY_NOISE_DB * rng.standard_normal(len(places))
+    arrays = {"tx_position": places, "rx_position": station, "rssi_db": decibels}
+    return from_arrays(arrays, {"name": "city"})

@@ -20,17 +20,16 @@ from scipy.spatial.distance import cdist, pdist
 from torch import Tensor
 
 from gsparc.methods.covering import covering
+from gsparc.methods.neighbourhood import NEIGHBOURS, Neighbourhood
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.trend import REACH, Trend, trend_of
 from gsparc.methods.vecchia import Sample, most_likely, told
 
-NEIGHBOURS = 30  # rows that tell of a place
 COVER = 20_000  # rows that weigh the mean law
 FIRST = 256  # rows of an ordering that condition on each other alone
+ARRAYS = ("values", "noise", "weights", "covariance")  # of a process
 BLOCK = 1_024  # systems solved at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
-SPARSER = 8.0  # from one set of places, in which neighbours are looked for, to the next
-FEWEST = 500  # places in the sparsest of them
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 
 
@@ -70,7 +69,7 @@ class NearestProcess:
 
     trend: Trend
     kernel: PowerKernel
-    places: np.ndarray
+    near: Neighbourhood
     values: np.ndarray
     noise: np.ndarray
     weights: np.ndarray
@@ -79,9 +78,14 @@ class NearestProcess:
 
     approximation = f"Vecchia {NEIGHBOURS}"
 
+    @property
+    def places(self) -> np.ndarray:
+        """(n, 3) or (n, 6) float64 [m]."""
+        return self.near.places
+
     def mean_and_variance(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See `PowerProcess.mean_and_variance`."""
-        mean, left, near = self._answers(queries, alone=False)
+        mean, left, near = self._answers(queries, None)
         whole = max(self.spread, 1 + self.kernel.noise)
         by_law = 1 - (1 + self.kernel.noise) / whole
         unknown = left / whole + by_law * (1 - np.exp(-((near / self._reach) ** 2)))
@@ -89,24 +93,25 @@ class NearestProcess:
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """See `PowerProcess.mean_at`; which rows are nearest has no gradient."""
-        return torch.cat([self._answer(part, alone=False)[0] for part in queries.split(BLOCK)])
+        return torch.cat([self._answer(part, None)[0] for part in queries.split(BLOCK)])
 
     def left_out(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean [dB] and variance of a measurement [dB^2] at each place (n,) without its own."""
-        mean, left, _ = self._answers(self.places, alone=True)
+        mean, left, _ = self._answers(self.places, np.arange(len(self.places)))
         return mean, self.kernel.amplitude * left
 
-    def _answers(self, queries: np.ndarray, alone: bool) -> tuple[np.ndarray, ...]:
+    def _answers(self, queries: np.ndarray, without: np.ndarray | None) -> tuple[np.ndarray, ...]:
+        parts = []
         with torch.no_grad():
-            parts = [self._answer(part, alone) for part in torch.from_numpy(queries).split(BLOCK)]
+            for start in range(0, len(queries), BLOCK):
+                block = slice(start, start + BLOCK)
+                own = None if without is None else without[block]
+                parts.append(self._answer(torch.from_numpy(queries[block]), own))
         return tuple(torch.cat(part).numpy() for part in zip(*parts, strict=True))
 
-    def _answer(self, queries: Tensor, alone: bool) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean [dB], variance of a measurement, of the amplitude, and distance to the nearest row, each (b,).
-
-        `alone`: the queries are known places, and what was measured there is not known.
-        """
-        distance, row = neighbours(self._tree, queries.detach().numpy(), NEIGHBOURS, alone)
+    def _answer(self, queries: Tensor, without: np.ndarray | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean [dB], variance of a measurement, of the amplitude, distance to the nearest row, each (b,)."""
+        row, far = self.near.nearest(queries.detach().numpy(), without)
         near = torch.from_numpy(self.places[row])
         weights, known = told(self.kernel, queries, near, torch.from_numpy(self.noise[row]))
         about = torch.from_numpy(self.weights)
@@ -115,14 +120,10 @@ class NearestProcess:
         mean = self.trend.mean(queries) + own @ about + (weights * rest).sum(1)
         unsure = own - torch.einsum("bk,bkp->bp", weights, terms)
         left = 1 + self.kernel.noise - known + ((unsure @ torch.from_numpy(self.covariance)) * unsure).sum(1)
-        return mean, left.clamp_min(0.0), torch.from_numpy(distance[:, 0])
+        return mean, left.clamp_min(0.0), torch.from_numpy(far)
 
     def _terms(self, near: Tensor) -> Tensor:
         return self.trend.terms(near.flatten(0, 1)).view(*near.shape[:2], -1)
-
-    @cached_property
-    def _tree(self) -> cKDTree:
-        return cKDTree(self.places)
 
     @cached_property
     def _reach(self) -> float:
@@ -130,32 +131,16 @@ class NearestProcess:
 
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `restored` needs."""
-        kernel, arrays = self.kernel, ("places", "values", "noise", "weights", "covariance")
-        return {
-            **self.trend.state(),
-            **kernel.state(),
-            "spread": self.spread,
-            **{name: torch.from_numpy(getattr(self, name)) for name in arrays},
-        }
+        arrays = {"places": self.places, "level": self.near.level, **{a: getattr(self, a) for a in ARRAYS}}
+        stored = {name: torch.from_numpy(value) for name, value in arrays.items()}
+        return {**self.trend.state(), **self.kernel.state(), "spread": self.spread, **stored}
 
     @classmethod
     def restored(cls, state: dict[str, Any]) -> NearestProcess:
         """The process whose `state()` this was."""
-        names = ("places", "values", "noise", "weights", "covariance")
-        arrays = (state[name].numpy() for name in names)
-        return cls(trend_of(state), PowerKernel.of(state), *arrays, float(state["spread"]))
-
-
-def neighbours(
-    tree: cKDTree, queries: np.ndarray, count: int, alone: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (B, k) [m] and numbers (B, k) of the nearest places, nearest first.
-
-    `alone`: the queries are places of the tree, and are not neighbours of themselves where there are others.
-    """
-    first = 2 if alone and tree.n > 1 else 1
-    distance, row = tree.query(queries, k=np.arange(first, min(count + first - 1, tree.n) + 1))
-    return distance, row
+        near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
+        arrays = (state[name].numpy() for name in ARRAYS)
+        return cls(trend_of(state), PowerKernel.of(state), near, *arrays, float(state["spread"]))
 
 
 def given(
@@ -176,11 +161,12 @@ def given(
         both = zip(vars(values).values(), vars(silent).values(), strict=True)
         every = Values(*(np.concatenate(pair) for pair in both))
     less = every.decibels - trend.mean(torch.from_numpy(every.places)).numpy()
+    near = Neighbourhood.of(every.places, seed)
     chosen = covering(every.places, COVER, seed)
     weights, covariance = weighed(every.places[chosen], less[chosen], noise[chosen], trend, kernel, seed)
     middle = np.average(values.decibels, weights=values.count)
     spread = np.average((values.decibels - middle) ** 2, weights=values.count) / kernel.amplitude
-    return NearestProcess(trend, kernel, every.places, less, noise, weights, covariance, float(spread))
+    return NearestProcess(trend, kernel, near, less, noise, weights, covariance, float(spread))
 
 
 @torch.no_grad()
@@ -210,7 +196,7 @@ def weighed(
         tree, end = cKDTree(places[:start]), min(2 * start, len(places))
         for a in range(start, end, BLOCK):
             block = slice(a, min(a + BLOCK, end))
-            _, row = neighbours(tree, places[block], NEIGHBOURS)
+            _, row = tree.query(places[block], k=np.arange(1, min(NEIGHBOURS, tree.n) + 1))
             shares, known = told(kernel, at[block], at[row], torch.from_numpy(noise[row]))
             left = (1 + torch.from_numpy(noise[block]) - known).sqrt()
             white.append((both[block] - torch.einsum("bk,bkp->bp", shares, both[row])) / left[:, None])
@@ -236,19 +222,17 @@ def settings_of(values: Values, trend: Trend, start: PowerKernel, seed: int) -> 
     count = len(values.places)
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
-    order = np.random.default_rng(seed).permutation(count)
     chosen = covering(values.places, COVER, seed)
     less = values.decibels - trend.mean(torch.from_numpy(values.places)).numpy()
     noise = start.noise / values.count[chosen]
     about, _ = weighed(values.places[chosen], less[chosen], noise, trend, start, seed)
-    sizes = [count]
-    while sizes[-1] / SPARSER >= FEWEST:
-        sizes.append(int(sizes[-1] / SPARSER))
+    level = Neighbourhood.of(values.places, seed).level
+    sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
-    for own in (order[:size] for size in sizes):
-        row = own[covering(values.places[own], LOOKED_AT // len(sizes), seed)]
-        _, near = neighbours(cKDTree(values.places[own]), values.places[row], NEIGHBOURS, alone=True)
-        parts.append(np.c_[row, own[near]])
+    for own in sets:
+        row = own[covering(values.places[own], LOOKED_AT // len(sets), seed)]
+        near = cKDTree(values.places[own]).query(values.places[row], k=NEIGHBOURS + 1)[1]
+        parts.append(np.c_[row, own[near[:, 1:]]])  # the nearest of all is the row itself
     rows = np.concatenate(parts)
     places = torch.from_numpy(values.places[rows])
     rest = torch.from_numpy(less[rows]) - trend.terms(places.flatten(0, 1)).view(*rows.shape, -1) @ (
@@ -259,11 +243,11 @@ def settings_of(values: Values, trend: Trend, start: PowerKernel, seed: int) -> 
     sample = Sample(
         between[:, 0, 1:], between[:, 1:, 1:], rest[:, 0], rest[:, 1:], counts[:, 0], counts[:, 1:]
     )
-    scale = pdist(values.places[order[:FEWEST]])
+    scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)
     starts = [PowerKernel((long * share, long), shares, start.noise, 1.0) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
     kernel = most_likely(starts, sample, scale)
     said = f"settings chosen on {len(rows)} of {count} places, each given its nearest {NEIGHBOURS}"
-    return kernel, f"{said} among {' and '.join(f'{size:d}' for size in sizes)}"
+    return kernel, f"{said} among {' and '.join(str(len(own)) for own in sets)}"

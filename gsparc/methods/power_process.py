@@ -19,7 +19,8 @@ from gsparc.data.schema import Site
 from gsparc.methods.censored_ep import condition, log_evidence, propagate
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows, law_of
-from gsparc.methods.nearest_process import NEIGHBOURS, NearestProcess, Values, given, settings_of
+from gsparc.methods.nearest_process import NearestProcess, Values, given, settings_of
+from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
 from gsparc.methods.trend import REACH, Trend, trend_of
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.methods import nearest_process, power_process
+from gsparc.methods import neighbourhood, power_process
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.gp import GaussianProcess
@@ -30,11 +30,11 @@ def rows_of(data, count: int) -> Rows:
 def many(monkeypatch):
     """100 rows are already many."""
     monkeypatch.setattr(power_process, "MOST_ROWS", 100)
-    monkeypatch.setattr(nearest_process, "FEWEST", 30)
+    monkeypatch.setattr(neighbourhood, "FEWEST", 30)
 
 
 def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
-    monkeypatch.setattr(nearest_process, "NEIGHBOURS", 1000)
+    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
     data = town(140)
     rows, trend = rows_of(data, 120), Trend(-100.0)
     whole, _ = conditioned(rows, trend, KERNEL, 0)
@@ -46,7 +46,7 @@ def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
 
 
 def test_rows_of_one_place_are_its_mean_and_lose_nothing(monkeypatch):
-    monkeypatch.setattr(nearest_process, "NEIGHBOURS", 1000)
+    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
     data, rng = town(60), np.random.default_rng(0)
     often = np.repeat(np.arange(40), 3)
     rows = rows_of(data, 60).at(often)
@@ -112,7 +112,7 @@ def test_slopes_of_the_mean():
 
 
 def test_left_out_is_a_prediction_without_each_place(monkeypatch):
-    monkeypatch.setattr(nearest_process, "NEIGHBOURS", 1000)
+    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
     data = town(50)
     rows = rows_of(data, 50)
     near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
