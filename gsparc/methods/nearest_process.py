@@ -231,8 +231,8 @@ def settings_of(values: Values, trend: Trend, start: PowerKernel, seed: int) -> 
     parts = []
     for own in sets:
         row = own[covering(values.places[own], LOOKED_AT // len(sets), seed)]
-        near = cKDTree(values.places[own]).query(values.places[row], k=NEIGHBOURS + 1)[1]
-        parts.append(np.c_[row, own[near[:, 1:]]])  # the nearest of all is the row itself
+        tree = cKDTree(values.places[own])  # the nearest of all is the row itself
+        parts.append(own[tree.query(values.places[row], k=NEIGHBOURS + 1)[1]])
     rows = np.concatenate(parts)
     places = torch.from_numpy(values.places[rows])
     rest = torch.from_numpy(less[rows]) - trend.terms(places.flatten(0, 1)).view(*rows.shape, -1) @ (

@@ -53,19 +53,21 @@ class Neighbourhood:
         return np.cumsum(np.bincount(self.level)).tolist()
 
     def nearest(
-        self, queries: np.ndarray, without: np.ndarray | None = None
+        self, queries: np.ndarray, without: np.ndarray | None = None, most: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Numbers (B, k) of neighbours of queries (B, D), and the distance (B,) from the nearest [m].
 
         Args:
             queries: [m].
             without: (B,) a place for each query that is no neighbour of it; None: none.
+            most: neighbours; None: NEIGHBOURS.
         """
         sparser = len(self._trees) - 1
-        share = int(NEIGHBOURS * WIDER) // max(sparser, 1)
+        most = NEIGHBOURS if most is None else most
+        share = int(most * WIDER) // max(sparser, 1)
         found, far = [], []
         for own, tree in self._trees[::-1]:
-            count = share if found else NEIGHBOURS - share * sparser
+            count = share if found else most - share * sparser
             more = 0 if without is None else 1
             ks = np.arange(1, min(count + more, tree.n) + 1)
             distance, number = tree.query(queries, k=ks)

@@ -317,7 +317,8 @@ def exact(process: Process) -> PowerProcess:
 
 def approximated(name: str, process: object) -> str:
     """A method's name with how its process is approximated, where it is."""
-    return f"{name} ({process.approximation})" if isinstance(process, NearestProcess) else name
+    how = getattr(process, "approximation", None)
+    return name if how is None else f"{name} ({how})"
 
 
 def _whole(rows: Rows, trend: Trend, kernel: PowerKernel, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:

@@ -19,6 +19,7 @@ from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, kernel_of
 
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
 MOST_LOOKS = 40
+TINY = 1e-30  # an amplitude has a logarithm
 
 
 def correlation(
@@ -46,10 +47,11 @@ def told(kernel: PowerKernel, places: Tensor, near: Tensor, noise: Tensor) -> tu
     cross = correlation(far, kernel.lengths, kernel.shares)
     gram = correlation(apart, kernel.lengths, kernel.shares)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
-    return _solved(gram, cross)
+    return solved(gram, cross)
 
 
-def _solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
+def solved(gram: Tensor, cross: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (B, k), and what they take off the variance (B,), of covariances (B, k, k) and (B, k)."""
     lower = torch.linalg.cholesky(gram)
     weights = torch.cholesky_solve(cross[..., None], lower)[..., 0]
     return weights, (weights * cross).sum(-1)
@@ -61,7 +63,8 @@ class Sample:
 
     Attributes:
         far, apart: (T, k) and (T, k, k) distances from the near ones, and between these [m].
-        value, near: (T,) and (T, k), less the mean law and its weighed terms [dB].
+        value, near: (T,) and (T, k), less the mean law and its weighed terms [dB]; or (T, P) and (T, k, P),
+            of P values that share their kernel and amplitude.
         count, counts: (T,) and (T, k) rows that each value is the mean of.
     """
 
@@ -109,8 +112,11 @@ def _density(parameters: Tensor, sample: Sample) -> tuple[Tensor, Tensor]:
     lengths, noise = list(parameters[: 2 if two else 1].exp()), parameters[-1].exp()
     shares = [share, 1 - share] if two else [share]
     gram = correlation(sample.apart, lengths, shares) + torch.diag_embed(noise / sample.counts + JITTER)
-    weights, known = _solved(gram, correlation(sample.far, lengths, shares))
+    weights, known = solved(gram, correlation(sample.far, lengths, shares))
     variance = 1 + noise / sample.count - known
-    squared = (sample.value - (weights * sample.near).sum(1)).square() / variance
-    amplitude = squared.mean().clamp_min(1e-12)
+    if sample.value.ndim == 1:
+        squared = (sample.value - (weights * sample.near).sum(1)).square()
+    else:
+        squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
+    amplitude = (squared / variance).mean().clamp_min(TINY)
     return 0.5 * (amplitude.log() + variance.log().mean()), amplitude

@@ -14,6 +14,7 @@ from gsparc.methods.kriging import Kriging
 from gsparc.methods.nearest_process import Values, given
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import conditioned, exact
+from gsparc.methods.reduced import reduced
 from gsparc.methods.trend import Trend
 from tests.methods.test_power_process import error_db, fit, town
 
@@ -154,3 +155,25 @@ def test_kriging_of_many_places_says_how_many(monkeypatch):
     assert method.label == "kriging (nearest 100)" and Kriging().label == "kriging"
     one = [method.predict(batch.tx[i : i + 1], batch.rx[i : i + 1]).mean for i in range(300)]
     assert torch.allclose(method.predict(batch.tx, batch.rx).mean, torch.cat(one))
+
+
+@pytest.mark.parametrize("kind", ["csi", "spectrum"])
+def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatch, tmp_path, kind):
+    data, near, whole = campaign(kind, 90), GaussianProcess(), GaussianProcess()
+    batch, _ = fit(whole, data, 80)
+    monkeypatch.setattr("gsparc.methods.gp.MOST_ROWS", 40)
+    batch, notes = fit(near, data, 80)
+    assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
+    assert "gp: each query is told by the 30 nearest of 80 rows (Vecchia)" in notes
+    said, exactly = near.predict(batch.tx, batch.rx), whole.predict(batch.tx, batch.rx)
+    target = batch.target
+    errors = [float((found.mean - target).abs().square().mean()) for found in (said, exactly)]
+    assert errors[0] < 2 * errors[1] < 0.1 * float(target.abs().square().mean()), errors  # very smooth
+    assert 0.3 < float(said.variance.mean() / exactly.variance.mean()) < 3
+    torch.save(near.state(), tmp_path / "state.pt")
+    again = GaussianProcess()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said.mean)
+    assert torch.allclose(near.mean_at(batch.tx, batch.rx), said.mean)
+    lean = reduced(near, {"confidence": False}, {}).predict(batch.tx, batch.rx)
+    assert lean.variance is None and torch.allclose(lean.mean, said.mean)

@@ -118,14 +118,6 @@ def test_intervals_cover_what_they_promise():
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
 
 
-def test_settings_of_other_kinds_are_chosen_on_some_rows(campaign, monkeypatch):
-    monkeypatch.setattr("gsparc.methods.gp.CHOSEN_ON", 20)
-    monkeypatch.setattr("gsparc.methods.gp.MOST_ROWS", 30)
-    _, notes = fit(GaussianProcess(), campaign("csi", 50), 40)
-    assert "gp: learned from 30 of 40 rows, drawn evenly" in notes
-    assert "gp: settings chosen on 20 of 30 rows, drawn evenly" in notes
-
-
 def test_back_from_disk_and_as_a_mean_alone(tmp_path):
     data, method = town(120), GaussianProcess()
     batch, _ = fit(method, data, 100)
