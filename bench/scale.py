@@ -2,6 +2,7 @@
 
 python bench/scale.py powers town 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
 python bench/scale.py powers city 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
+python bench/scale.py channels hall.h5 10000 100000 >> docs/results/scale/channels.csv
 python bench/scale.py draw docs/results/scale docs/images
 
 Every method is fitted in a process of its own. Seconds are of the processor, user and system, beside those
@@ -14,23 +15,26 @@ import csv
 import os
 import resource
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from town import TESTED, city, town
+from town import TESTED, city, hall, town
 
+from gsparc.data.own import load_own
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, Method
 
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
+CHANNELS = ("mean", "nearest", "complex_gp")
 SINGLE = 40  # queries asked one by one, for the time of one
 HEAD = (
     "source", "method", "label", "rows", "fit_cpu_s", "fit_wall_s", "query_cpu_ms", "rmse", "rmse_error",
-    "data_gb", "peak_gb", "load",
+    "data_gb", "peak_gb", "private_gb", "load",
 )  # fmt: skip
 
 
@@ -44,6 +48,20 @@ def make(name: str) -> Method:
         return build(compose("train", overrides=[f"model={name}"]).model)
 
 
+class Private:
+    """Watches how much memory is not of files, which the system takes back when it needs it."""
+
+    def __init__(self) -> None:
+        self.most = 0.0
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        while True:
+            text = Path("/proc/self/status").read_text(encoding="ascii")
+            self.most = max(self.most, float(text.split("RssAnon:")[1].split()[0]) / 1e6)
+            time.sleep(0.02)
+
+
 def peak_gb() -> float:
     """Largest resident memory of this process so far."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
@@ -51,7 +69,7 @@ def peak_gb() -> float:
 
 def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
     """A line of one method."""
-    held, method = peak_gb(), make(name)
+    held, private, method = peak_gb(), Private(), make(name)
     cpu, wall = time.process_time(), time.perf_counter()
     method.fit(data, fold, FitContext())
     cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
@@ -67,7 +85,7 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
         method.predict(one.tx, one.rx)
     query = (time.process_time() - began) / SINGLE * 1e3
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
-    values = (cpu, wall, query, rmse, spread, held, peak_gb(), os.getloadavg()[0])
+    values = (cpu, wall, query, rmse, spread, held, peak_gb(), private.most, os.getloadavg()[0])
     count = len(fold.train) + len(fold.val)
     csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
     sys.stdout.flush()
@@ -103,10 +121,34 @@ def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) 
         each(source, methods, data, fold, decibels)
 
 
+def relative(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Squared errors (B,) of channels or spectra, of the mean power of these targets."""
+    axes = tuple(range(1, target.ndim))
+    return (np.abs(found - target) ** 2).mean(axes) / (np.abs(target) ** 2).mean()
+
+
+def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNELS) -> None:
+    """Lines of channels that are read from a file of 16 antennas by 64 tones."""
+    for count in counts:
+        if not path.is_file():
+            hall(path, count)
+        began = time.process_time()
+        data, rows = load_own(path), np.arange(count + TESTED)
+        read = (time.process_time() - began, peak_gb(), path.stat().st_size / 1e9)
+        sys.stderr.write(
+            f"{count} rows read in {read[0]:.1f} s, peak {read[1]:.2f} GB, file {read[2]:.2f} GB\n"
+        )
+        fold = Fold(rows[:count], rows[:0], rows[-TESTED::4])
+        each("hall", methods, data, fold, relative)
+        path.unlink()
+
+
 def main(kind: str, *rest: str) -> None:
     """See the head of this file."""
     if kind == "powers":
         powers(rest[0], [int(count) for count in rest[1:]])
+    elif kind == "channels":
+        channels(Path(rest[0]), [int(count) for count in rest[1:]])
     elif kind == "head":
         csv.writer(sys.stdout).writerow(HEAD)
     else:
