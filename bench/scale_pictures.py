@@ -46,7 +46,8 @@ def draw(tables: Path, pictures: Path) -> None:
                 if quantity == "rmse":
                     errors = [2 * float(one["rmse_error"]) for one in own]
                 elif quantity == "fit_cpu_s":
-                    label = f"{name}, slope {slope(own, quantity):.2f}"
+                    found = slope(own, quantity)
+                    label = name if np.isnan(found) else f"{name}, slope {found:.2f}"
                 place.errorbar(rows, values, errors, color=colour, marker=mark, label=label, capsize=2)
                 place.set_title(title)
                 place.set_xlabel("rows")

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.data.blocks import blocks, is_big
+from gsparc.data.blocks import blocks, contents, is_big
 from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
 from gsparc.data.schema import Links, Measurements, Site
@@ -73,9 +73,10 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
         array = arrays[name]
         if array is None:
             continue
+        array = np.ascontiguousarray(array)  # of one number too: (1,)
         digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
-        for part in blocks(array) if array.ndim else ((),):
-            digest.update(np.ascontiguousarray(array[part]).tobytes())
+        for part in contents(array):
+            digest.update(part)
     return digest.hexdigest()
 
 

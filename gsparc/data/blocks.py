@@ -25,6 +25,15 @@ def blocks(array: Any) -> Iterator[slice]:
     yield from (slice(start, start + step) for start in range(0, max(len(array), 1), step))
 
 
+def contents(array: np.ndarray) -> Iterator[bytes]:
+    """Bytes of an array in the order of its entries, a block at a time."""
+    if not array.ndim:
+        yield array.tobytes()
+        return
+    for part in blocks(array):
+        yield np.ascontiguousarray(array[part]).tobytes()
+
+
 def scratch(shape: tuple[int, ...], dtype: Any) -> np.memmap:
     """An array of zeros in a file without a name (in TMPDIR), which is gone when the array is.
 

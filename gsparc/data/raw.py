@@ -16,7 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from gsparc.data.blocks import blocks, is_big, on_disk
+from gsparc.data.blocks import contents, is_big, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.hdf5_probe import read_error
@@ -113,8 +113,8 @@ def _digest(raw: Raw) -> str:
         if text:
             digest.update("\0".join(array.ravel()).encode())
         else:
-            for part in blocks(array) if array.ndim else ((),):
-                digest.update(np.ascontiguousarray(array[part]).tobytes())
+            for part in contents(array):
+                digest.update(part)
     for name, value in sorted(raw.attributes.items()):
         digest.update(f"{name}={np.asarray(_plain(value)).tolist()!r};".encode())
     return digest.hexdigest()

@@ -191,7 +191,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
             return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
         if len(targets) > MOST_ROWS:
             return self._learn_many(positions, targets)
-        self.near, thinned = None, []
+        self.near = None
+        thinned: list[str] = []
         parts = principal_components(targets, self.kind, self.limit)
         entries = len(parts.mean)
         looked_at: np.ndarray | slice = slice(None)

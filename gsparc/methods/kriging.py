@@ -165,9 +165,7 @@ class Kriging(Interpolator, PredictsVariance):
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         if self.tree is not None and len(queries) > BLOCK:
-            blocks = [self._look_up(queries[i : i + BLOCK]) for i in range(0, len(queries), BLOCK)]
-            parts = zip(*(vars(block).values() for block in blocks), strict=True)
-            return Prediction(*(None if part[0] is None else torch.cat(part) for part in parts))
+            return _joined([self._look_up(queries[i : i + BLOCK]) for i in range(0, len(queries), BLOCK)])
         place, weights, left = self._weights(queries)
         shares = torch.from_numpy(weights)
 
@@ -200,6 +198,16 @@ class Kriging(Interpolator, PredictsVariance):
         self.channels = state["channels"].numpy() if "channels" in state else None
         self.variogram = Variogram(*(float(v) for v in state["variogram"]))
         self._solve()
+
+
+def _joined(parts: list[Prediction]) -> Prediction:
+    confidence = [part.confidence for part in parts if part.confidence is not None]
+    variance = [part.variance for part in parts if part.variance is not None]
+    return Prediction(
+        torch.cat([part.mean for part in parts]),
+        torch.cat(confidence) if confidence else None,
+        torch.cat(variance) if variance else None,
+    )
 
 
 def _by_place(rows: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import h5py
 import numpy as np
 import pytest
 
 from gsparc.data import blocks
+from gsparc.data.assemble import content_hash
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own, write_own
 
@@ -56,6 +59,15 @@ def test_a_bad_entry_is_named_there_too(tmp_path, small):
             file[name] = one
     with pytest.raises(DataError, match=r"csi.*row 31.*not finite"):
         load_own(tmp_path / "own.h5")
+
+
+def test_the_hash_is_that_of_all_bytes_as_it_was(small):
+    named = {"scale": np.array(2.0), "csi": arrays(200)["csi"][:, ::2], "none": None}
+    digest = hashlib.sha256()
+    for name in ("csi", "scale"):
+        whole = np.ascontiguousarray(named[name])
+        digest.update(f"{name} {whole.dtype.str} {whole.shape};".encode() + whole.tobytes())
+    assert content_hash(named) == digest.hexdigest()
 
 
 def test_blocks_are_all_rows_in_their_order(small):

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.power_kernel import inverse_of
-from gsparc.methods.power_process import PowerProcess, conditioned, draw
+from gsparc.methods.power_process import PowerProcess, Process, conditioned, draw, exact
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
@@ -161,7 +161,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 def find_fringes(
     rows: Rows,
     numbers: np.ndarray,
-    plain: PowerProcess,
+    plain: Process,
     wavelength: float,
     seed: int,
     budget: TimeBudget | None,
@@ -190,7 +190,7 @@ def find_fringes(
     for k, part in enumerate(folds(group, FOLDS, seed)):
         fold[part] = k
     fold[rng.permutation(count)[: count // PROBES]] = -1
-    process, _ = conditioned(rows, plain.trend, plain.kernel, seed)
+    process = exact(conditioned(rows, plain.trend, plain.kernel, seed)[0])
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None
