@@ -65,7 +65,8 @@ class Neighbourhood:
         sparser = len(self._trees) - 1
         most = NEIGHBOURS if most is None else most
         share = int(most * WIDER) // max(sparser, 1)
-        found, far = [], []
+        found: list[np.ndarray] = []
+        far: list[np.ndarray] = []
         for own, tree in self._trees[::-1]:
             count = share if found else most - share * sparser
             more = 0 if without is None else 1
