@@ -139,8 +139,9 @@ class NearestProcess:
     def restored(cls, state: dict[str, Any]) -> NearestProcess:
         """The process whose `state()` this was."""
         near = Neighbourhood(state["places"].numpy(), state["level"].numpy())
-        arrays = (state[name].numpy() for name in ARRAYS)
-        return cls(trend_of(state), PowerKernel.of(state), near, *arrays, float(state["spread"]))
+        arrays = {name: state[name].numpy() for name in ARRAYS}
+        trend, kernel = trend_of(state), PowerKernel.of(state)
+        return cls(trend, kernel, near, spread=float(state["spread"]), **arrays)
 
 
 def given(

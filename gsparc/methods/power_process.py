@@ -158,8 +158,8 @@ def _fitted(
     """The process about the best of `trends`, and what must be said of it."""
     trend, kernel, said = _settings(rows, trends, seed, chosen_on)
     if len(rows.places) > MOST_ROWS and not rows.silent.any():  # these tell of settings too
-        kernel, more = settings_of(Values.of(rows.places, rows.decibels), trend, kernel, seed)
-        said = (*said, f"then {more}")
+        kernel, how = settings_of(Values.of(rows.places, rows.decibels), trend, kernel, seed)
+        said = (*said, f"then {how}")
     process, more = conditioned(rows, trend, kernel, seed)
     return process, (*said, *more)
 

@@ -75,8 +75,8 @@ class ComplexGP(PredictsVariance):
         self.places, self.near = torch.from_numpy(data.moving[known]), None
         one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
         if len(known) > MOST_ROWS and one_run:
-            notes = self._fit_many(data, known)
-            return FitReport(time.monotonic() - started, tuple(f"complex_gp: {note}" for note in notes))
+            said = tuple(f"complex_gp: {note}" for note in self._fit_many(data, known))
+            return FitReport(time.monotonic() - started, said)
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
         looked_at = torch.arange(len(known))
         if len(known) > CHOSEN_ON:
