@@ -33,7 +33,7 @@ def draw(tables: Path, pictures: Path) -> None:
         lines = list(csv.DictReader(file))
     for source in dict.fromkeys(one["source"] for one in lines):
         figure, axes = panels(9.0, 6.4, 2, 2)
-        for name in dict.fromkeys(one["method"] for one in lines):
+        for name in dict.fromkeys(one["method"] for one in lines if one["source"] == source):
             own = sorted(
                 (one for one in lines if (one["source"], one["method"]) == (source, name)),
                 key=lambda one: int(one["rows"]),
@@ -53,5 +53,5 @@ def draw(tables: Path, pictures: Path) -> None:
                 place.set_xlabel("rows")
                 place.set_yscale("log" if quantity != "peak_gb" else "linear")
                 logarithmic(place, fine=False)
-        axes[0, 0].legend()
+        figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
         save(figure, pictures / f"scale-{source}.png")

@@ -178,7 +178,7 @@ def find_fringes(
     """
     own = TimeBudget(SECONDS, "processor")
     kept = draw(rows.silent, MOST_ROWS, seed)
-    part = f" (of {len(kept)} of {len(rows.places)} rows)" if len(kept) < len(rows.places) else ""
+    drawn = f" (of {len(kept)} of {len(rows.places)} rows)" if len(kept) < len(rows.places) else ""
     rows, numbers = rows.at(kept), numbers[kept]
     count, level = len(kept), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
     basis = basis_of(rows.places, wavelength)
@@ -204,10 +204,10 @@ def find_fringes(
         if len(weights) >= TRIED and not gain.exceeds(0.0):
             break
     if fringes is None or gain is None or not gain.exceeds(0.0):
-        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{part}"
+        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{drawn}"
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
     said = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
-    return fringes, f"{said} between rows and a block away, the process the rest{part}"
+    return fringes, f"{said} between rows and a block away, the process the rest{drawn}"
 
 
 def _blindly(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
