@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gsparc.array.cross_validation import tune
 from gsparc.array.vector_cache import recovered, report
-from gsparc.array.vector_gp import aligned_by, mirror_elements
+from gsparc.array.vector_gp import aligned_by, aligned_to, mirror_elements
 from gsparc.data.files import platform_cache
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Prior
@@ -27,6 +27,7 @@ from gsparc.field.initial import InitTask, Start
 from gsparc.field.kernels import whitened
 from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
+from gsparc.methods.covering import covering
 from gsparc.methods.left_out_images import LeftOut
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.methods.time_budget import Spent, TimeBudget
@@ -35,7 +36,7 @@ from gsparc.physics.array_response import steering
 
 log = logging.getLogger(__name__)
 
-MOST_ROWS = 5000  # training spectra; of more, so many are drawn: time grows with their cube
+MOST_ROWS = 5000  # spectra whose vectors are aligned as one, in their number cubed: more follow their nearest
 RIDGE = 1e-3  # of the largest singular value of G: bounds the norm of emissions
 
 
@@ -90,7 +91,7 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
 
     Args:
         data: spectra of a static array.
-        rows: (n,) to learn from, at most `MOST_ROWS` of them.
+        rows: (n,) to learn from.
         anchors: largest number of places that stand for them.
         seed: of every random choice.
         run_dir: for the report of phase retrieval.
@@ -104,19 +105,23 @@ def learn(data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir
     if not len(rows):
         raise ValueError("the training set is empty")
     assert site.array is not None and site.grid is not None and site.wavelength is not None
-    if len(rows) > MOST_ROWS:
-        rows = np.sort(np.random.default_rng([seed, 5]).permutation(rows)[:MOST_ROWS])
-        log.info("training on %d of the spectra", len(rows))
     watch = TimeBudget()
     found, training = recovered(data, rows, platform_cache(), seed)
     elapsed = watch.counted
     report(found, data, rows, run_dir / "array_recovery.csv")
     matrix = steering(site.array, site.grid, site.wavelength).numpy()
-    images = to_real(training_targets(data, rows), "spectrum")
     partner, places = mirror_elements(site.array), data.tx[rows]
-    tuned = tune(found.vectors, places, images, matrix, site.wavelength, partner, seed)
+    core = covering(places, MOST_ROWS, seed)
+    images = to_real(training_targets(data, rows[core]), "spectrum")
+    tuned = tune(found.vectors[core], places[core], images, matrix, site.wavelength, partner, seed)
     kernel = tuned.kernel
-    vectors = aligned_by(found.vectors, places, partner, kernel)
+    vectors = np.empty(found.vectors.shape, np.complex128)
+    vectors[core] = aligned_by(found.vectors[core], places[core], partner, kernel)
+    rest = np.setdiff1d(np.arange(len(rows)), core)
+    if len(rest):
+        log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
+        others = found.vectors[rest], places[rest]
+        vectors[rest] = aligned_to(*others, vectors[core], places[core], partner, kernel)
     stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
     features = whitened(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(

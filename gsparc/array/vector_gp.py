@@ -18,6 +18,7 @@ from gsparc.methods import gp
 
 SWEEPS = 30
 TOLERANCE = 1e-3  # mean change per vector and sweep, relative to its norm, that ends the sweeps
+NEAREST = 30  # aligned vectors that a further one is aligned to
 TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
@@ -143,3 +144,34 @@ def aligned_by(
     """
     inverse = np.linalg.inv(kernel.gram(positions))
     return refine_alignment(align(vectors, positions, partner), inverse, partner)
+
+
+def aligned_to(
+    vectors: np.ndarray,
+    positions: np.ndarray,
+    known: np.ndarray,
+    places: np.ndarray,
+    partner: np.ndarray | None,
+    kernel: Kernel,
+) -> np.ndarray:
+    """Vectors (m, M) complex128 with the phases and twins most likely given the nearest of aligned ones.
+
+    Args:
+        vectors, positions: (m, M) complex and (m, 3) [m], phases and twins unknown.
+        known, places: (n, M) complex128 and (n, 3) [m], aligned.
+        partner: of `mirror_elements`.
+        kernel: length and noise.
+    """
+    aligned, tree = np.array(vectors, dtype=np.complex128), cKDTree(places)
+    near = tree.query(positions, k=np.arange(1, min(NEAREST, len(places)) + 1))[1]
+    for i, rows in enumerate(near):
+        weights = np.linalg.solve(kernel.gram(places[rows]), kernel.cross(places[rows], positions[i : i + 1]))
+        expected = weights[:, 0] @ known[rows]
+        overlap = np.vdot(aligned[i], expected)
+        if partner is not None:
+            other = twin(aligned[i], partner)
+            if abs(np.vdot(other, expected)) > abs(overlap):
+                aligned[i], overlap = other, np.vdot(other, expected)
+        if abs(overlap) > 0:
+            aligned[i] *= overlap / abs(overlap)
+    return aligned

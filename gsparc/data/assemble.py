@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsparc.data.blocks import blocks, contents, is_big
 from gsparc.data.checks.outliers import peaks, too_far, too_strong
 from gsparc.data.errors import Problems
 from gsparc.data.schema import Links, Measurements, Site
@@ -42,6 +43,8 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     measured entries.
     """
     usual = ~too_strong(peaks(values, weight))
+    if weight is None and is_big(values):
+        return _rounded_rms_of_blocks(values, usual)
     values, weight = values[usual], None if weight is None else weight[usual]
     magnitude = np.abs(values if weight is None else values[weight]).astype(np.float64)
     peak = float(magnitude.max(initial=0.0))
@@ -52,6 +55,17 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
     return float(10 ** (round(20 * np.log10(rms)) / 20))
 
 
+def _rounded_rms_of_blocks(values: np.ndarray, usual: np.ndarray) -> float:
+    peak = float(peaks(values)[usual].max(initial=0.0))
+    if peak == 0.0:
+        return 0.0
+    total, count = 0.0, 0
+    for part in blocks(values):
+        magnitude = np.abs(values[part][usual[part]]).astype(np.float64) / peak
+        total, count = total + float((magnitude**2).sum()), count + magnitude.size
+    return float(10 ** (round(20 * np.log10(peak * np.sqrt(total / count))) / 20))
+
+
 def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
     """SHA-256 of named arrays: type, shape and bytes; the same whatever file they came from."""
     digest = hashlib.sha256()
@@ -59,9 +73,10 @@ def content_hash(arrays: Mapping[str, np.ndarray | None]) -> str:
         array = arrays[name]
         if array is None:
             continue
-        array = np.ascontiguousarray(array)
+        array = np.ascontiguousarray(array)  # of one number too: (1,)
         digest.update(f"{name} {array.dtype.str} {array.shape};".encode())
-        digest.update(array.tobytes())
+        for part in contents(array):
+            digest.update(part)
     return digest.hexdigest()
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.assemble import assemble, bad_positions, rounded_rms
+from gsparc.data.blocks import blocks, is_big, scratch
 from gsparc.data.checks.outliers import peaks, too_strong
 from gsparc.data.errors import DataError
 from gsparc.data.fields import FIELDS, NORMALISATIONS
@@ -148,7 +149,7 @@ def interpret(raw: Raw, source: str | Path) -> Reading:
     target, scale = _scaled(measured, values, mask, links.censored)
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
-        check.refuse_rows(measured, ~np.isfinite(target), huge)
+        check.refuse_rows(measured, ~_finite(target), huge)
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
@@ -197,6 +198,8 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
         return None, kind
     if kind == "csi" and array.size:
         array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
+    if is_big(array) and kind == "csi" and "mask" not in check.raw.arrays:
+        return array, kind  # its blocks are cast where they are read
     if (
         kind == "rssi" or array.dtype.kind in "fc"
     ):  # magnitudes of complex64 overflow, units of 1e-42 are lost
@@ -234,13 +237,22 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
     measured = True if mask is None else mask
     unmarked = "not finite; expected numbers (mark what was not measured in mask)"
     with np.errstate(over="ignore"):
-        check.refuse_rows(name, ~np.isfinite(np.abs(values)) & measured, unmarked)
+        if mask is None:
+            check.refuse_rows(name, ~_finite(values), unmarked)
+        else:
+            check.refuse_rows(name, ~np.isfinite(np.abs(values)) & measured, unmarked)
     if name == "csi":
         return
     with np.errstate(invalid="ignore"):
         bad = np.abs(values) > 400 if name == "rssi_db" else values < 0
     wanted = "dB between -400 and 400" if name == "rssi_db" else "linear power, at least 0 (is it in dB?)"
     check.refuse_rows(name, bad & measured, f"out of range; expected {wanted}")
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    """Rows (S,) of `values` (S, ...) that are finite throughout."""
+    rows = (values[part].reshape(len(values[part]), -1) for part in blocks(values))
+    return np.concatenate([np.isfinite(np.abs(part)).all(1) for part in rows])
 
 
 def _static(
@@ -317,6 +329,12 @@ def _scaled(
     if scale <= 0:
         return values, 0.0
     lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
+    if mask_or_level is None and name == "csi" and is_big(values):
+        target = scratch(values.shape, np.complex64)
+        with np.errstate(over="ignore"):
+            for part in blocks(values):
+                target[part] = values[part].astype(np.complex128) * lift / (scale * lift)
+        return target, scale
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
         return (values * lift / (scale * lift)).astype(np.complex64 if name == "csi" else np.float32), scale
 

@@ -16,6 +16,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from gsparc.data.blocks import contents, is_big, on_disk
 from gsparc.data.errors import DataError, reason
 from gsparc.data.files import whole_file
 from gsparc.data.hdf5_probe import read_error
@@ -107,9 +108,13 @@ def _digest(raw: Raw) -> str:
     digest = hashlib.sha256()
     for name, array in sorted(raw.arrays.items()):
         text = array.dtype.kind in "US"
-        content = "\0".join(array.ravel()).encode() if text else np.ascontiguousarray(array).tobytes()
         head = f"{name} {'text' if text else array.dtype.str} {array.shape} {raw.units.get(name)};"
-        digest.update(head.encode() + content)
+        digest.update(head.encode())
+        if text:
+            digest.update("\0".join(array.ravel()).encode())
+        else:
+            for part in contents(array):
+                digest.update(part)
     for name, value in sorted(raw.attributes.items()):
         digest.update(f"{name}={np.asarray(_plain(value)).tolist()!r};".encode())
     return digest.hexdigest()
@@ -174,7 +179,7 @@ def _read_hdf5(path: Path) -> Raw:
                 name = _plain(key)  # h5py hands out bytes when a name is not UTF-8
                 if isinstance(item, h5py.Dataset):
                     text = h5py.check_string_dtype(item.dtype)
-                    arrays[name] = np.asarray(item.asstr()[()] if text else item[()])
+                    arrays[name] = on_disk(item) if not text and is_big(item) else _values(item, text)
                     if "units" in item.attrs:
                         units[name] = _plain(item.attrs["units"])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
@@ -189,6 +194,10 @@ def _read_hdf5(path: Path) -> Raw:
             f"yourself, delete the attribute {DIGEST}"
         )
     return raw
+
+
+def _values(item: h5py.Dataset, text: Any) -> np.ndarray:
+    return np.asarray(item.asstr()[()] if text else item[()])
 
 
 def _plain(value: Any) -> Any:

@@ -18,7 +18,7 @@ from gsparc.maps.promise import Promise
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.method import HasProcess
 from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.power_process import PowerProcess, fit_powers
+from gsparc.methods.power_process import PowerProcess, exact, fit_powers
 from gsparc.methods.predictor import Predictor
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
@@ -133,7 +133,7 @@ def _stand_in(asking: Predictor, promise: Promise | None, number: int) -> PowerP
     level, _ = predicted(said, asking.site.kind)
     good = np.isfinite(level)
     rows = Rows(own[good], level[good], np.zeros(int(good.sum()), bool))
-    return fit_powers(rows, asking.site, "constant")[0]
+    return exact(fit_powers(rows, asking.site, "constant")[0])
 
 
 def _queries(asking: Predictor, places: np.ndarray, other: Sequence[float] | None, width: int) -> np.ndarray:

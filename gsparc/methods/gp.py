@@ -18,18 +18,25 @@ from torch import Tensor
 from gsparc.data.schema import Kind, Measurements
 from gsparc.methods.censored import silent
 from gsparc.methods.coarse_grid import Filled
+from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Method, Prediction, PredictsVariance
+from gsparc.methods.nearest_targets import NearestTargets, learned, projected
+from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.pareto import Settings
+from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import (
     CHOSEN_ON,
     MEANS,
     MOST_ROWS,
     MeanName,
     PowerProcess,
+    Process,
+    approximated,
     conditioned,
     draw,
+    exact,
     fit_powers,
     restored,
 )
@@ -169,7 +176,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
     name = "gp"
     stored = ("mean", "axes", "weights", "lost")
     uses_censored = True
-    powers: PowerProcess | None = None  # None: not powers, or learned by an earlier version
+    powers: Process | None = None  # None: not powers, or learned by an earlier version
+    near: NearestTargets | None = None  # of rows too many for one factor
 
     def __init__(self, components: int = 512, mean: MeanName = "auto") -> None:
         if components < 1:
@@ -181,11 +189,10 @@ class GaussianProcess(Interpolator, PredictsVariance):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         if self.kind == "rssi":
             return self._learn_censored(positions, targets, np.zeros(len(targets), bool))
-        thinned = []
         if len(targets) > MOST_ROWS:
-            thinned.append(f"gp: learned from {MOST_ROWS} of {len(targets)} rows, drawn evenly")
-            kept = draw(np.zeros(len(targets), bool), MOST_ROWS, 0)
-            positions, targets = positions[kept], targets[kept]
+            return self._learn_many(positions, targets)
+        self.near = None
+        thinned: list[str] = []
         parts = principal_components(targets, self.kind, self.limit)
         entries = len(parts.mean)
         looked_at: np.ndarray | slice = slice(None)
@@ -203,6 +210,22 @@ class GaussianProcess(Interpolator, PredictsVariance):
             notes.append(f"gp: {self.limit} components kept, mean square left out {parts.lost:.2e}")
         return (*notes, *thinned)
 
+    def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
+        """Of rows too many for one factor."""
+        kept = covering(positions, CHOSEN_ON, 0)
+        parts = principal_components(targets[kept], self.kind, self.limit)
+        entries = len(parts.mean)
+        start = choose_kernel(positions[kept], parts.scores, entries)
+        scores, lost = projected(targets, self.kind, parts.mean, parts.axes)
+        first = PowerKernel((start.length,), (1.0,), start.noise, 1.0)
+        self.near, said = learned(positions, scores, lost, entries, first, 0)
+        self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
+        found = self.near.kernel
+        basis = f"{len(parts.axes)} components of {len(kept)} rows, mean square left out {lost:.2e}"
+        told_by = f"each query is told by the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
+        settings = f"length {found.lengths[0]:.4g} m, noise {found.noise:.3g} of the signal's variance"
+        return tuple(f"gp: {note}" for note in (settings, said, told_by, basis))
+
     def _learn_censored(
         self, positions: np.ndarray, targets: np.ndarray, silent: np.ndarray
     ) -> tuple[str, ...]:
@@ -211,15 +234,19 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.powers, notes = fit_powers(rows, self.site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
+    @property
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return approximated(self.name, self.powers or self.near)
+
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return self.powers
+        return None if self.powers is None else exact(self.powers)
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""
         if self.powers is None:
             return None
-        rows = rows[draw(silent(data, rows), MOST_ROWS, 0)]
         decibels = to_real(training_targets(data, rows), "rssi")[:, 0].astype(np.float64)
         found = copy.copy(self)
         seen = Rows(data.moving[rows], decibels, silent(data, rows))
@@ -231,6 +258,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
             decibels, spread, share = (torch.from_numpy(v) for v in self.powers.mean_and_variance(queries))
             power = self._decode(decibels[:, None].float())
             return Prediction(power, (1 - share).float(), entry_variance(spread.float(), power, self.kind))
+        if self.near is not None:
+            return self._look_up_near(self.near, torch.from_numpy(queries))
         cross = self.kernel.cross(queries, self.positions)
         scores = (torch.from_numpy(cross) @ self.weights).float()
         mean = self._decode(torch.addmm(self.mean, scores, self.axes))
@@ -241,10 +270,20 @@ class GaussianProcess(Interpolator, PredictsVariance):
         sure = torch.from_numpy(1 - left / prior).float()
         return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
 
+    @torch.no_grad()
+    def _look_up_near(self, near: NearestTargets, queries: Tensor) -> Prediction:
+        scores, left = near.at(queries)
+        mean = self._decode(torch.addmm(self.mean, scores, self.axes))
+        variance = (near.kernel.amplitude * left + near.lost).float()
+        sure = (1 - left / (1 + near.kernel.noise)).float()
+        return Prediction(mean, sure, entry_variance(variance, mean, self.kind))
+
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean (B, ...) alone; see `Differentiable`. The variance is most of a prediction."""
         if self.powers is not None:
             return self._decode(self.powers.mean_at(self._queries(tx, rx))[:, None].float())
+        if self.near is not None:
+            return self._decode(torch.addmm(self.mean, self.near.at(self._queries(tx, rx))[0], self.axes))
         places = torch.from_numpy(self.positions)
         squared = (self._queries(tx, rx)[:, None] - places).square().sum(-1)
         far = squared.clamp_min(1e-24).sqrt() * (math.sqrt(3) / self.kernel.length)  # finite slope at 0
@@ -253,7 +292,7 @@ class GaussianProcess(Interpolator, PredictsVariance):
 
     def knobs(self) -> tuple[str, ...]:
         """See `Reducible`."""
-        if self.powers is not None:
+        if self.powers is not None or self.near is not None:
             return ("confidence",)
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
@@ -266,8 +305,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
         assert self.site is not None
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
-        if self.powers is not None:
-            return PowerMean(self)
+        if self.powers is not None or self.near is not None:
+            return MeanAlone(self)
         stride, grid = int(settings.get("stride", 1)), self.site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
         kept: Tensor | slice = slice(
@@ -287,12 +326,18 @@ class GaussianProcess(Interpolator, PredictsVariance):
     def _learned(self) -> dict[str, Any]:
         if self.powers is not None:
             return {"powers": self.powers.state()}
+        if self.near is not None:
+            return {"near": self.near.state(), "mean": self.mean, "axes": self.axes}
         kernel = [self.kernel.length, self.kernel.noise, self.kernel.amplitude]
         return {**super()._learned(), "positions": torch.from_numpy(self.positions), "kernel": kernel}
 
     def _relearn(self, state: dict[str, Any]) -> None:
         self.powers = restored(state["powers"]) if "powers" in state else None
+        self.near = NearestTargets.of(state["near"]) if "near" in state else None
         if self.powers is not None:
+            return
+        if self.near is not None:
+            self.mean, self.axes = state["mean"], state["axes"]
             return
         super()._relearn(state)
         self.kernel = Kernel(*(float(v) for v in state["kernel"]))
@@ -300,8 +345,8 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.factor = cho_factor(self.kernel.gram(self.positions), lower=True)
 
 
-class PowerMean(View):
-    """The mean of powers, without its variance."""
+class MeanAlone(View):
+    """The mean, without its variance."""
 
     @torch.no_grad()
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:

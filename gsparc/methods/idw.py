@@ -12,6 +12,8 @@ from gsparc.methods.interpolation import Interpolator
 from gsparc.methods.method import Prediction
 from gsparc.methods.target_rows import to_real
 
+SPACING_ON = 10_000  # rows whose spacing is looked at
+
 
 class InverseDistance(Interpolator):
     """Averages the `neighbours` nearest samples with weights 1 / distance^power.
@@ -34,7 +36,8 @@ class InverseDistance(Interpolator):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Targets keep their stored type: bytes stay bytes.
         self.positions, self.targets, self.tree = positions, targets, cKDTree(positions)
-        nearest = self.tree.query(positions, k=[2])[0][:, 0]  # infinite where there is no second place
+        some = positions[:: -(-len(positions) // SPACING_ON)]
+        nearest = self.tree.query(some, k=[2])[0][:, 0]  # infinite where there is no second place
         apart = nearest[(nearest > 0) & np.isfinite(nearest)]
         self.spacing = float(np.median(apart)) if len(apart) else 1.0  # [m], of neighbouring places
         return ()

@@ -31,6 +31,7 @@ PAIRS = 200_000  # looked at for the variogram
 SIDE = 2048  # pixels of an image looked at for it
 WHOLE = 3_000  # places whose system is factored as one: that costs their number cubed
 NEAREST = 100  # places that a query is kriged from, of more than these
+BLOCK = 256  # queries whose systems are solved at a time: memory
 JITTER = 1e-9  # of the variance, only so that a system without nugget can be solved
 
 
@@ -91,6 +92,13 @@ class Kriging(Interpolator, PredictsVariance):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"
+    system: tuple[np.ndarray, np.ndarray] | None = None
+    tree: cKDTree | None = None
+
+    @property
+    def label(self) -> str:
+        """The name, and how many places a query is kriged from where it is not all."""
+        return self.name if self.tree is None else f"{self.name} (nearest {NEAREST})"
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         # Repeated places would make the system singular: their mean is kriged.
@@ -118,8 +126,7 @@ class Kriging(Interpolator, PredictsVariance):
 
     def _solve(self) -> None:
         """Factor the system of all places, or prepare to find the nearest of too many for that."""
-        self.system: tuple[np.ndarray, np.ndarray] | None = None
-        self.tree: cKDTree | None = None
+        self.system, self.tree = None, None
         if len(self.positions) > WHOLE:
             self.tree = cKDTree(self.positions)
         else:
@@ -157,6 +164,8 @@ class Kriging(Interpolator, PredictsVariance):
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
+        if self.tree is not None and len(queries) > BLOCK:
+            return _joined([self._look_up(queries[i : i + BLOCK]) for i in range(0, len(queries), BLOCK)])
         place, weights, left = self._weights(queries)
         shares = torch.from_numpy(weights)
 
@@ -189,6 +198,16 @@ class Kriging(Interpolator, PredictsVariance):
         self.channels = state["channels"].numpy() if "channels" in state else None
         self.variogram = Variogram(*(float(v) for v in state["variogram"]))
         self._solve()
+
+
+def _joined(parts: list[Prediction]) -> Prediction:
+    confidence = [part.confidence for part in parts if part.confidence is not None]
+    variance = [part.variance for part in parts if part.variance is not None]
+    return Prediction(
+        torch.cat([part.mean for part in parts]),
+        torch.cat(confidence) if confidence else None,
+        torch.cat(variance) if variance else None,
+    )
 
 
 def _by_place(rows: np.ndarray, place: np.ndarray) -> np.ndarray:

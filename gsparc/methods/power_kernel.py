@@ -6,7 +6,9 @@ those of largest leave-one-out likelihood (Rasmussen and Williams 2006, section 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError, blas, cholesky, lapack
@@ -54,6 +56,19 @@ class PowerKernel:
         matrix[np.diag_indices_from(matrix)] += self.noise
         return matrix
 
+    def state(self) -> dict[str, list[float]]:
+        """Numbers that `of` needs."""
+        return {
+            "lengths": [*self.lengths], "shares": [*self.shares], "kernel": [self.noise, self.amplitude]
+        }  # fmt: skip
+
+    @classmethod
+    def of(cls, state: Mapping[str, Any]) -> PowerKernel:
+        """The kernel whose `state()` this was."""
+        lengths, shares = (tuple(float(v) for v in state[name]) for name in ("lengths", "shares"))
+        noise, amplitude = (float(v) for v in state["kernel"])
+        return cls(lengths, shares, noise, amplitude)
+
     def parameters(self) -> np.ndarray:
         """Logarithms of lengths and noise, between them the logit of the first share where there are two."""
         logit = [np.log(self.shares[0] / self.shares[1])] if len(self.shares) == 2 else []
@@ -65,7 +80,7 @@ def kernel_of(parameters: np.ndarray, amplitude: float = 1.0) -> PowerKernel:
     noise = float(np.exp(parameters[-1]))
     if len(parameters) == 2:
         return PowerKernel((float(np.exp(parameters[0])),), (1.0,), noise, amplitude)
-    lengths, share = np.exp(parameters[:2]), 1 / (1 + np.exp(-parameters[2]))
+    lengths, share = np.exp(parameters[:2]), float(1 / (1 + np.exp(-parameters[2])))
     return PowerKernel((float(lengths[0]), float(lengths[1])), (share, 1 - share), noise, amplitude)
 
 

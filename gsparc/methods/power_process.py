@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, get_args
 
@@ -16,8 +17,14 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.methods.censored_ep import condition, log_evidence, propagate
-from gsparc.methods.distance_law import Law, Rows, law_of
+from gsparc.methods.covering import covering
+from gsparc.methods.distance_law import Rows, law_of
+from gsparc.methods.nearest_process import NearestProcess, Values, given, settings_of
+from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, choose, kernel_of, slopes
+from gsparc.methods.trend import REACH, Trend, trend_of
+
+log = logging.getLogger(__name__)
 
 MeanName = Literal["auto", "constant", "distance"]
 MEANS: tuple[MeanName, ...] = get_args(MeanName)
@@ -25,7 +32,7 @@ MEANS: tuple[MeanName, ...] = get_args(MeanName)
 CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors a matrix
 COMPARED_ON = 500  # of them, constant and distance law
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
-MOST_ROWS = 6_000  # learned from
+MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is told by the nearest
 MOST_SILENT = 3_000  # of them, where nothing was heard
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 TWO_LENGTHS_NEED = 100
@@ -33,43 +40,6 @@ SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 EVIDENCE_LOOKS = 30
 AMPLITUDES_DB2 = (1e-4, 1e5)
-REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
-
-
-@dataclass(frozen=True)
-class Trend:
-    """The mean of powers, and what of it is uncertain.
-
-    Attributes:
-        level: the mean where there is no law [dB].
-        law: the distance law, or None.
-        middle, spread: mean and deviation of the rows' decades of distance: its slope is uncertain in these.
-    """
-
-    level: float
-    law: Law | None = None
-    middle: float = 0.0
-    spread: float = 1.0
-
-    @classmethod
-    def of(cls, rows: Rows, law: Law | None) -> Trend:
-        """About a law; about the mean of what was heard where that is None."""
-        used = ~rows.silent if not rows.silent.all() else rows.silent
-        if law is None:
-            return cls(float(rows.decibels[used].mean()))
-        decades = law.decades(torch.from_numpy(rows.places))
-        return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), 1e-6))
-
-    def mean(self, places: Tensor) -> Tensor:
-        """Powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
-        return places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
-
-    def terms(self, places: Tensor) -> Tensor:
-        """What is uncertain of the mean: (n, 1), a constant, or (n, 2), also the slope of the law."""
-        one = torch.ones_like(places[:, :1])
-        if self.law is None:
-            return one
-        return torch.cat([one, (self.law.decades(places)[:, None] - self.middle) / self.spread], 1)
 
 
 @dataclass(frozen=True)
@@ -116,11 +86,15 @@ class PowerProcess:
     @cached_property
     def _spread(self) -> tuple[float, float]:
         """Variance of the rows that were heard, of the amplitude, and how far a law of them reaches [m]."""
-        lower, heard = np.tril(self.factor), self.extra == 0
-        decibels = self.trend.mean(torch.from_numpy(self.places)).numpy() + lower @ (lower.T @ self.weights)
-        whole = float(decibels[heard].var()) / self.kernel.amplitude if heard.any() else 0.0
+        heard = self.extra == 0
+        whole = float(self.decibels()[heard].var()) / self.kernel.amplitude if heard.any() else 0.0
         reach = float(np.linalg.norm(np.ptp(self.places, axis=0))) * REACH
         return max(whole, 1 + self.kernel.noise), max(reach, 1e-9)
+
+    def decibels(self) -> np.ndarray:
+        """What it was given (n,), pseudo-values where nothing was heard [dB]."""
+        lower = np.tril(self.factor)
+        return self.trend.mean(torch.from_numpy(self.places)).numpy() + lower @ (lower.T @ self.weights)
 
     def mean_at(self, queries: Tensor) -> Tensor:
         """The mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
@@ -138,35 +112,24 @@ class PowerProcess:
 
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `restored` needs."""
-        law, kernel = self.trend.law, self.kernel
-        return {
-            "trend": [self.trend.level, self.trend.middle, self.trend.spread],
-            "law": [] if law is None else [*astuple(law)[:4]],
-            "law_place": [] if law is None or law.place is None else [*law.place],
-            "lengths": [*kernel.lengths],
-            "shares": [*kernel.shares],
-            "kernel": [kernel.noise, kernel.amplitude],
-            **{name: torch.from_numpy(getattr(self, name)) for name in ("places", "weights", "extra")},
-        }
+        arrays = {name: torch.from_numpy(getattr(self, name)) for name in ("places", "weights", "extra")}
+        return {**self.trend.state(), **self.kernel.state(), **arrays}
 
 
-def restored(state: dict[str, Any]) -> PowerProcess:
+Process = PowerProcess | NearestProcess
+
+
+def restored(state: dict[str, Any]) -> Process:
     """The process whose `state()` this was."""
-    values, place = [float(v) for v in state["law"]], [float(v) for v in state["law_place"]]
-    at = (place[0], place[1], place[2]) if place else None
-    law = Law(values[0], values[1], values[2], values[3], at) if values else None
-    level, middle, spread = (float(v) for v in state["trend"])
-    lengths, shares = (tuple(float(v) for v in state[name]) for name in ("lengths", "shares"))
-    noise, amplitude = (float(v) for v in state["kernel"])
+    if "covariance" in state:
+        return NearestProcess.restored(state)
     arrays = (state[name].numpy() for name in ("places", "weights", "extra"))
-    return PowerProcess(
-        Trend(level, law, middle, spread), PowerKernel(lengths, shares, noise, amplitude), *arrays
-    )
+    return PowerProcess(trend_of(state), PowerKernel.of(state), *arrays)
 
 
 def fit_powers(
     rows: Rows, site: Site, mean: MeanName = "auto", seed: int = 0, chosen_on: int | None = None
-) -> tuple[PowerProcess, tuple[str, ...]]:
+) -> tuple[Process, tuple[str, ...]]:
     """A process of largest leave-one-out likelihood, and what must be said of it.
 
     Where some rows were silent, settings are those of largest evidence as expectation propagation has it.
@@ -178,27 +141,25 @@ def fit_powers(
         seed: of the rows that are drawn where there are too many.
         chosen_on: rows that settings are chosen on, of more; None: CHOSEN_ON.
     """
-    notes = []
-    if len(rows.places) > MOST_ROWS:
-        notes.append(f"learned from {MOST_ROWS} of {len(rows.places)} rows, drawn evenly")
-        rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
-    process, more = _fitted(rows, _trends(rows, site, mean), seed, chosen_on)
-    return process, (_description(process.trend, process.kernel), *notes, *more)
+    process, notes = _fitted(rows, _trends(rows, site, mean), seed, chosen_on)
+    return process, (_description(process.trend, process.kernel), *notes)
 
 
 def fit_about(
     rows: Rows, trend: Trend, seed: int = 0, chosen_on: int | None = None
-) -> tuple[PowerProcess, tuple[str, ...]]:
+) -> tuple[Process, tuple[str, ...]]:
     """The same about a mean law that is given."""
-    rows = rows.at(draw(rows.silent, MOST_ROWS, seed))
     return _fitted(rows, [(trend, 0, ())], seed, chosen_on)
 
 
 def _fitted(
     rows: Rows, trends: list[tuple[Trend, int, tuple[str, ...]]], seed: int, chosen_on: int | None
-) -> tuple[PowerProcess, tuple[str, ...]]:
+) -> tuple[Process, tuple[str, ...]]:
     """The process about the best of `trends`, and what must be said of it."""
     trend, kernel, said = _settings(rows, trends, seed, chosen_on)
+    if len(rows.places) > MOST_ROWS and not rows.silent.any():  # these tell of settings too
+        kernel, how = settings_of(Values.of(rows.places, rows.decibels), trend, kernel, seed)
+        said = (*said, f"then {how}")
     process, more = conditioned(rows, trend, kernel, seed)
     return process, (*said, *more)
 
@@ -316,10 +277,51 @@ def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
     return replace(one, score=-float(best.fun) * len(values) - one.cost, kernel=kernel)
 
 
-def conditioned(
-    rows: Rows, trend: Trend, kernel: PowerKernel, seed: int
-) -> tuple[PowerProcess, tuple[str, ...]]:
+def conditioned(rows: Rows, trend: Trend, kernel: PowerKernel, seed: int) -> tuple[Process, tuple[str, ...]]:
     """The process given all rows with settings as they are, and what must be said of the silent ones."""
+    if len(rows.places) > MOST_ROWS and not rows.silent.all():
+        return _nearest(rows, trend, kernel, seed)
+    return _whole(rows.at(draw(rows.silent, MOST_ROWS, seed)), trend, kernel, seed)
+
+
+def _nearest(
+    rows: Rows, trend: Trend, kernel: PowerKernel, seed: int
+) -> tuple[NearestProcess, tuple[str, ...]]:
+    """Of rows too many for one factor; of silent ones, those that a part of the rows is not sure of."""
+    loud = rows.at(np.flatnonzero(~rows.silent))
+    values = Values.of(loud.places, loud.decibels)
+    said = f"each place is told by the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
+    if not rows.silent.any():
+        return given(values, trend, kernel, None, np.zeros(0), seed), (said,)
+    part = rows.at(draw(rows.silent, MOST_ROWS, seed))
+    few, notes = _whole(part, trend, kernel, seed)
+    quiet = few.extra > 0
+    stand_ins = Values(few.places[quiet], few.decibels()[quiet], np.ones(int(quiet.sum())))
+    of = f"of {int(rows.silent.sum())} silent rows {int(part.silent.sum())}, drawn evenly, are looked at"
+    return given(values, trend, kernel, stand_ins, few.extra[quiet], seed), (said, of, *notes)
+
+
+def exact(process: Process) -> PowerProcess:
+    """One that has covariances between places; of rows too many for that, given some that cover the site."""
+    if isinstance(process, PowerProcess):
+        return process
+    few = covering(process.places, MOST_ROWS, 0)
+    log.info(
+        "covariances between places: of %d of %d rows that cover the site", len(few), len(process.places)
+    )
+    places, extra = process.places[few], process.noise[few] - process.kernel.noise
+    factor = _factored(_gram(process.kernel, places, process.trend), extra)
+    weights = cho_solve((factor, True), process.values[few], check_finite=False)
+    return PowerProcess(process.trend, process.kernel, places, weights, extra)
+
+
+def approximated(name: str, process: object) -> str:
+    """A method's name with how its process is approximated, where it is."""
+    how = getattr(process, "approximation", None)
+    return name if how is None else f"{name} ({how})"
+
+
+def _whole(rows: Rows, trend: Trend, kernel: PowerKernel, seed: int) -> tuple[PowerProcess, tuple[str, ...]]:
     notes: list[str] = []
     extra = np.zeros(len(rows.places))
     places = torch.from_numpy(rows.places)

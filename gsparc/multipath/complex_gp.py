@@ -19,7 +19,10 @@ from torch import Tensor
 
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.methods.covering import covering
 from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
+from gsparc.methods.neighbourhood import Neighbourhood
+from gsparc.methods.vecchia import solved
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import run_factors
 from gsparc.multipath.visibility_kernel import matern32
@@ -29,6 +32,11 @@ from gsparc.physics.waves import LIGHT
 LENGTHS = (0.25, 1.0, 4.0, 16.0)  # wavelengths, candidates of the envelope's length
 NOISES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0)  # of the signal's power, candidates
 CHOSEN_ON = 1_000  # rows that length and noise are chosen on: each look factors a matrix
+MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is told by the nearest
+NEAREST = 100  # rows that tell of a query: waves from all around are not screened as shadows are
+TRIED_ON = 300  # of these, rows whose density given their neighbours chooses the settings
+ENTRIES = 64  # of their channels
+QUERIES = 32  # at a time, each with the channels of its neighbours: memory
 NAMED = 6  # factors of runs that a note gives
 
 
@@ -49,6 +57,12 @@ class ComplexGP(PredictsVariance):
 
     def __init__(self) -> None:
         self.site: Site | None = None
+        self.near: Neighbourhood | None = None  # of rows too many for one factor
+
+    @property
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return self.name if self.near is None else f"{self.name} (Vecchia {NEAREST})"
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
@@ -58,7 +72,11 @@ class ComplexGP(PredictsVariance):
         known = np.concatenate([fold.train, fold.val])
         self.site = data.site
         self.shape = tuple(data.target.shape[1:])
-        self.places = torch.from_numpy(data.moving[known])
+        self.places, self.near = torch.from_numpy(data.moving[known]), None
+        one_run = data.run is None or len(np.unique(data.run[known])) == 1  # factors of several need all rows
+        if len(known) > MOST_ROWS and one_run:
+            said = tuple(f"complex_gp: {note}" for note in self._fit_many(data, known))
+            return FitReport(time.monotonic() - started, said)
         target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
         looked_at = torch.arange(len(known))
         if len(known) > CHOSEN_ON:
@@ -86,6 +104,38 @@ class ComplexGP(PredictsVariance):
             notes.append(self._said_of(names, run))
         return FitReport(time.monotonic() - started, tuple(notes))
 
+    def _fit_many(self, data: Measurements, known: np.ndarray) -> tuple[str, ...]:
+        """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours."""
+        assert self.site is not None and self.site.wavelength is not None
+        self.targets = np.empty((len(known), int(np.prod(self.shape))), np.complex64)
+        for start in range(0, len(known), MOST_ROWS):  # a block at a time: they may be on disk
+            part = known[start : start + MOST_ROWS]
+            self.targets[start : start + MOST_ROWS] = data.target[part].reshape(len(part), -1)
+        near = self.near = Neighbourhood.of(self.places.numpy(), 0)
+        row = covering(near.places, TRIED_ON, 0)
+        others, _ = near.nearest(near.places[row], row, NEAREST)
+        rows = np.c_[row, others]
+        at = torch.from_numpy(near.places[rows])
+        between = torch.cdist(at, at, compute_mode="donot_use_mm_for_euclid_dist")
+        entries = np.random.default_rng(0).permutation(self.targets.shape[1])[:ENTRIES]
+        values = torch.from_numpy(self.targets[rows[..., None], entries])
+        tried = []
+        for length in (length * self.site.wavelength for length in LENGTHS):
+            covariance = self._correlation(between, length)
+            for noise in NOISES:
+                gram = covariance[:, 1:, 1:] + noise * torch.eye(others.shape[1], dtype=torch.float64)
+                weights, told = solved(gram, covariance[:, 0, 1:])
+                missed = values[:, 0] - torch.einsum("tk,tkr->tr", weights.to(values.dtype), values[:, 1:])
+                variance = 1 + noise - told
+                power = float((missed.abs().square().mean(1) / variance).mean())
+                tried.append((np.log(max(power, 1e-300)) + float(variance.log().mean()), length, noise))
+        _, self.length, self.noise = min(tried, key=lambda t: t[0])
+        self.power = max(float(values[:, 0].abs().square().mean()), 1e-30)
+        self.runs, self.factors = np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128)
+        said = f"envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
+        told_by = f"each query is told by the {NEAREST} nearest of {len(known)} rows (Vecchia)"
+        return said, told_by, f"settings chosen on {len(row)} of them, each given its nearest"
+
     def _said_of(self, names: np.ndarray, run: np.ndarray) -> str:
         """A note of the factors of runs (n,), numbers into `names` (runs,)."""
         first = [int(np.flatnonzero(run == number)[0]) for number in range(len(names))][:NAMED]
@@ -101,7 +151,7 @@ class ComplexGP(PredictsVariance):
     def _solve(self, target: Tensor, length: float, noise: float, rows: Tensor, run: np.ndarray) -> _Solved:
         """Weights of `rows` (m,) for an envelope's length [m]; the best power and runs' factors are taken."""
         places, target, number = self.places[rows], target[rows], run[rows.numpy()]
-        gram = self._kernel(places, places, length)
+        gram = self._correlation(torch.cdist(places, places), length)
         gram.diagonal().add_(noise)
         lower = cholesky(gram)
         aligning = torch.ones(len(rows), dtype=torch.complex128)
@@ -118,9 +168,9 @@ class ComplexGP(PredictsVariance):
         nll = 0.5 * np.log(max(fit, 1e-300)) + determinant - float(aligning.abs().log().mean())
         return _Solved(nll, lower, torch.complex(weights[:, :half], weights[:, half:]), aligning)
 
-    def _kernel(self, a: Tensor, b: Tensor, length: float) -> Tensor:
+    def _correlation(self, distance: Tensor, length: float) -> Tensor:
+        """At distances [m], of any shape."""
         assert self.site is not None and self.site.carrier_hz is not None
-        distance = torch.cdist(a, b)
         envelope = matern32((distance / length).square())
         return torch.sinc(2 * distance * self.site.carrier_hz / LIGHT) * envelope
 
@@ -128,6 +178,12 @@ class ComplexGP(PredictsVariance):
         """See `Method.predict`."""
         if self.site is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
+        if self.near is not None:
+            with torch.no_grad():
+                mean, left = self._told(self.near, self._moving(tx, rx))
+            variance = left / (1 + self.noise)
+            sure = (1 - variance).float().clamp(0, 1)
+            return Prediction(mean, sure, (self.power * variance).float())
         with torch.no_grad():
             cross = self._cross(tx, rx)
         known = torch.linalg.solve_triangular(self.factor, cross.T, upper=False).square().sum(0)
@@ -151,18 +207,48 @@ class ComplexGP(PredictsVariance):
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The mean alone (B, A, K) complex64; see `Differentiable`."""
+        if self.near is not None:
+            return self._told(self.near, self._moving(tx, rx))[0]
         return self._mean(self._cross(tx, rx))
+
+    def _told(
+        self, near: Neighbourhood, queries: Tensor, without: np.ndarray | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Mean (B, A, K) complex64 and variance of a measurement (B,), of the power, by the nearest rows."""
+        means, left = [], []
+        for start in range(0, len(queries), QUERIES):
+            part = queries[start : start + QUERIES]
+            own = None if without is None else without[start : start + QUERIES]
+            row, _ = near.nearest(part.detach().numpy(), own, NEAREST)
+            places = torch.from_numpy(near.places[row])
+            far = (part[:, None] - places).square().sum(-1).clamp_min(1e-24).sqrt()  # finite slope at 0
+            apart = torch.cdist(places, places, compute_mode="donot_use_mm_for_euclid_dist")
+            gram = self._correlation(apart, self.length)
+            gram.diagonal(dim1=-2, dim2=-1).add_(self.noise)
+            weights, told = solved(gram, self._correlation(far, self.length))
+            values = torch.from_numpy(self.targets[row])
+            means.append(torch.einsum("bk,bkr->br", weights.to(values.dtype), values))
+            left.append((1 + self.noise - told).clamp_min(0))
+        return torch.cat(means).reshape(-1, *self.shape), torch.cat(left)
 
     def leave_one_out(self) -> LeftOut:
         """See `LeaveOneOut`; rows are those of the fit, counted from 0."""
+        if self.near is not None:
+            rows = np.arange(len(self.places))
+            mean = self._told(self.near, self.places, rows)[0].flatten(1)
+            return LeftOut(rows, (torch.from_numpy(self.targets) - mean).to(torch.complex128))
         inverse = torch.cholesky_inverse(self.factor).diagonal()
         return LeftOut(np.arange(len(self.places)), self.turned[:, None] * self.weights / inverse[:, None])
 
-    def _cross(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Covariance (B, n) of the moving end's places with those learned from."""
+    def _moving(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Places (B, 3) float64 [m] of the moving end."""
         assert self.site is not None
         moving = tx if self.site.moving_end == "tx" else rx.position.reshape(-1, 3).expand(len(tx), 3)
-        return self._kernel(moving.cpu().double(), self.places, self.length)
+        return moving.cpu().double()
+
+    def _cross(self, tx: Tensor, rx: Pose) -> Tensor:
+        """Covariance (B, n) of the moving end's places with those learned from."""
+        return self._correlation(torch.cdist(self._moving(tx, rx), self.places), self.length)
 
     def _mean(self, cross: Tensor) -> Tensor:
         mean = torch.complex(cross @ self.weights.real, cross @ self.weights.imag)
@@ -172,6 +258,10 @@ class ComplexGP(PredictsVariance):
         """See `Method.state`."""
         if self.site is None:
             raise ValueError("complex_gp: not fitted yet; call fit or restore first")
+        if self.near is not None:
+            arrays = {"places": self.places, "level": torch.from_numpy(self.near.level)}
+            stored = {**arrays, "targets": torch.from_numpy(self.targets), "shape": list(self.shape)}
+            return {**stored, "length": self.length, "noise": self.noise, "power": self.power}
         names = ("places", "weights", "factor", "length", "noise", "power", "turned")
         runs = {"runs": torch.from_numpy(self.runs), "factors": self.factors}
         return {**{name: getattr(self, name) for name in names}, **runs, "shape": list(self.shape)}
@@ -179,12 +269,18 @@ class ComplexGP(PredictsVariance):
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.shape = site, tuple(int(n) for n in state["shape"])
-        self.places, self.weights, self.factor = state["places"], state["weights"], state["factor"]
+        self.length, self.noise, self.power = (float(state[k]) for k in ("length", "noise", "power"))
+        self.places, self.near = state["places"], None
+        if "level" in state:
+            self.near = Neighbourhood(self.places.numpy(), state["level"].numpy())
+            self.targets = state["targets"].numpy()
+            self.runs, self.factors = np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128)
+            return
+        self.weights, self.factor = state["weights"], state["factor"]
         ones = torch.ones(len(self.places), dtype=torch.complex128)  # earlier versions knew no runs
         self.turned = state.get("turned", ones)
         self.runs = state["runs"].numpy() if "runs" in state else np.zeros(1, np.int64)
         self.factors = state.get("factors", ones[:1])
-        self.length, self.noise, self.power = (float(state[k]) for k in ("length", "noise", "power"))
 
     def size(self) -> int:
         """Training samples kept."""

@@ -26,8 +26,9 @@ from gsparc.data.walls import read_walls
 from gsparc.field.conditional import CompletedField, ConditionalField, LeftOutRows, StackedField, learns
 from gsparc.field.initial import InitSettings
 from gsparc.methods.method import FitContext, FitReport, HasPaths, Method, Prediction
+from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.pareto import Settings
-from gsparc.methods.power_process import PowerProcess
+from gsparc.methods.power_process import PowerProcess, approximated, exact
 from gsparc.methods.reduced import View, contributions, knobs, reduced
 from gsparc.methods.registry import field_initialiser, method_class
 from gsparc.methods.time_budget import Clock, TimeBudget, less_repeatable
@@ -74,6 +75,11 @@ class Gsparc(LearnedField):
         self.started = ""  # initialisers of what was fitted
         self._beside: tuple[Method, float] | None = None
         self._lean: Method | None = None  # the process beside, made when it is first asked
+
+    @property
+    def label(self) -> str:
+        """The name, and how many nearest rows tell of a place where not all do."""
+        return approximated(self.name, getattr(self.field, "process", None))
 
     @property
     def takes_budget(self) -> bool:  # type: ignore[override]
@@ -323,6 +329,9 @@ class Gsparc(LearnedField):
             assert found.explained is not None
             own = _comparable(found.explained, data.site)
             self.explained = weighing.explained(own, target, data.site.kind != "csi")
+        if isinstance(getattr(field, "process", None), NearestProcess):
+            log.info("gradient steps: none, the settings are those of largest density given the nearest rows")
+            return 0, field.count > 0
         if not learns(field) or budget.over(1 - STEPS_SHARE / 2):
             log.info(
                 "gradient steps: none, %s", "no seconds are left" if learns(field) else "nothing to move"
@@ -385,7 +394,8 @@ class Gsparc(LearnedField):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return getattr(self.field, "process", None)
+        found = getattr(self.field, "process", None)
+        return None if found is None else exact(found)
 
     def reconditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""

@@ -14,7 +14,6 @@ from scipy.spatial.distance import cdist
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.methods import power_process
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.kriging import Kriging
 from gsparc.methods.method import FitContext
@@ -117,25 +116,6 @@ def test_intervals_cover_what_they_promise():
     deviation = found.variance.sqrt() / (np.log(10) / 10 * found.mean[:, 0])
     assert 0.83 < float((missed.abs() < 1.645 * deviation).float().mean()) < 0.97
     assert found.confidence.min() >= 0 and found.confidence.max() <= 1
-
-
-def test_many_rows_are_thinned_and_it_is_said(monkeypatch):
-    monkeypatch.setattr(power_process, "CHOSEN_ON", 60)
-    monkeypatch.setattr(power_process, "COMPARED_ON", 40)
-    monkeypatch.setattr(power_process, "MOST_ROWS", 100)
-    method = GaussianProcess()
-    _, notes = fit(method, town(150), 130)
-    assert "gp: learned from 100 of 130 rows, drawn evenly" in notes
-    assert "gp: settings chosen on 60 of 100 rows, drawn evenly" in notes
-    assert method.powers is not None and len(method.powers.places) == 100
-
-
-def test_settings_of_other_kinds_are_chosen_on_some_rows(campaign, monkeypatch):
-    monkeypatch.setattr("gsparc.methods.gp.CHOSEN_ON", 20)
-    monkeypatch.setattr("gsparc.methods.gp.MOST_ROWS", 30)
-    _, notes = fit(GaussianProcess(), campaign("csi", 50), 40)
-    assert "gp: learned from 30 of 40 rows, drawn evenly" in notes
-    assert "gp: settings chosen on 20 of 30 rows, drawn evenly" in notes
 
 
 def test_back_from_disk_and_as_a_mean_alone(tmp_path):

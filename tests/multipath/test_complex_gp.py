@@ -40,6 +40,30 @@ def test_between_dense_receivers_and_back_from_disk(tmp_path):
     torch.testing.assert_close(again.predict(batch.tx, batch.rx).mean, prediction.mean)
 
 
+def test_many_rows_are_told_by_the_nearest(tmp_path, monkeypatch):
+    _, data, fold = _dense()
+    whole, near = ComplexGP(), ComplexGP()
+    whole.fit(data, fold, FitContext(tmp_path))
+    monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)
+    notes = near.fit(data, fold, FitContext(tmp_path)).notes
+    assert near.label == "complex_gp (Vecchia 100)" and whole.label == "complex_gp"
+    assert any("told by the 100 nearest" in note for note in notes), notes
+    batch = data.batch(fold.test)
+    said, exactly = (method.predict(batch.tx, batch.rx) for method in (near, whole))
+    errors = [nmse(found.mean.numpy(), batch.target.numpy()) for found in (said, exactly)]
+    assert errors[0] < 1.5 * errors[1] < 0.4, errors
+    error = (said.mean - batch.target).abs().square().mean()
+    assert 0.2 < said.variance.mean() / error < 5
+    left, all_left = near.leave_one_out(), whole.leave_one_out()
+    assert left.residual.shape == all_left.residual.shape
+    assert 0.7 < float(left.residual.abs().square().mean() / all_left.residual.abs().square().mean()) < 1.7
+    torch.save(near.state(), tmp_path / "state.pt")
+    again = ComplexGP()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said.mean)
+    assert torch.allclose(near.mean_at(batch.tx, batch.rx), said.mean)
+
+
 def test_far_from_all_measurements_it_says_nothing(tmp_path):
     _, data, fold = _dense()
     method = ComplexGP()

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsparc.data.blocks import blocks
 from gsparc.data.schema import Measurements
 
 FEW = 0.02  # share of the rows, at least one row
@@ -46,8 +47,11 @@ def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.n
 
 def peaks(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
     """Largest magnitude (S,) of the measured entries of rows `values` (S, ...)."""
-    magnitude = np.abs(values if mask is None else np.where(mask, values, 0))
-    return magnitude.reshape(len(values), -1).max(axis=1, initial=0)
+    found = []
+    for part in blocks(values):
+        magnitude = np.abs(values[part] if mask is None else np.where(mask[part], values[part], 0))
+        found.append(magnitude.reshape(len(magnitude), -1).max(axis=1, initial=0))
+    return np.concatenate(found)
 
 
 def outliers(data: Measurements) -> dict[str, np.ndarray]:

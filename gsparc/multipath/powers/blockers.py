@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsparc.methods.power_process import Trend
+from gsparc.methods.trend import Trend
 from gsparc.multipath.powers.extinction import extinctions
 
 Place = tuple[float, float, float]

@@ -10,7 +10,7 @@ here few, sought, and of any shape); one or two Matern-3/2 of place; noise. With
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,16 +23,16 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.methods.censored import silent
-from gsparc.methods.distance_law import Law, Rows
+from gsparc.methods.covering import covering
+from gsparc.methods.distance_law import Rows
+from gsparc.methods.nearest_process import COVER, NearestProcess
 from gsparc.methods.power_kernel import PowerKernel, inverse_of, kernel_of
 from gsparc.methods.power_process import (
     CHOSEN_ON,
     LAW_NEEDS,
     MEANS,
-    MOST_ROWS,
     MeanName,
-    PowerProcess,
-    Trend,
+    Process,
     conditioned,
     draw,
     fit_about,
@@ -41,6 +41,7 @@ from gsparc.methods.power_process import (
 from gsparc.methods.power_process import restored as restored_process
 from gsparc.methods.target_rows import TINY_POWER, entry_variance, from_real, to_real, training_targets
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.trend import Trend, trend_of
 from gsparc.multipath.powers.blockers import Blockers, Place, ShadowedTrend
 from gsparc.multipath.powers.fringes import Fringes, find_fringes, fringes_of, nearest, sampled
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
@@ -54,6 +55,7 @@ UNHURRIED_S = 8.0  # of a budget, from which settings are chosen on as many rows
 LEAST_CHOSEN_ON = 300
 SEEK_WITHIN = 0.35  # of a budget: seeking, and trying on groups, takes several times what the process took
 FOLDS = 5
+MOST_ASKED = 4_000  # rows of a fold that are predicted
 RIDGE_STEPS = 5  # of the variance of what is left
 LEAST = 40  # rows that were heard, for seeking Gaussians
 LEAST_KNOWN = 12  # the same, for asking whether known ones pay
@@ -115,9 +117,10 @@ class PowerField(ConditionalField):
         self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude = (
             nn.Parameter(part) for part in vars(covariance).values()
         )
-        self.process: PowerProcess | None = None
+        self.process: Process | None = None
         self._tree: cKDTree | None = None  # of its places, made when it is asked
         self.known = np.zeros(0, np.int64)
+        self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
         self.decibels = np.zeros(0)
         self.alone = np.zeros(0)  # weights of the terms where there is no process
 
@@ -186,14 +189,17 @@ class PowerField(ConditionalField):
         """
         if not len(rows):
             raise ValueError("a field of powers needs at least one row")
-        rows = rows[draw(silent(data, rows), MOST_ROWS, self.seed)]
         seen = rows_of(data, rows)
         self.process, _ = conditioned(seen, *self.prior(), self.seed)
         self._tree = None
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
+        if isinstance(self.process, NearestProcess):
+            self.at = cKDTree(self.process.places).query(loud.places)[1]
         if len(self.means):
-            trend, places = self.process.trend, torch.from_numpy(loud.places)
+            trend = self.process.trend
+            loud = loud.at(covering(loud.places, COVER, self.seed))
+            places = torch.from_numpy(loud.places)
             values = loud.decibels - trend.mean(places).numpy()
             self.alone = ridge(trend.terms(places).numpy(), values, self.process.kernel.amplitude)
 
@@ -227,18 +233,24 @@ class PowerField(ConditionalField):
     def left_out(self) -> LeftOutRows:
         """See `ConditionalField`; of rows where something was heard.
 
+        Of very many rows each is predicted without all that was measured at its place.
+
         Raises:
             ValueError: before `condition`.
         """
         process = self._conditioned()
-        lower = process.factor
-        inverse, _ = inverse_of(np.tril(lower) @ np.tril(lower).T)
-        loud = process.extra == 0
-        share = inverse.diagonal()[loud]
-        decibels = torch.from_numpy(self.decibels - process.weights[loud] / share)
-        spread = torch.from_numpy(process.kernel.amplitude / share)
-        if self.fringes is not None:
+        if isinstance(process, NearestProcess):
+            means, variances = process.left_out()
+            decibels, spread = torch.from_numpy(means[self.at]), torch.from_numpy(variances[self.at])
+            places = process.places[self.at]
+        else:
+            inverse, _ = inverse_of(np.tril(process.factor) @ np.tril(process.factor).T)
+            loud = process.extra == 0
+            share = inverse.diagonal()[loud]
+            decibels = torch.from_numpy(self.decibels - process.weights[loud] / share)
+            spread = torch.from_numpy(process.kernel.amplitude / share)
             places = process.places[loud]
+        if self.fringes is not None:
             decibels, factor = self.fringes.blended_unseen(
                 decibels, torch.from_numpy(places), nearest(places), self.known
             )
@@ -248,23 +260,21 @@ class PowerField(ConditionalField):
 
     def state(self) -> dict[str, Any]:
         """See `ConditionalField`."""
-        law = self.trend.law
         values = {name: value.detach().clone() for name, value in self.named_parameters()}
         return {
             **values,
-            "trend": [self.trend.level, self.trend.middle, self.trend.spread],
-            "law": [] if law is None else [*astuple(law)[:4]],
-            "law_place": [] if law is None or law.place is None else [*law.place],
+            **self.trend.state(),
             "still": [] if self.still is None else [*self.still],
             "seed": self.seed,
             "known": torch.from_numpy(self.known),
+            "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
             "alone": torch.from_numpy(self.alone),
             **({} if self.fringes is None else {"fringes": self.fringes.state()}),
             **({} if self.process is None else {"process": self.process.state()}),
         }
 
-    def _answer(self, process: PowerProcess, places: Tensor) -> tuple[np.ndarray, ...]:
+    def _answer(self, process: Process, places: Tensor) -> tuple[np.ndarray, ...]:
         """Mean [dB], its variance [dB^2], share of the prior's, and what is explained [dB], each (b,)."""
         mean, spread, share = process.mean_and_variance(places.numpy())
         if self.fringes is not None:
@@ -282,7 +292,7 @@ class PowerField(ConditionalField):
             self._tree = cKDTree(self._conditioned().places)
         return self._tree.query(places.numpy())[0]
 
-    def _conditioned(self) -> PowerProcess:
+    def _conditioned(self) -> Process:
         if self.process is None:
             raise ValueError("a field of powers: condition it first")
         return self.process
@@ -438,6 +448,7 @@ def gain_of_groups(
             return None
         rest = np.setdiff1d(np.arange(len(group)), part)
         asked = part[~rows.silent[part]]
+        asked = asked[draw(np.zeros(len(asked), bool), MOST_ASKED, seed)]
         learned = rows.at(rest).at(draw(rows.silent[rest], SOUGHT_ON, seed))
         if len(asked) == 0 or int((~learned.silent).sum()) < least:
             continue
@@ -457,14 +468,12 @@ def gain_of_groups(
 
 def restored(site: Site, state: dict[str, Any]) -> PowerField:
     """The field whose `state()` this was."""
-    values, place, still = ([float(v) for v in state[name]] for name in ("law", "law_place", "still"))
-    law = Law(values[0], values[1], values[2], values[3], _place(place)) if values else None
-    level, middle, spread = (float(v) for v in state["trend"])
+    still = [float(v) for v in state["still"]]
     names = ("means", "log_scales", "turns", "log_strengths")
     two = len(state["log_lengths"]) == 2
     kernel = PowerKernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
     field = PowerField(
-        site, Trend(level, law, middle, spread), kernel, Blockers(*(state[name] for name in names)),
+        site, trend_of(state), kernel, Blockers(*(state[name] for name in names)),
         _place(still), int(state["seed"]), fringes_of(state["fringes"]) if "fringes" in state else None,
     )  # fmt: skip
     with torch.no_grad():
@@ -472,10 +481,11 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
             parameter.copy_(state[name])
     field.known, field.decibels = state["known"].numpy(), state["decibels"].numpy()
     field.alone = state["alone"].numpy()
+    field.at = state["at"].numpy() if "at" in state else field.at  # earlier versions had no such processes
     if "process" in state:
         process = restored_process(state["process"])
         trend, _ = field.prior()
-        field.process = PowerProcess(trend, process.kernel, process.places, process.weights, process.extra)
+        field.process = replace(process, trend=trend)
     return field
 
 

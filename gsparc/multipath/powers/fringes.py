@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.power_kernel import inverse_of
-from gsparc.methods.power_process import PowerProcess, conditioned, draw
+from gsparc.methods.power_process import PowerProcess, Process, conditioned, draw, exact
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.multipath.powers.groups import Gain, compared, folds, groups
 from gsparc.multipath.powers.waves import FLOOR, Basis, basis_of, decibels_of, fit_waves
@@ -161,7 +161,7 @@ def nearest(places: np.ndarray) -> np.ndarray:
 def find_fringes(
     rows: Rows,
     numbers: np.ndarray,
-    plain: PowerProcess,
+    plain: Process,
     wavelength: float,
     seed: int,
     budget: TimeBudget | None,
@@ -178,6 +178,7 @@ def find_fringes(
     """
     own = TimeBudget(SECONDS, "processor")
     kept = draw(rows.silent, MOST_ROWS, seed)
+    drawn = f" (of {len(kept)} of {len(rows.places)} rows)" if len(kept) < len(rows.places) else ""
     rows, numbers = rows.at(kept), numbers[kept]
     count, level = len(kept), 10 * float(np.log10((10 ** (rows.decibels / 10)).mean()))
     basis = basis_of(rows.places, wavelength)
@@ -189,7 +190,7 @@ def find_fringes(
     for k, part in enumerate(folds(group, FOLDS, seed)):
         fold[part] = k
     fold[rng.permutation(count)[: count // PROBES]] = -1
-    process, _ = conditioned(rows, plain.trend, plain.kernel, seed)
+    process = exact(conditioned(rows, plain.trend, plain.kernel, seed)[0])
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
     gain: Gain | None = None
@@ -203,10 +204,10 @@ def find_fringes(
         if len(weights) >= TRIED and not gain.exceeds(0.0):
             break
     if fringes is None or gain is None or not gain.exceeds(0.0):
-        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better"
+        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{drawn}"
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
     said = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
-    return fringes, f"{said} between rows and a block away, the process the rest"
+    return fringes, f"{said} between rows and a block away, the process the rest{drawn}"
 
 
 def _blindly(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:

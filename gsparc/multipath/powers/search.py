@@ -20,8 +20,8 @@ from torch import Tensor
 
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.power_kernel import PowerKernel, choose, inverse_of
-from gsparc.methods.power_process import Trend
 from gsparc.methods.time_budget import TimeBudget
+from gsparc.methods.trend import Trend
 from gsparc.multipath.powers.blockers import Blockers, Place
 
 CANDIDATES = 3_000  # drawn for each Gaussian

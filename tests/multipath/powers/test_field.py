@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import replace
 
@@ -16,9 +17,10 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitContext
+from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.power_kernel import PowerKernel
-from gsparc.methods.power_process import Trend
 from gsparc.methods.registry import field_initialiser
+from gsparc.methods.trend import Trend
 from gsparc.multipath.powers import field as powers
 from gsparc.multipath.powers.blockers import Blockers
 from gsparc.multipath.powers.field import PowerField, PowerSettings, initialise, restored, rows_within
@@ -267,3 +269,21 @@ def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
         field = powers_of(data, rows, init)
         errors.append(float(np.sqrt(np.mean((db(field(batch.tx, batch.rx).mean) - db(batch.target)) ** 2))))
     assert errors[0] < 0.9 * errors[1], errors
+
+
+def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch):
+    data, field = blocked[0], blocked[1]
+    rows = np.arange(240)
+    field.condition(data, rows)
+    batch = data.batch(np.arange(240, len(data)))
+    whole, left = db(field(batch.tx, batch.rx).mean), field.left_out()
+    monkeypatch.setattr("gsparc.methods.power_process.MOST_ROWS", 100)
+    near = copy.deepcopy(field)
+    near.condition(data, rows)
+    assert isinstance(near.process, NearestProcess) and near.count == field.count > 0
+    assert np.sqrt(np.mean((db(near(batch.tx, batch.rx).mean) - whole) ** 2)) < 0.3
+    assert np.array_equal(near.left_out().rows, left.rows)
+    assert np.sqrt(np.mean((db(near.left_out().mean) - db(left.mean)) ** 2)) < 0.4
+    again = restored(data.site, near.state())
+    assert torch.equal(again(batch.tx, batch.rx).mean, near(batch.tx, batch.rx).mean)
+    assert torch.equal(again.left_out().mean, near.left_out().mean)

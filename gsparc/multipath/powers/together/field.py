@@ -267,6 +267,9 @@ def initialise(
         f"{count} stations in one model, law of exponent {law.exponent:.3g} +- {law.exponents:.2g}, "
         f"levels +- {law.levels_db:.2g} dB"
     ]
+    most, largest = most_each(count), int(np.bincount(every.station).max())
+    if largest > most:
+        said.append(f"at most {most} rows of each station are learned from, of up to {largest}")
     prior, _ = learn_shared(prior, few, budget=budget)
     if max(np.bincount(every.station)) >= ENDS_FROM and not (budget and budget.over(0.5)):
         many = thinned(every, ENDS_ON, seed)

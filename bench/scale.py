@@ -1,0 +1,161 @@
+"""Seconds, memory and errors against the number of rows.
+
+python bench/scale.py powers town 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
+python bench/scale.py powers city 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
+python bench/scale.py channels hall.h5 10000 100000 >> docs/results/scale/channels.csv
+python bench/scale.py draw docs/results/scale docs/images
+
+Every method is fitted in a process of its own. Seconds are of the processor, user and system, beside those
+of the wall, which say little on a machine that others use: its load stands beside them.
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from town import TESTED, city, hall, town
+
+from gsparc.data.own import load_own
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.methods.method import FitContext, Method
+
+POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
+CHANNELS = ("mean", "nearest", "complex_gp")
+SINGLE = 40  # queries asked one by one, for the time of one
+HEAD = (
+    "source", "method", "label", "rows", "fit_cpu_s", "fit_wall_s", "query_cpu_ms", "rmse", "rmse_error",
+    "data_gb", "peak_gb", "private_gb", "load",
+)  # fmt: skip
+
+
+def make(name: str) -> Method:
+    """An unfitted method with what `conf/model` sets."""
+    from hydra import compose, initialize_config_module
+
+    from gsparc.methods.registry import build
+
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        return build(compose("train", overrides=[f"model={name}"]).model)
+
+
+class Private:
+    """Watches how much memory is not of files, which the system takes back when it needs it."""
+
+    def __init__(self) -> None:
+        self.most = 0.0
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def _watch(self) -> None:
+        while True:
+            text = Path("/proc/self/status").read_text(encoding="ascii")
+            self.most = max(self.most, float(text.split("RssAnon:")[1].split()[0]) / 1e6)
+            time.sleep(0.02)
+
+
+def peak_gb() -> float:
+    """Largest resident memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
+    """A line of one method."""
+    held, private, method = peak_gb(), Private(), make(name)
+    cpu, wall = time.process_time(), time.perf_counter()
+    method.fit(data, fold, FitContext())
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    missed = []
+    for part in np.array_split(fold.test, -(-len(fold.test) // 256)):
+        batch = data.batch(part)
+        missed.append(error(method.predict(batch.tx, batch.rx).mean.numpy(), batch.target.numpy()))
+    squared = np.concatenate(missed)
+    rmse = np.sqrt(squared.mean())
+    ones = [data.batch(fold.test[i : i + 1]) for i in range(SINGLE)]
+    began = time.process_time()
+    for one in ones:
+        method.predict(one.tx, one.rx)
+    query = (time.process_time() - began) / SINGLE * 1e3
+    spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
+    values = (cpu, wall, query, rmse, spread, held, peak_gb(), private.most, os.getloadavg()[0])
+    count = len(fold.train) + len(fold.val)
+    csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
+    sys.stdout.flush()
+
+
+def each(
+    source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any]
+) -> None:
+    """A line of every method, each fitted in a child that the measurements are shared with."""
+    for name in methods:
+        make(name)  # imports it, so that no child does
+    for name in methods:
+        child = os.fork()
+        if child == 0:
+            try:
+                measured(source, name, data, fold, error)
+            finally:
+                os._exit(0)
+        os.waitpid(child, 0)
+
+
+def decibels(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Squared errors (B,) of powers [dB^2]."""
+    return ((10 * np.log10(found / target)) ** 2)[:, 0]
+
+
+def powers(source: str, counts: Sequence[int], methods: Sequence[str] = POWERS) -> None:
+    """Lines of all methods for numbers of rows, a tenth of them for validation."""
+    for count in counts:
+        data = {"town": town, "city": city}[source](count)
+        rows = np.arange(count + TESTED)
+        fold = Fold(rows[count // 10 : count], rows[: count // 10], rows[count:])
+        each(source, methods, data, fold, decibels)
+
+
+def relative(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Squared errors (B,) of channels or spectra, of the mean power of these targets."""
+    axes = tuple(range(1, target.ndim))
+    return (np.abs(found - target) ** 2).mean(axes) / (np.abs(target) ** 2).mean()
+
+
+def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNELS) -> None:
+    """Lines of channels that are read from a file of 16 antennas by 64 tones."""
+    for count in counts:
+        if not path.is_file():
+            hall(path, count)
+        began = time.process_time()
+        data, rows = load_own(path), np.arange(count + TESTED)
+        read = (time.process_time() - began, peak_gb(), path.stat().st_size / 1e9)
+        sys.stderr.write(
+            f"{count} rows read in {read[0]:.1f} s, peak {read[1]:.2f} GB, file {read[2]:.2f} GB\n"
+        )
+        fold = Fold(rows[:count], rows[:0], rows[-TESTED::4])
+        each("hall", methods, data, fold, relative)
+        path.unlink()
+
+
+def main(kind: str, *rest: str) -> None:
+    """See the head of this file."""
+    if kind == "powers":
+        powers(rest[0], [int(count) for count in rest[1:]])
+    elif kind == "channels":
+        channels(Path(rest[0]), [int(count) for count in rest[1:]])
+    elif kind == "head":
+        csv.writer(sys.stdout).writerow(HEAD)
+    else:
+        from scale_pictures import draw
+
+        draw(Path(rest[0]), Path(rest[1]))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

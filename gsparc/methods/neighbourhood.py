@@ -1,0 +1,81 @@
+"""Neighbours of a place among very many, near ones and some that are not of the same spot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.methods.covering import covering
+
+NEIGHBOURS = 30  # that tell of a place
+WIDER = 0.5  # share of them that are of sparser sets
+SPARSER = 8.0  # from one set of places to the next
+FEWEST = 500  # places in the sparsest of them
+
+
+@dataclass(frozen=True)
+class Neighbourhood:
+    """Places in sets that are ever sparser and cover the site.
+
+    A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
+
+    Attributes:
+        places: (n, D) [m].
+        level: (n,) int8, 0 of the sparsest set that covers the site; sets are disjoint.
+    """
+
+    places: np.ndarray
+    level: np.ndarray
+
+    @classmethod
+    def of(cls, places: np.ndarray, seed: int) -> Neighbourhood:
+        """Sets of an eighth of the places, of an eighth of these, and so on."""
+        rows, sets = np.arange(len(places)), []
+        while len(rows) / SPARSER >= FEWEST:
+            rows = rows[covering(places[rows], int(len(rows) / SPARSER), seed)]
+            sets.append(rows)
+        level = np.full(len(places), len(sets), np.int8)
+        for number, own in enumerate(sets):
+            level[own] = len(sets) - 1 - number
+        return cls(places, level)
+
+    @cached_property
+    def _trees(self) -> list[tuple[np.ndarray, cKDTree]]:
+        sets = [np.flatnonzero(self.level == number) for number in range(int(self.level.max()) + 1)]
+        return [(own, cKDTree(self.places[own])) for own in sets]
+
+    @property
+    def counts(self) -> list[int]:
+        """Places of the sparsest set, of it and the next, and so on."""
+        return np.cumsum(np.bincount(self.level)).tolist()
+
+    def nearest(
+        self, queries: np.ndarray, without: np.ndarray | None = None, most: int | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Numbers (B, k) of neighbours of queries (B, D), and the distance (B,) from the nearest [m].
+
+        Args:
+            queries: [m].
+            without: (B,) a place for each query that is no neighbour of it; None: none.
+            most: neighbours; None: NEIGHBOURS.
+        """
+        sparser = len(self._trees) - 1
+        most = NEIGHBOURS if most is None else most
+        share = int(most * WIDER) // max(sparser, 1)
+        found: list[np.ndarray] = []
+        far: list[np.ndarray] = []
+        for own, tree in self._trees[::-1]:
+            count = share if found else most - share * sparser
+            more = 0 if without is None else 1
+            ks = np.arange(1, min(count + more, tree.n) + 1)
+            distance, number = tree.query(queries, k=ks)
+            row = own[number]
+            if without is not None and row.shape[1] > 1:
+                later = np.argsort(row == without[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
+                row, distance = (np.take_along_axis(part, later, 1) for part in (row, distance))
+            found.append(row)
+            far.append(distance[:, 0])
+        return np.concatenate(found, 1), np.min(far, axis=0)

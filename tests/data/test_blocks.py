@@ -1,0 +1,76 @@
+"""Channels too large for memory: read from where they are, block by block, and the same as in memory."""
+
+from __future__ import annotations
+
+import hashlib
+
+import h5py
+import numpy as np
+import pytest
+
+from gsparc.data import blocks
+from gsparc.data.assemble import content_hash
+from gsparc.data.errors import DataError
+from gsparc.data.own import load_own, write_own
+
+
+def arrays(rows: int = 40) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    return {
+        "rx_position": rng.uniform(0, 5, (rows, 3)), "tx_position": np.array([9.0, 0, 2]),
+        "csi": (rng.normal(size=(rows, 4, 8)) + 1j * rng.normal(size=(rows, 4, 8))).astype(np.complex64),
+        "frequency_hz": 3.5e9 + 1e6 * np.arange(8),
+    }  # fmt: skip
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A kilobyte is big, and half of it a block."""
+    monkeypatch.setattr(blocks, "BIG", 1024)
+    monkeypatch.setattr(blocks, "BLOCK", 512)
+
+
+@pytest.mark.parametrize("chunked", [True, False])
+def test_channels_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch, chunked):
+    path = tmp_path / "own.h5"
+    if chunked:
+        write_own(path, arrays())
+    else:
+        with h5py.File(path, "w") as file:
+            for name, values in arrays().items():
+                file[name] = values
+    there = load_own(path)
+    assert isinstance(there.target, np.memmap) and there.target.dtype == np.complex64
+    with monkeypatch.context() as patch:
+        patch.setattr(blocks, "BIG", 2**28)
+        here = load_own(path)
+    assert not isinstance(here.target, np.memmap)
+    assert np.array_equal(there.target, here.target) and there.site.sha256 == here.site.sha256
+    assert there.site.target_scale == here.site.target_scale
+    rows = np.array([7, 3, 3, 39])
+    assert np.array_equal(there.batch(rows).target, here.batch(rows).target)
+
+
+def test_a_bad_entry_is_named_there_too(tmp_path, small):
+    values = arrays()
+    values["csi"][31, 2, 5] = np.nan
+    with h5py.File(tmp_path / "own.h5", "w") as file:
+        for name, one in values.items():
+            file[name] = one
+    with pytest.raises(DataError, match=r"csi.*row 31.*not finite"):
+        load_own(tmp_path / "own.h5")
+
+
+def test_the_hash_is_that_of_all_bytes_as_it_was(small):
+    named = {"scale": np.array(2.0), "csi": arrays(200)["csi"][:, ::2], "none": None}
+    digest = hashlib.sha256()
+    for name in ("csi", "scale"):
+        whole = np.ascontiguousarray(named[name])
+        digest.update(f"{name} {whole.dtype.str} {whole.shape};".encode() + whole.tobytes())
+    assert content_hash(named) == digest.hexdigest()
+
+
+def test_blocks_are_all_rows_in_their_order(small):
+    values = np.arange(700.0).reshape(70, 10)
+    assert np.array_equal(np.concatenate([values[part] for part in blocks.blocks(values)]), values)
+    assert len(list(blocks.blocks(np.zeros((0, 3))))) == 1

@@ -1,0 +1,179 @@
+"""Powers of very many rows, each place told by the nearest: where that is exact, and what it says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from gsparc.methods import neighbourhood, power_process
+from gsparc.methods.covering import covering
+from gsparc.methods.distance_law import Rows
+from gsparc.methods.gp import GaussianProcess
+from gsparc.methods.kriging import Kriging
+from gsparc.methods.nearest_process import Values, given
+from gsparc.methods.power_kernel import PowerKernel
+from gsparc.methods.power_process import conditioned, exact
+from gsparc.methods.reduced import reduced
+from gsparc.methods.trend import Trend
+from tests.methods.test_power_process import error_db, fit, town
+
+KERNEL = PowerKernel((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
+
+
+def rows_of(data, count: int) -> Rows:
+    return Rows(
+        data.moving[:count], 10 * np.log10(data.target[:count, 0]).astype(float), np.zeros(count, bool)
+    )
+
+
+@pytest.fixture
+def many(monkeypatch):
+    """100 rows are already many."""
+    monkeypatch.setattr(power_process, "MOST_ROWS", 100)
+    monkeypatch.setattr(neighbourhood, "FEWEST", 30)
+
+
+def test_given_all_rows_as_neighbours_it_is_the_exact_process(monkeypatch):
+    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
+    data = town(140)
+    rows, trend = rows_of(data, 120), Trend(-100.0)
+    whole, _ = conditioned(rows, trend, KERNEL, 0)
+    near = given(Values.of(rows.places, rows.decibels), trend, KERNEL, None, np.zeros(0), 0)
+    queries = np.concatenate([data.moving[120:], data.moving[120:] + 3000.0])
+    for one, other in zip(near.mean_and_variance(queries), whole.mean_and_variance(queries), strict=True):
+        assert np.allclose(one, other, rtol=1e-5)
+    assert np.allclose(near.mean_at(torch.from_numpy(queries)), whole.mean_at(torch.from_numpy(queries)))
+
+
+def test_rows_of_one_place_are_its_mean_and_lose_nothing(monkeypatch):
+    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
+    data, rng = town(60), np.random.default_rng(0)
+    often = np.repeat(np.arange(40), 3)
+    rows = rows_of(data, 60).at(often)
+    rows = Rows(rows.places, rows.decibels + rng.normal(size=120), rows.silent)
+    whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    assert len(near.places) == 40
+    for one, other in zip(
+        near.mean_and_variance(data.moving), whole.mean_and_variance(data.moving), strict=True
+    ):
+        assert np.allclose(one, other, rtol=1e-4)
+
+
+def test_thirty_neighbours_tell_nearly_all_and_the_label_says_so(many):
+    data = town(700)
+    near, whole = GaussianProcess(), GaussianProcess()
+    batch, notes = fit(near, data, 500)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(power_process, "MOST_ROWS", 10_000)
+        fit(whole, data, 500)
+    assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
+    assert "gp: each place is told by the 30 nearest of 500 (Vecchia)" in notes
+    assert error_db(near, batch) < 1.03 * error_db(whole, batch)
+
+
+def test_silent_rows_stay_known_and_are_counted(many):
+    data = town(300)
+    level = float(np.quantile(data.target, 0.3))
+    silent = data.target[:, 0] < level
+    rows = Rows(data.moving, 10 * np.log10(np.where(silent, level, data.target[:, 0])).astype(float), silent)
+    process, notes = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    assert any("of 90 silent rows 30, drawn evenly, are looked at" in note for note in notes), notes
+    loud = rows.at(np.flatnonzero(~silent))
+    deaf = given(Values.of(loud.places, loud.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    truth = 10 * np.log10(data.target[silent, 0])
+    heard, unheard = (
+        np.abs(p.mean_and_variance(data.moving[silent])[0] - truth).mean() for p in (process, deaf)
+    )
+    assert heard < unheard
+
+
+def test_back_from_disk(many, tmp_path):
+    data, method = town(160), GaussianProcess()
+    batch, _ = fit(method, data, 140)
+    torch.save(method.state(), tmp_path / "state.pt")
+    again = GaussianProcess()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    said, then = method.predict(batch.tx, batch.rx), again.predict(batch.tx, batch.rx)
+    for part in ("mean", "confidence", "variance"):
+        assert torch.equal(getattr(said, part), getattr(then, part))
+    assert again.label == "gp (Vecchia 30)"
+
+
+def test_slopes_of_the_mean():
+    data = town(120)
+    rows = rows_of(data, 120)
+    near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    at = torch.from_numpy(data.moving[:5] + 1.0).requires_grad_()
+    (slope,) = torch.autograd.grad(near.mean_at(at).sum(), at)
+    for axis in torch.eye(3, dtype=torch.float64)[:2]:
+        ends = [near.mean_at((at + h * axis).detach()) for h in (1e-4, -1e-4)]
+        assert torch.allclose(slope @ axis, (ends[0] - ends[1]) / 2e-4, rtol=1e-4, atol=1e-7)
+
+
+def test_left_out_is_a_prediction_without_each_place(monkeypatch):
+    monkeypatch.setattr(neighbourhood, "NEIGHBOURS", 1000)
+    data = town(50)
+    rows = rows_of(data, 50)
+    near = given(Values.of(rows.places, rows.decibels), Trend(-100.0), KERNEL, None, np.zeros(0), 0)
+    whole, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    share = np.linalg.inv(np.tril(whole.factor) @ np.tril(whole.factor).T).diagonal()
+    mean, variance = near.left_out()
+    order = np.lexsort(rows.places.T[::-1])  # as unique places come
+    # What the terms weigh is known from all rows, the one that is left out among them.
+    assert np.abs(mean - (rows.decibels - whole.weights / share)[order]).max() < 0.3
+    assert np.allclose(variance, (KERNEL.amplitude / share)[order], rtol=0.05)
+
+
+def test_covariances_are_those_of_rows_that_cover_the_site(many):
+    data = town(400)
+    rows = rows_of(data, 300)
+    process, _ = conditioned(rows, Trend(-100.0), KERNEL, 0)
+    few = exact(process)
+    assert len(few.places) == 100 and exact(few) is few
+    wide, _ = few.mean_and_variance(data.moving[300:])[1:]
+    narrow, _ = process.mean_and_variance(data.moving[300:])[1:]
+    assert (wide >= narrow * 0.99).mean() > 0.95
+
+
+def test_a_parked_car_counts_no_more_than_a_street():
+    rng = np.random.default_rng(0)
+    parked = 5 + 1e-3 * rng.normal(size=(9000, 2))
+    places = np.concatenate([parked, rng.uniform(0, 1000, (1000, 2))])
+    chosen = covering(places, 500, 0)
+    assert len(chosen) == 500 and len(np.unique(chosen)) == 500
+    assert (chosen >= 9000).mean() > 0.75
+    assert np.array_equal(covering(places[:300], 500, 0), np.arange(300))
+    assert len(covering(np.zeros((50, 3)), 20, 0)) == 20
+
+
+def test_kriging_of_many_places_says_how_many(monkeypatch):
+    monkeypatch.setattr("gsparc.methods.kriging.WHOLE", 150)
+    data, method = town(700), Kriging()
+    batch, _ = fit(method, data, 400)
+    assert method.label == "kriging (nearest 100)" and Kriging().label == "kriging"
+    one = [method.predict(batch.tx[i : i + 1], batch.rx[i : i + 1]).mean for i in range(300)]
+    assert torch.allclose(method.predict(batch.tx, batch.rx).mean, torch.cat(one))
+
+
+@pytest.mark.parametrize("kind", ["csi", "spectrum"])
+def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatch, tmp_path, kind):
+    data, near, whole = campaign(kind, 90), GaussianProcess(), GaussianProcess()
+    batch, _ = fit(whole, data, 80)
+    monkeypatch.setattr("gsparc.methods.gp.MOST_ROWS", 40)
+    batch, notes = fit(near, data, 80)
+    assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
+    assert "gp: each query is told by the 30 nearest of 80 rows (Vecchia)" in notes
+    said, exactly = near.predict(batch.tx, batch.rx), whole.predict(batch.tx, batch.rx)
+    target = batch.target
+    errors = [float((found.mean - target).abs().square().mean()) for found in (said, exactly)]
+    assert errors[0] < 2 * errors[1] < 0.1 * float(target.abs().square().mean()), errors  # very smooth
+    assert 0.3 < float(said.variance.mean() / exactly.variance.mean()) < 3
+    torch.save(near.state(), tmp_path / "state.pt")
+    again = GaussianProcess()
+    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
+    assert torch.equal(again.predict(batch.tx, batch.rx).mean, said.mean)
+    assert torch.allclose(near.mean_at(batch.tx, batch.rx), said.mean)
+    lean = reduced(near, {"confidence": False}, {}).predict(batch.tx, batch.rx)
+    assert lean.variance is None and torch.allclose(lean.mean, said.mean)
