@@ -287,7 +287,7 @@ def _pose(rx: Pose, chosen: Tensor, site: Site | None) -> Pose:
 
 
 def _rows(batch: Batch, chosen: Tensor, site: Site | None) -> Batch:
-    parts = {
+    parts: dict[str, Any] = {
         name: value[chosen] if isinstance(value, Tensor) and name != "station" else value
         for name, value in vars(batch).items()
     }

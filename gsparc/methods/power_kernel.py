@@ -6,6 +6,7 @@ those of largest leave-one-out likelihood (Rasmussen and Williams 2006, section 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -123,7 +124,11 @@ def inverse_of(gram: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def left_out(
-    kernel: PowerKernel, distance: np.ndarray, terms: np.ndarray, values: np.ndarray
+    kernel: PowerKernel,
+    distance: np.ndarray,
+    terms: np.ndarray,
+    values: np.ndarray,
+    bounded: bool = False,
 ) -> tuple[float, float, np.ndarray]:
     """Negative leave-one-out log density, the amplitude that minimises it, slopes by `kernel.parameters()`.
 
@@ -133,6 +138,8 @@ def left_out(
     Args:
         kernel, distance, terms: as in `PowerKernel.gram`.
         values: (n,) less the mean law [dB].
+        bounded: adds half the square of the amplitude's excess in nats over the values' variance; without it
+            few rows may choose a long process with next to no noise, good at its neighbours alone.
 
     Raises:
         LinAlgError: the covariance is not positive definite.
@@ -141,8 +148,12 @@ def left_out(
     count, ratio, share = len(values), inverse @ values, inverse.diagonal()
     amplitude = max(float((ratio**2 / share).mean()), np.finfo(float).tiny)
     density = 0.5 * count * np.log(2 * np.pi * np.e * amplitude) - 0.5 * float(np.log(share).sum())
-    by_ratio = ratio / (share * amplitude)
-    by_share = -0.5 * (ratio**2 / (share**2 * amplitude) + 1 / share)
+    least = float((values**2).mean()) if bounded else amplitude
+    excess = max(math.log(amplitude / max(least, amplitude * 1e-12)), 0.0)
+    density += 0.5 * excess**2
+    steeper = 1 + 2 * excess / count
+    by_ratio = steeper * ratio / (share * amplitude)
+    by_share = -0.5 * (steeper * ratio**2 / (share**2 * amplitude) + 1 / share)
     # dK^-1 = -K^-1 dK K^-1: the slopes by R = K^-1 y and by diag(K^-1) become one by K.
     column = inverse @ by_ratio
     by_gram = blas.dsyrk(1.0, inverse * np.sqrt(-by_share), lower=1)
@@ -159,7 +170,7 @@ def choose(
 
     def objective(parameters: np.ndarray) -> tuple[float, np.ndarray]:
         try:
-            value, _, slope = left_out(kernel_of(parameters), distance, terms, values)
+            value, _, slope = left_out(kernel_of(parameters), distance, terms, values, bounded=True)
         except LinAlgError:  # in float64: as bad as it gets
             return BAD, np.zeros(len(parameters))
         return value / len(values), slope / len(values)
@@ -168,5 +179,5 @@ def choose(
     start = min(points, key=lambda point: objective(point)[0]) if len(points) > 1 else points[0]
     pace = {"ftol": 5e-6, "maxfun": MOST_LOOKS}
     best = minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options=pace).x
-    value, amplitude, _ = left_out(kernel_of(best), distance, terms, values)
+    value, amplitude, _ = left_out(kernel_of(best), distance, terms, values, bounded=True)
     return value, kernel_of(best, amplitude)

@@ -40,6 +40,7 @@ DEFAULTS = partial(
     L.Trainer,
     accelerator="cpu",
     devices=1,
+    strategy="auto",
     precision="32-true",
     max_steps=400,
     val_check_interval=100,

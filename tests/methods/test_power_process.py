@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,9 @@ from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.kriging import Kriging
 from gsparc.methods.method import FitContext
 from gsparc.methods.power_kernel import PowerKernel, kernel_of, left_out
+from gsparc.methods.power_process import fit_powers
 from gsparc.methods.reduced import reduced
+from gsparc.multipath.powers.field import rows_of
 from gsparc.ops import Pose
 
 KERNELS = (PowerKernel((0.3,), (1.0,), 0.1, 1.0), PowerKernel((0.1, 0.5), (0.3, 0.7), 0.1, 1.0))
@@ -47,16 +50,34 @@ def error_db(method, batch) -> float:
     return float((10 * torch.log10(found / batch.target)).square().mean().sqrt())
 
 
+@pytest.mark.parametrize("bounded", [False, True])
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_slopes_of_the_left_out_likelihood(kernel):
+def test_slopes_of_the_left_out_likelihood(kernel, bounded):
     rng = np.random.default_rng(0)
     places, values = rng.uniform(size=(40, 3)), rng.normal(size=40)
     terms = np.c_[np.ones(40), rng.normal(size=40)]
     distance, at = cdist(places, places), kernel.parameters()
-    slope = left_out(kernel, distance, terms, values)[2]
+    ask = partial(left_out, distance=distance, terms=terms, values=values, bounded=bounded)
+    assert ask(kernel)[1] > values.var()  # beyond the bound
+    slope = ask(kernel)[2]
     for axis in np.eye(len(at)):
-        ends = [left_out(kernel_of(at + h * axis), distance, terms, values)[0] for h in (-1e-5, 1e-5)]
+        ends = [ask(kernel_of(at + h * axis))[0] for h in (-1e-5, 1e-5)]
         assert slope @ axis == pytest.approx((ends[1] - ends[0]) / 2e-5, rel=1e-5)
+
+
+@pytest.mark.skipif(not CITY.exists(), reason=f"{CITY} is not here")
+def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
+    """97 rows of a measured station chose 2 km and next to no noise: up to 63 dBm where nobody measured."""
+    with np.load(CITY) as stored:
+        station = stored["station"].tolist().index("law73-nuc2-b210")
+        decibels = stored["rssi_db"][:, station].astype(np.float64)
+        rows = np.random.default_rng(9).permutation(np.flatnonzero(np.isfinite(decibels)))[:97]
+        places = np.c_[stored["mobile_position"][rows], np.zeros(97)]
+        still = np.append(stored["station_position"][station], 0.0)
+    known = {"rx_position": places, "tx_position": still, "rssi_db": decibels[rows]}
+    data = from_arrays(known, {"name": "city"})
+    process, _ = fit_powers(rows_of(data, np.arange(97)), data.site)
+    assert process.kernel.amplitude < 3 * decibels[rows].var()  # 6.6 times without the bound
 
 
 def test_left_out_is_a_prediction_without_each_row():
