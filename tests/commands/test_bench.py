@@ -17,6 +17,7 @@ from gsparc.methods.timing import ClockSettings
 from gsparc.ops import composite, machine_limits, make_plan
 
 
+@pytest.mark.slow
 def test_quick_bench_leaves_finite_ratios(tmp_path):
     command = [sys.executable, "-m", "gsparc", "bench", "quick=true", f"hydra.run.dir={tmp_path}"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300)

@@ -192,6 +192,7 @@ def test_methods_of_one_end_are_refused_as_before():
 CHANNELS = Path(__file__).parents[3] / "shared" / "data" / "real" / "techtile-csi-920mhz.npz"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CHANNELS.is_file(), reason=f"no measured channels at {CHANNELS}")
 def test_measured_ceiling_in_squares():
     from gsparc.data.modules.techtile import Techtile
