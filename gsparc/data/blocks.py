@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import os
 import tempfile
 from collections.abc import Iterator
 from typing import Any
@@ -41,6 +43,9 @@ def scratch(shape: tuple[int, ...], dtype: Any) -> np.memmap:
         OSError: no room.
     """
     with tempfile.TemporaryFile(prefix="gsparc-") as file:
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        if size and hasattr(os, "posix_fallocate"):  # a full disk would end the process at the first write
+            os.posix_fallocate(file.fileno(), 0, size)
         return np.memmap(file, dtype=dtype, mode="w+", shape=shape)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,13 +26,15 @@ def claimed(lock: Path) -> Iterator[bool]:
         ValueError: the file system has no locks.
     """
     lock.parent.mkdir(parents=True, exist_ok=True)
-    file = FileLock(lock)
+    file = FileLock(lock, fallback_to_soft=False)  # a soft lock would outlive a killed owner
     try:
         file.acquire(timeout=0)
     except Timeout:
         yield False
         return
-    except NotImplementedError:
+    except (NotImplementedError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP):
+            raise
         raise ValueError(f"{lock}: this file system has no locks; choose a folder on another") from None
     try:
         yield True

@@ -86,7 +86,7 @@ class PowerProcess:
     @cached_property
     def _spread(self) -> tuple[float, float]:
         """Variance of the rows that were heard, of the amplitude, and how far a law of them reaches [m]."""
-        heard = self.extra == 0
+        heard = self.extra <= 0  # below: the mean of several at one place
         whole = float(self.decibels()[heard].var()) / self.kernel.amplitude if heard.any() else 0.0
         reach = float(np.linalg.norm(np.ptp(self.places, axis=0))) * REACH
         return max(whole, 1 + self.kernel.noise), max(reach, 1e-9)

@@ -66,7 +66,7 @@ def simulate(campaign: Campaign, out: Path, shared: bool = False) -> Outcome | N
         ValueError: `out` exists, or parts beside it belong to another simulation, or bad settings.
         SimulatorMissing: the scene needs Sionna and it is not here.
     """
-    plan = {**asdict(campaign), "parts": PARTS}
+    plan = {**asdict(campaign), "parts": PARTS, "inputs": campaign.inputs()}
     if out.exists():
         if shared and written_by(out, plan):
             return None

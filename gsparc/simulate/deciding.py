@@ -188,7 +188,8 @@ def _verify(
         choice = auto.verify(choice, settings, probe)
         errors = probe.errors(choice.effects, settings.required)
         failed = int((errors[probe.reached] > settings.required.tolerance).sum())
-        early, _ = auto.allowed_failures(count, len(held), settings.quantile, settings.confidence)
+        heard = int(probe.reached.sum())
+        early, _ = auto.allowed_failures(heard, len(held), settings.quantile, settings.confidence)
         if failed <= early:
             break
     return choice, Changed(held[:count], errors)
@@ -215,7 +216,7 @@ def _key(campaign: Campaign, settings: AutoSettings, survey: Survey) -> str:
         "geometry": survey.engine.fingerprint(), "transmitters": survey.transmitters.tolist(),
         "materials": survey.engine.materials(), "versions": survey.engine.versions(), "scene": scene,
         "asked": asked, "antennas": [getattr(e, "antenna", None) for e in survey.engines], 
-        "samples": campaign.sampling.samples, "names": survey.names,
+        "samples": campaign.sampling.samples, "names": survey.names, "inputs": campaign.inputs(),
     }  # fmt: skip
     if settings.required.kind != "coverage":
         about |= {"csi": asdict(campaign.csi), "spectrum": asdict(campaign.spectrum)}

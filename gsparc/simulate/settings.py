@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -59,6 +61,15 @@ class Campaign:
     check_seed: int = 2
     weakest_db: float = 60.0
     measurement: str = "spectrum"
+
+    def inputs(self) -> dict[str, str]:
+        """SHA-256 of the files that a scene and its receivers are read from."""
+        files = (self.scene.file, self.scene.xml, (self.scene.receivers or {}).get("file"))
+        return {
+            str(file): hashlib.sha256(Path(file).read_bytes()).hexdigest()
+            for file in files
+            if file is not None and Path(file).is_file()
+        }
 
     def __post_init__(self) -> None:
         if self.measurement not in ("spectrum", "csi"):

@@ -193,6 +193,19 @@ def test_parts_of_another_simulation_are_refused(tmp_path, monkeypatch):
         simulate(plan(shard=20), tmp_path / "box.h5")
 
 
+def test_parts_of_another_table_of_places_are_refused(tmp_path, monkeypatch):
+    """Shards were kept by the number of a row whose place had changed."""
+    table = tmp_path / "places.csv"
+    asked = plan(scene=replace(SCENE, receivers={"kind": "file", "file": str(table)}))
+    table.write_text("x,y,z\n1,1,1.2\n2,1,1.2\n3,1,1.2\n")
+    monkeypatch.setattr(campaigns, "_trace_all", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        simulate(asked, tmp_path / "box.h5")
+    table.write_text("x,y,z\n1,1,1.2\n2,1,1.2\n3,4,1.2\n")
+    with pytest.raises(ValueError, match="different simulation"):
+        simulate(asked, tmp_path / "box.h5")
+
+
 def test_a_kill_amid_the_removal_leaves_no_shards_without_their_plan(tmp_path, monkeypatch):
     """Shards whose plan was removed first would pass for those of any other simulation."""
 

@@ -35,7 +35,7 @@ def visit():
             client_id=number, scene=server.scene, gui=server.gui, camera=server.initial_camera,
             atomic=server.atomic,
         )  # fmt: skip
-        return Session(client, view, work)
+        return Session(client, view, work, 1)
 
     yield come
     work.close()

@@ -195,7 +195,9 @@ class PowerField(ConditionalField):
         loud = seen.at(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
         if isinstance(self.process, NearestProcess):
-            self.at = cKDTree(self.process.places).query(loud.places)[1]
+            # A silent row may lie at the same place; its noise is larger than any mean's.
+            heard = np.flatnonzero(self.process.noise <= self.process.kernel.noise)
+            self.at = heard[cKDTree(self.process.places[heard]).query(loud.places)[1]]
         if len(self.means):
             trend = self.process.trend
             loud = loud.at(covering(loud.places, COVER, self.seed))

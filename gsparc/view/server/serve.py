@@ -7,6 +7,7 @@ import threading
 import time
 from typing import Any
 
+import torch
 import viser
 
 from gsparc.data.errors import DataError
@@ -32,7 +33,8 @@ class Server:
     def __init__(self, view: SiteView, host: str = "127.0.0.1", port: int = 8080) -> None:
         self.view, self.work = view, Newest()
         self.sessions: dict[int, Session] = {}
-        self._lock = threading.Lock()
+        self._lock, self._threads = threading.Lock(), torch.get_num_threads()
+        self._gone: set[int] = set()  # clients that left before their session was there
         view.station(view.viewed.stations[0])  # made before anyone waits for it
         try:
             self.server = viser.ViserServer(host=host, port=port, label="gsparc", verbose=False)
@@ -49,14 +51,21 @@ class Server:
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def _came(self, client: Any) -> None:
-        session = Session(client, self.view, self.work)
+        session = Session(client, self.view, self.work, self._threads)
         with self._lock:
-            self.sessions[client.client_id] = session
+            gone = client.client_id in self._gone  # while its session was made
+            self._gone.discard(client.client_id)
+            if not gone:
+                self.sessions[client.client_id] = session
+        if gone:
+            self.work.forget(lambda key: isinstance(key, tuple) and key[0] == client.client_id)
+            return
         log.info("client %d came, %d here", client.client_id, len(self.sessions))
 
     def _went(self, client: Any) -> None:
         with self._lock:
-            self.sessions.pop(client.client_id, None)
+            if self.sessions.pop(client.client_id, None) is None:
+                self._gone.add(client.client_id)
         self.work.forget(lambda key: isinstance(key, tuple) and key[0] == client.client_id)
         log.info("client %d went, %d here", client.client_id, len(self.sessions))
 

@@ -46,8 +46,8 @@ class Session:
         work: does what is asked.
     """
 
-    def __init__(self, client: Any, view: SiteView, work: Newest) -> None:
-        self.client, self.view, self.work = client, view, work
+    def __init__(self, client: Any, view: SiteView, work: Newest, threads: int) -> None:
+        self.client, self.view, self.work, self.threads = client, view, work, threads
         self.site = view.viewed.site
         self.station = view.viewed.stations[0]
         self.places = {end: np.asarray(at, np.float64) for end, at in view.starts(self.station).items()}
@@ -275,8 +275,9 @@ class Session:
     def _answered(self) -> Iterator[None]:
         since, places = self.asked_s, {end: at.copy() for end, at in self.places.items()}
         way = self.view.viewed.ways[-1 if self.way is None else int(self.way.value)]
-        if way.threads is not None and way.threads != torch.get_num_threads():
-            torch.set_num_threads(way.threads)
+        threads = self.threads if way.threads is None else way.threads
+        if threads != torch.get_num_threads():
+            torch.set_num_threads(threads)
         try:
             predictor = way.predictor if self.station is None else way.predictor.at(self.station)
             answer = ask(predictor, places)

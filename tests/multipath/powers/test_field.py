@@ -287,3 +287,18 @@ def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch
     again = restored(data.site, near.state())
     assert torch.equal(again(batch.tx, batch.rx).mean, near(batch.tx, batch.rx).mean)
     assert torch.equal(again.left_out().mean, near.left_out().mean)
+
+
+def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
+    """Among very many rows the nearest to a row could be a silent one of the same place."""
+    one = town(150, walls=False)
+    twice = np.tile(np.arange(150), 2)
+    places, decibels = one.moving[twice] + one.site.origin, db(torch.from_numpy(one.target[twice]))
+    data = from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
+    silent = np.arange(300) >= 150
+    data = replace(data, mask=~silent[:, None], censored=silent)
+    monkeypatch.setattr("gsparc.methods.power_process.MOST_ROWS", 100)
+    field = small_field(data, two=False)
+    field.condition(data, np.arange(300))
+    assert isinstance(field.process, NearestProcess) and len(field.at) == 150
+    assert (field.process.noise[field.at] <= field.process.kernel.noise).all()
