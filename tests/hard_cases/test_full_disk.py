@@ -72,6 +72,7 @@ def test_training_stops_with_one_line_and_goes_on_when_there_is_room(tmp_path):
     assert checkpoint.read(folder / "last.ckpt").extra["trainer"]["global_step"] == 40
 
 
+@pytest.mark.slow
 def test_simulation_keeps_its_finished_shards(tmp_path):
     whole, out = tmp_path / "whole.h5", tmp_path / "box.h5"
     assert run(simulation, str(whole), 20)[0] == 0

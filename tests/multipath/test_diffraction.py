@@ -68,6 +68,7 @@ def test_a_diffracted_wave_takes_the_shortest_way_and_spreads_as_keller_says():
     assert torch.allclose(met[0, 0], points[best], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_an_edge_is_found_where_it_is_and_explains_what_no_point_can(tmp_path):
     _, data, fold = _room(_edge)
     method, report, error = _fit(data, fold, tmp_path)

@@ -54,7 +54,8 @@ def _scalar_nmse(predicted, true):
     return nmse(predicted * scalar[:, None, None], true)
 
 
-@pytest.mark.parametrize("offsets", [pytest.param("phase", marks=pytest.mark.slow), "phase_timing"])
+@pytest.mark.slow
+@pytest.mark.parametrize("offsets", ["phase", "phase_timing"])
 def test_sources_are_found_through_unknown_offsets(offsets, tmp_path):
     _, data, fold = shoebox(150, size=SMALL, max_order=1, frequency_hz=FREQUENCY, reflection=-0.5)
     _, _, seen = _offset(data, offsets == "phase_timing")
