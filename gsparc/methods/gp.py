@@ -222,7 +222,7 @@ class GaussianProcess(Interpolator, PredictsVariance):
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
         found = self.near.kernel
         basis = f"{len(parts.axes)} components of {len(kept)} rows, mean square left out {lost:.2e}"
-        told_by = f"each query is told by the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
+        told_by = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
         settings = f"length {found.lengths[0]:.4g} m, noise {found.noise:.3g} of the signal's variance"
         return tuple(f"gp: {note}" for note in (settings, said, told_by, basis))
 

@@ -1,4 +1,4 @@
-"""A process of powers given very many rows: each place is told by the rows nearest to it alone.
+"""A process of powers given very many rows: each place is predicted from the rows nearest to it.
 
 A. V. Vecchia, "Estimation and model identification for continuous spatial processes", J. R. Stat. Soc. B 50
 (1988); A. Datta et al., "Hierarchical nearest-neighbor Gaussian process models for large geostatistical

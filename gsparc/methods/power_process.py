@@ -32,7 +32,7 @@ MEANS: tuple[MeanName, ...] = get_args(MeanName)
 CHOSEN_ON = 1_000  # rows that settings are chosen on: each look at them factors a matrix
 COMPARED_ON = 500  # of them, constant and distance law
 WEIGHED_ON = 600  # the same where some rows were silent: each look factors several
-MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is told by the nearest
+MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
 MOST_SILENT = 3_000  # of them, where nothing was heard
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 TWO_LENGTHS_NEED = 100
@@ -290,7 +290,7 @@ def _nearest(
     """Of rows too many for one factor; of silent ones, those that a part of the rows is not sure of."""
     loud = rows.at(np.flatnonzero(~rows.silent))
     values = Values.of(loud.places, loud.decibels)
-    said = f"each place is told by the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
+    said = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
     if not rows.silent.any():
         return given(values, trend, kernel, None, np.zeros(0), seed), (said,)
     part = rows.at(draw(rows.silent, MOST_ROWS, seed))

@@ -133,7 +133,7 @@ class ComplexGP(PredictsVariance):
         self.power = max(float(values[:, 0].abs().square().mean()), 1e-30)
         self.runs, self.factors = np.zeros(1, np.int64), torch.ones(1, dtype=torch.complex128)
         said = f"envelope {self.length:.3g} m, noise {self.noise:.0e} of the signal's power"
-        told_by = f"each query is told by the {NEAREST} nearest of {len(known)} rows (Vecchia)"
+        told_by = f"each query is predicted from the {NEAREST} nearest of {len(known)} rows (Vecchia)"
         return said, told_by, f"settings chosen on {len(row)} of them, each given its nearest"
 
     def _said_of(self, names: np.ndarray, run: np.ndarray) -> str:

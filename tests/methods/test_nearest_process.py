@@ -69,7 +69,7 @@ def test_thirty_neighbours_tell_nearly_all_and_the_label_says_so(many):
         patch.setattr(power_process, "MOST_ROWS", 10_000)
         fit(whole, data, 500)
     assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
-    assert "gp: each place is told by the 30 nearest of 500 (Vecchia)" in notes
+    assert "gp: each place is predicted from the 30 nearest of 500 (Vecchia)" in notes
     assert error_db(near, batch) < 1.03 * error_db(whole, batch)
 
 
@@ -164,7 +164,7 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     monkeypatch.setattr("gsparc.methods.gp.MOST_ROWS", 40)
     batch, notes = fit(near, data, 80)
     assert near.label == "gp (Vecchia 30)" and whole.label == "gp"
-    assert "gp: each query is told by the 30 nearest of 80 rows (Vecchia)" in notes
+    assert "gp: each query is predicted from the 30 nearest of 80 rows (Vecchia)" in notes
     said, exactly = near.predict(batch.tx, batch.rx), whole.predict(batch.tx, batch.rx)
     target = batch.target
     errors = [float((found.mean - target).abs().square().mean()) for found in (said, exactly)]

@@ -47,7 +47,7 @@ def test_many_rows_are_told_by_the_nearest(tmp_path, monkeypatch):
     monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)
     notes = near.fit(data, fold, FitContext(tmp_path)).notes
     assert near.label == "complex_gp (Vecchia 100)" and whole.label == "complex_gp"
-    assert any("told by the 100 nearest" in note for note in notes), notes
+    assert any("predicted from the 100 nearest" in note for note in notes), notes
     batch = data.batch(fold.test)
     said, exactly = (method.predict(batch.tx, batch.rx) for method in (near, whole))
     errors = [nmse(found.mean.numpy(), batch.target.numpy()) for found in (said, exactly)]
