@@ -16,9 +16,9 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import torch
 from campaigns import brief, spectra
 from crashes import killed, moments, run, simulation, training
+from states import same
 
 from gsparc.methods import checkpoint
 
@@ -58,16 +58,6 @@ def assert_whole(folder: Path) -> None:
         elif path.suffix == ".h5":
             with h5py.File(path) as file:
                 assert len(file["rx_position"]) == ROWS
-
-
-def same(a: object, b: object) -> bool:
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return a == b
 
 
 @pytest.fixture(scope="module")

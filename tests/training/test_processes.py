@@ -9,6 +9,7 @@ import pytest
 import torch
 from invented import invent
 from several import Kill, trained
+from states import same
 
 from gsparc.training.processes import Processes, add_up, agreed, count
 
@@ -40,16 +41,6 @@ def test_two_processes_learn_what_one_does(tmp_path, static_end, double, most):
     assert torch.equal(one["model.gaussians.ids"], two["model.gaussians.ids"])
     for name, value in one.items():
         assert (value - two[name]).abs().max() <= most * (1 + value.abs().max()), name
-
-
-def same(a: object, b: object) -> bool:
-    if isinstance(a, torch.Tensor):
-        return torch.equal(a, b)
-    if isinstance(a, dict):
-        return a.keys() == b.keys() and all(same(a[key], b[key]) for key in a)
-    if isinstance(a, (list, tuple)):
-        return len(a) == len(b) and all(same(x, y) for x, y in zip(a, b, strict=True))
-    return a == b
 
 
 @pytest.mark.slow

@@ -69,9 +69,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
         ValueError: no such file, not OSM's XML, or no building in it.
     """
     path = Path(path)
-    missing = [
-        name for name in ("osmnx", "trimesh", "mapbox_earcut") if importlib.util.find_spec(name) is None
-    ]
+    missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise ValueError(f"scene=osm needs {', '.join(missing)}; pip install 'gsparc[scenes]'")
     features = _features(path)
@@ -102,7 +100,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     solids = [_joined(material, parts) for material, parts in sorted(meshes.items())]
     corners = np.concatenate([solid.vertices[:, :2] for solid in solids])
     box = np.stack([corners.min(0), corners.max(0)])
-    if np.ptp(box, axis=0).max() > 2e4:
+    if np.ptp(box, axis=0).max() > LARGEST_M:
         raise ValueError(
             f"scene.file={path}: buildings over {np.ptp(box, axis=0).max() / 1e3:.0f} km; cut it"
         )
