@@ -9,22 +9,23 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
-from gsparc.multipath.waves.covariance import Shape, Values, direct_wave, prior
+from gsparc.multipath.waves.covariance import Shape, Values, direct_wave, prior, source_waves
+from gsparc.physics.mirror_planes import images
 
 
 @dataclass(frozen=True)
 class Common:
-    """Gain of the direct wave and level of ends, each times the distance to the places' middle.
+    """Gains of the direct wave and of images in shared planes (J,), and the level of ends.
 
     Attributes:
-        gain: () complex128 [m], the ends' mean: small where their phases are unrelated.
-        steady, spread: [m^2] squared size of the true mean, and the variance of `gain` about it.
+        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle, the smaller the less
+            sure it is: small where phases are unrelated.
+        told: (J,) [m^2] what knowing it takes from the power.
         level: [m^2] power that covariances are in units of.
     """
 
     gain: Tensor
-    steady: float
-    spread: float
+    told: Tensor
     level: float
 
     @staticmethod
@@ -32,28 +33,36 @@ class Common:
         """From groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
-            away = _away(shape, values, group.slot)
-            wave = torch.zeros(len(group), dtype=torch.complex128)
-            if shape.direct:
-                wave = direct_wave(shape, values, group.slot, group.places)
-                wave = wave * shape.of("direct", values.power)
-            gains.append(away * (wave.conj() @ alpha).mean())
-            levels.append(scale * away**2)
+            waves, power, away = _waves(shape, values, group.slot, group.places)
+            gains.append(away * power * (waves.conj() @ alpha).mean(1))
+            levels.append(scale * float(_away(shape, values, group.slot)) ** 2)
         each = torch.stack(gains)
-        count, gain = len(each), each.mean()
-        whole, mean = float(each.abs().square().mean()), float(gain.abs().square())
-        steady = max((count * mean - whole) / (count - 1), 0.0) if count > 1 else 0.0
-        return Common(gain, steady, (whole - steady) / count, float(torch.stack(levels).mean()))
+        count, gain = len(each), each.mean(0)
+        whole, mean = each.abs().square().mean(0), gain.abs().square()
+        steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
+        sure = steady / (steady + (whole - steady) / count).clamp_min(1e-300)
+        return Common(gain * sure, steady * sure, sum(levels) / count)
 
     def at(self, shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
-        away = _away(shape, values, slot)
-        before = self.level / away**2 * prior(shape, values, slot, places)
-        if not shape.direct:
-            return torch.zeros(len(places), dtype=torch.complex128), before, before
-        wave = direct_wave(shape, values, slot, places) / away
-        after = before + (self.spread - self.steady) * wave.abs().square()
-        return self.gain * wave, after.clamp_min(0), before
+        before = self.level / _away(shape, values, slot) ** 2 * prior(shape, values, slot, places)
+        waves, _, away = _waves(shape, values, slot, places)
+        waves = waves / away[:, None]
+        after = before - self.told @ waves.abs().square()
+        return self.gain @ waves, after.clamp_min(0), before
+
+
+def _waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Waves (J, n) of an end and its images, their powers (J,) and distances to the middle (J,) [m]."""
+    if not shape.direct:
+        none = places.new_zeros(0)
+        return places.new_zeros(0, len(places), dtype=torch.complex128), none, none
+    end = slot.end + values.offset
+    placed = torch.cat([end[None], images(end, values.planes, shape.words)])
+    away = torch.linalg.vector_norm(placed - shape.middle, dim=-1)
+    mirrors = source_waves(shape, values, slot, places)[shape.sources :]
+    power = [shape.of("direct", values.power), shape.of("source", values.power)[shape.sources :]]
+    return torch.cat([direct_wave(shape, values, slot, places)[None], mirrors]), torch.cat(power), away
 
 
 def _away(shape: Shape, values: Values, slot: Slot) -> Tensor:

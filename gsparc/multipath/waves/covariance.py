@@ -4,8 +4,9 @@
         + S (p_g a a^H + sum_n t_n b_n b_n^H)
 
 with E the Matern-3/2 envelope, V_b the correlation of waves from one direction, w_b a factor by its angle to
-the static end, 1 where there is one end, a and b_n the spherical waves of the static end and of sources, S a
-squared exponential of gains that vary over places, and R one that is so long that it only ends far outside.
+the static end, 1 where there is one end, a and b_n the spherical waves of the static end and of sources (of
+given places, and images of the end in mirror planes that all ends share), S a squared exponential of gains
+that vary over places, and R one that is so long that it only ends far outside.
 Noise, and what is correlated over the order of rows, is training's alone.
 """
 
@@ -22,6 +23,7 @@ from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
 from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth, steering
+from gsparc.physics.mirror_planes import Word, images
 
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
 DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike
@@ -38,9 +40,10 @@ class Shape:
         angles: (M, 3) float64, where waves of unequal power come from; none: from everywhere alike.
         concentration: of each.
         constant, direct, correlated: whether there is leakage, a direct wave, noise correlated over rows.
-        sources: how many.
+        sources: how many of given places.
         middle: (3,) float64 [m] of the places learned from, where waves have their nominal power.
         reach: length of what is fixed [m].
+        words: images of the static end in `Values.planes`; they count as sources after those of given places.
     """
 
     angles: Tensor
@@ -51,11 +54,17 @@ class Shape:
     sources: int
     middle: Tensor
     reach: float
+    words: tuple[Word, ...] = ()
+
+    @property
+    def count(self) -> int:
+        """Sources and images."""
+        return self.sources + len(self.words)
 
     @property
     def is_real(self) -> bool:
         """Whether all covariances are real."""
-        return not len(self.angles) and not self.direct and not self.sources
+        return not len(self.angles) and not self.direct and not self.count
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -65,8 +74,8 @@ class Shape:
             *["direction"] * len(self.angles),
             *["constant"] * self.constant,
             *["direct", "direct_smooth"] * self.direct,
-            *["source"] * self.sources,
-            *["source_smooth"] * self.sources,
+            *["source"] * self.count,
+            *["source_smooth"] * self.count,
             "noise",
             *["fast", "drift"] * self.correlated,
         )
@@ -99,6 +108,7 @@ class Values:
         sources: (N, 3) float64 [m], local.
         towards: (J,) float64 logarithms of factors of directions' powers, at angles to the static end from 0
             to pi; none: directions are those of the room alone.
+        planes: (W, 4) float64 mirror planes that all static ends share, see `physics.mirror_planes`.
     """
 
     power: Tensor
@@ -107,6 +117,7 @@ class Values:
     offset: Tensor
     sources: Tensor
     towards: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.float64))
+    planes: Tensor = field(default_factory=lambda: torch.zeros(0, 4, dtype=torch.float64))
 
 
 def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
@@ -116,13 +127,24 @@ def direct_wave(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Ten
 
 
 def source_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
-    """(N, n) complex128 of all sources, each of size 1 in the middle."""
-    reference = torch.linalg.vector_norm(values.sources - shape.middle, dim=-1)
+    """(N, n) complex128 of all sources and images, each of size 1 in the middle."""
+    if not shape.count:
+        return places.new_zeros(0, len(places), dtype=torch.complex128)
+    end = slot.end + values.offset
+    given = torch.cat([values.sources, images(end, values.planes, shape.words)])
+    reference = torch.linalg.vector_norm(given - shape.middle, dim=-1)
     waves = [
-        steering(places, source, slot.wavenumber, away)
-        for source, away in zip(values.sources, reference, strict=True)
+        steering(places, source, slot.wavenumber, away) for source, away in zip(given, reference, strict=True)
     ]
-    return torch.stack(waves) if waves else places.new_zeros(0, len(places), dtype=torch.complex128)
+    seen = mirrored(values.planes, shape.words, end, shape.middle)
+    return torch.stack(waves) * torch.cat([seen.new_ones(shape.sources), seen])[:, None]
+
+
+def mirrored(planes: Tensor, words: Sequence[Word], end: Tensor, middle: Tensor) -> Tensor:
+    """1 for words (W,) whose planes all have the end (3,) and the places' middle (3,) on one side, else 0."""
+    sides = planes[:, :3] @ torch.stack([end, middle], 1) - planes[:, 3:]
+    alike = (sides[:, 0] * sides[:, 1] > 0).tolist()
+    return torch.tensor([float(all(alike[letter] for letter in word)) for word in words], dtype=torch.float64)
 
 
 def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
@@ -218,7 +240,7 @@ def told(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tens
         gains = shape.of("direct", values.power)[0] * smooth(distance, shape.reach)
         gains = gains + shape.of("direct_smooth", values.power)[0] * smooth(distance, values.gain)
         found = found + before[:, None] * after.conj()[None] * gains
-    return found + explained(shape, values, slot, a, b) if shape.sources else found
+    return found + explained(shape, values, slot, a, b) if shape.count else found
 
 
 def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
@@ -229,7 +251,7 @@ def prior(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Tensor:
     if shape.direct:
         level = direct_wave(shape, values, slot, places).abs().square()
         found = found + level * (shape.of("direct", power) + shape.of("direct_smooth", power))
-    if shape.sources:
+    if shape.count:
         level = source_waves(shape, values, slot, places).abs().square()
         found = found + (shape.of("source", power) + shape.of("source_smooth", power)) @ level
     return found.expand(len(places))

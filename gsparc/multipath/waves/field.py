@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Measurements, Site
+from gsparc.data.site_objects import SiteObjects
 from gsparc.field.conditional import ConditionalField, LeftOutRows, Posterior
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.run_factors import aligning, run_quadratic
@@ -89,7 +90,7 @@ class ChannelField(ConditionalField):
         log_envelope, log_gain: lengths [log m].
         offset: (3,) of static ends [m].
         sources: (N, 3) [m], local.
-        towards: (J,) see `Values`.
+        towards, planes: (J,), (W, 4) see `Values`.
     """
 
     kind = "diffuse"
@@ -105,6 +106,7 @@ class ChannelField(ConditionalField):
         self.sources = nn.Parameter(values.sources.clone())
         # An empty parameter would have no slope.
         self.towards = nn.Parameter(values.towards.clone()) if len(values.towards) else values.towards
+        self.planes = nn.Parameter(values.planes.clone()) if len(values.planes) else values.planes
         self.weights: tuple[Weights, ...] = ()
         self.stations: dict[int, list[Weights]] = {}
         self.common: Common | None = None
@@ -116,7 +118,7 @@ class ChannelField(ConditionalField):
     def values(self) -> Values:
         """The parameters as they are, differentiable."""
         lengths = self.log_envelope.exp(), self.log_gain.exp()
-        return Values(self.log_power.exp(), *lengths, self.offset, self.sources, self.towards)
+        return Values(self.log_power.exp(), *lengths, self.offset, self.sources, self.towards, self.planes)
 
     @property
     def _held(self) -> Values:
@@ -130,12 +132,12 @@ class ChannelField(ConditionalField):
 
     @property
     def count(self) -> int:
-        """Sources."""
-        return self.shape.sources
+        """Sources and images."""
+        return self.shape.count
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Of `residual` (the diffuse field), `directions`, `leakage`, `direct`, `sources` and `drift`."""
+        """Of `residual` (diffuse field), `directions`, `leakage`, `direct`, `sources`, `mirrors`, `drift`."""
         shape = self.shape
         on = {
             "residual": True,
@@ -143,9 +145,15 @@ class ChannelField(ConditionalField):
             "leakage": shape.constant,
             "direct": shape.direct,
             "sources": shape.sources > 0,
+            "mirrors": len(shape.words) > 0,
             "drift": shape.correlated,
         }
         return tuple(name for name, is_on in on.items() if is_on)
+
+    def objects(self) -> SiteObjects:
+        """The mirror planes that static ends share."""
+        planes = self.planes.detach().numpy()
+        return SiteObjects.of(planes=planes if len(planes) else None)
 
     def loss(self, batch: Batch) -> Tensor:
         """See `ConditionalField`; needs `condition` first, for the scales.
@@ -385,11 +393,12 @@ class ChannelField(ConditionalField):
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
-    shape, kept = Shape(**state["shape"]), state["values"]
+    words = tuple(tuple(int(letter) for letter in word) for word in state["shape"].get("words", ()))
+    shape, kept = Shape(**{**state["shape"], "words": words}), state["values"]
     lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
-    none = torch.zeros(0, dtype=torch.float64)  # earlier versions knew no angles to ends
-    towards = kept.get("towards", none)
-    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"], towards)
+    # Earlier versions knew no angles to ends, and no mirrors.
+    some = {name: kept[name] for name in ("towards", "planes") if name in kept}
+    values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"], **some)
     antennas, tones = (int(n) for n in state["channel"])
     field = ChannelField(site, shape, values, (antennas, tones))
     with torch.no_grad():

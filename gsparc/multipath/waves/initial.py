@@ -37,6 +37,7 @@ from gsparc.multipath.waves.evidence import (
 )
 from gsparc.multipath.waves.field import ChannelField
 from gsparc.multipath.waves.kernels import cells, directions, envelope, isotropic
+from gsparc.multipath.waves.mirrors import find_mirrors
 from gsparc.multipath.waves.offset import best_offset
 from gsparc.multipath.waves.settings import ChannelSettings
 
@@ -46,6 +47,7 @@ GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source'
 LEAST = 1e-3  # of all powers: sources below are dropped
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
+ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
 DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
@@ -238,6 +240,11 @@ class _Search:
             best = self._step(best, self._with_told(best, direct), forced, "leakage and direct wave", notes)
         if len(self.sources) and not budget.over():
             best = self._step(best, self._with_sources(best), "auto", "sources", notes)
+        if wanted.mirrors and best.shape.direct and ends_of(self.every) > 1 and not budget.over():
+            mirrored = self._with_mirrors(best, budget)
+            if mirrored is not None:
+                count = len(mirrored.values.planes)
+                best = self._step(best, mirrored, "auto", f"mirror planes of all ends ({count})", notes)
         if wanted.directions is not False and not budget.over():
             best = self._step(best, self._with_directions(best), wanted.directions, "directions", notes)
         if ends_of(self.every) > 1 and not budget.over():
@@ -280,6 +287,7 @@ class _Search:
     def _worth(self, shape: Shape, values: Values) -> float:
         """What the terms beside the isotropic field must gain [nats]."""
         parameters = len(shape.names) - 2 + shape.direct + 3 * bool(values.offset.any()) + len(values.towards)
+        parameters += 3 * len(values.planes)
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
@@ -315,27 +323,47 @@ class _Search:
 
     def _with_sources(self, before: Candidate) -> Candidate:
         """With those sources that have power."""
-        found = self._with_all_sources(before)
-        shape, power = found.shape, found.values.power
+        shape = replace(before.shape, sources=len(self.sources))
+        values = replace(before.values, sources=self.sources)
+        if before.shape.direct:
+            return self._heard(self._with_waves(before, shape, values))
+        return self._heard(self._of_lengths(shape, values, before.shape, True))
+
+    def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
+        """With images in planes that all ends share; None where none is found."""
+        shape, values = before.shape, before.values
+        rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
+        wide = replace(self, groups=thinned(self.every, self.settings.ends, self.settings.rows))
+        parts = wide._compressed(shape, values)
+        planes, words = find_mirrors(
+            rough, parts, shape, values, self.wavelength, self.settings.mirrors, budget.over
+        )
+        if not words:
+            return None
+        found = self._with_waves(before, replace(shape, words=words), replace(values, planes=planes))
+        return self._heard(found)
+
+    def _with_waves(self, before: Candidate, shape: Shape, values: Values) -> Candidate:
+        """With sources or images that there were none of before."""
+        power = before.values.power
+        level = NEW * float(before.shape.of("isotropic", power)[0])
+        end = before.shape.where("noise")[0]
+        fresh = torch.full((len(shape.names) - len(power),), level, dtype=torch.float64)
+        return self._fitted(shape, replace(values, power=torch.cat([power[:end], fresh, power[end:]])))
+
+    def _heard(self, found: Candidate) -> Candidate:
+        """Without the sources and images that have no power."""
+        shape, values, power = found.shape, found.values, found.values.power
         fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
         heard = power[fixed] + power[varying] > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return found
         silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
         rest = power[[i for i in range(len(power)) if i not in silent]]
-        values = replace(found.values, power=rest, sources=found.values.sources[heard])
-        return self._fitted(replace(shape, sources=int(heard.sum())), values)
-
-    def _with_all_sources(self, before: Candidate) -> Candidate:
-        shape = replace(before.shape, sources=len(self.sources))
-        values = replace(before.values, sources=self.sources)
-        if before.shape.direct:
-            power = before.values.power
-            level = NEW * float(before.shape.of("isotropic", power)[0])
-            fresh = torch.full((2 * len(self.sources),), level, dtype=torch.float64)
-            end = before.shape.where("noise")[0]
-            return self._fitted(shape, replace(values, power=torch.cat([power[:end], fresh, power[end:]])))
-        return self._of_lengths(shape, values, before.shape, True)
+        given, seen = heard[: shape.sources], heard[shape.sources :].tolist()
+        words = tuple(word for word, has in zip(shape.words, seen, strict=True) if has)
+        shape = replace(shape, sources=int(given.sum()), words=words)
+        return self._fitted(shape, replace(values, power=rest, sources=values.sources[given]))
 
     def _with_directions(self, before: Candidate) -> Candidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""

@@ -9,8 +9,9 @@ from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group
 from gsparc.multipath.waves.covariance import Shape, Values
-from gsparc.multipath.waves.evidence import Compressed, solved
+from gsparc.multipath.waves.evidence import Compressed
 from gsparc.multipath.waves.kernels import steering
+from gsparc.multipath.waves.probe import Probe
 
 REACH = 1.0  # wavelengths to either side that are looked at, and the prior's standard deviation
 COARSE = 4  # steps to either side
@@ -30,25 +31,14 @@ def best_offset(
     for number, name in enumerate(names):
         if name in ("direct", "direct_smooth"):
             power[number] = 1e-12
-    states = []
-    for part in parts:
-        at = solved(part, power)
-        wide = part.basis.to(torch.complex128)
-        noise = power[names.index("noise")]
-        alpha = wide @ at.alpha + (part.group.target - wide @ part.target) / noise
-        root = torch.linalg.cholesky(at.inverse + 1e-12 * torch.eye(len(at.inverse)))
-        states.append((part.group, wide @ root, wide, alpha, float(noise), at.scale))
+    probes = [Probe.of(part, power) for part in parts]
 
     def gain(offsets: Tensor) -> Tensor:
         score = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)
-        for group, root, wide, alpha, noise, scale in states:
-            for chunk in torch.arange(len(offsets)).split(max(CHUNK // len(group), 1)):
-                waves = _waves(group, shape, offsets[chunk])
-                inner = (waves.conj() @ alpha).abs().square().sum(1)
-                inside = (waves.conj() @ root).abs().square().sum(1)
-                outside = waves.abs().square().sum(1) - (waves.conj() @ wide).abs().square().sum(1)
-                size = 1 + level * (inside + outside.clamp_min(0) / noise)
-                score[chunk] += level * inner / size / scale - alpha.shape[1] * size.log()
+        for probe in probes:
+            for chunk in torch.arange(len(offsets)).split(max(CHUNK // len(probe.group), 1)):
+                waves = _waves(probe.group, shape, offsets[chunk])
+                score[chunk] += probe.gain(waves, level)
         return score
 
     step = REACH * wavelength / COARSE

@@ -26,6 +26,7 @@ class ChannelSettings(Checked):
         tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
         narrow: concentration of each of these.
         knots: in that angle.
+        mirrors: planes that several static ends share, at most; 0 for none.
     """
 
     constant: bool | str = setting("auto", switch("auto"))
@@ -42,3 +43,4 @@ class ChannelSettings(Checked):
     tied: int = setting(64, whole(4, 500))
     narrow: float = setting(16.0, POSITIVE)
     knots: int = setting(9, whole(2, 100))
+    mirrors: int = setting(8, whole(0, 32))
