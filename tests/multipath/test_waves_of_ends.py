@@ -21,6 +21,7 @@ from gsparc.multipath.waves.initial import initialise
 from gsparc.multipath.waves.kernels import sphere
 from gsparc.multipath.waves.settings import ChannelSettings
 from gsparc.training.gsparc import Gsparc
+from gsparc.training.terms import EffectSettings
 
 K = 2 * np.pi / WAVELENGTH
 QUICK = ChannelSettings(tied=12, narrow=5.0, knots=4, angles=8, rows=60)
@@ -206,3 +207,14 @@ def test_measured_ceiling_in_squares():
     with torch.no_grad():
         own = nmse(field.answer(batch).mean.numpy(), batch.target.numpy())
     assert own < 0.55 * nmse(plain.answer(batch).mean.numpy(), batch.target.numpy())
+
+
+def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
+    """Rows of a later station carry its number, of which a site of one end knew nothing."""
+    data = _ceiling(ends=2, count=30)
+    fold = _fold(data)
+    method = for_links(lambda: Gsparc(EffectSettings(phase=False)), data)
+    method.fit(data, fold, FitContext(stations="each"))
+    batch = data.batch(fold.test)
+    by_place, by_row = method.predict(batch.tx, batch.rx), method.answer(batch)
+    torch.testing.assert_close(by_place.mean, by_row.mean)

@@ -111,7 +111,9 @@ def gather(data: Measurements, rows: np.ndarray, apart: bool) -> tuple[Group, ..
         run = np.zeros(len(rows), np.int64)
     else:
         run = np.unique(data.run[rows], return_inverse=True)[1].reshape(-1)
-    station = np.zeros(len(rows), np.int64) if data.station is None else data.station[rows]
+    station = np.zeros(len(rows), np.int64)
+    if data.station is not None and data.site.stations is not None:
+        station = data.station[rows]
     taken = _taken(data)
     moving = torch.from_numpy(np.asarray(data.moving[rows], np.float64))
     turned = torch.from_numpy(np.asarray(data.rx_rotation[rows], np.float64))

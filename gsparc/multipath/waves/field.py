@@ -162,7 +162,7 @@ class ChannelField(ConditionalField):
             ValueError: not conditioned yet.
         """
         moving, _, turned, nearest = asked(self.site, batch.tx, batch.rx)
-        station = nearest if batch.station is None else batch.station.cpu()
+        station = self._numbers(batch.station, nearest)
         target = batch.target.cpu().to(torch.complex128) / self.run_factor(batch.run)[:, None, None]
         shape, values = self.shape, self.values
         total, entries = torch.zeros(len(moving), dtype=torch.float64), torch.zeros(len(moving))
@@ -234,7 +234,7 @@ class ChannelField(ConditionalField):
                 one. Of one that no row was learned of, what ends have in common answers (`Common`).
         """
         moving, static, turned, nearest = asked(self.site, tx, rx)
-        station = nearest if station is None else station.cpu()
+        station = self._numbers(station, nearest)
         count, longest = len(moving), max(len(each.group) for each in self._conditioned())
         parts = [
             self._answer(moving[part], static[part], turned[part], station[part])
@@ -248,6 +248,10 @@ class ChannelField(ConditionalField):
             share.to(device) if self.count else None,
             (after / before.clamp_min(1e-300)).clamp(0, 1).float().to(device),
         )
+
+    def _numbers(self, station: Tensor | None, nearest: Tensor) -> Tensor:
+        """Stations (B,) by number; a site of one end keeps no numbers, whatever its rows carry."""
+        return nearest if station is None or self.site.stations is None else station.cpu()
 
     def answer(self, batch: Batch) -> Posterior:
         """Answer rows of known stations, in the phase and level of their runs."""
