@@ -33,6 +33,7 @@ PROMISING = 2000  # planes that are looked at again after the first was found
 STARTS = 3  # planes that are moved to their best, of which the best is tried
 APART = 1.0  # wavelengths between the images in two of them
 REFINED = 5  # halvings of the step
+LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
 SAME = 0.25  # wavelengths between images of two words that are one
 CHUNK = 300_000  # entries of waves held at a time
@@ -106,7 +107,7 @@ def find_mirrors(
     most: int,
     late: Callable[[], bool] = lambda: False,
 ) -> tuple[Tensor, tuple[Word, ...]]:
-    """Planes (W, 4) float64, local, and images in them; none where nothing is worth its numbers.
+    """Planes (W, 4) float64, local, and images in them; none where all together are not worth it.
 
     Args:
         coarse: few rows of few ends, for the grid.
@@ -124,7 +125,7 @@ def find_mirrors(
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
     grid, turn = candidates(rough, shape, values, wavelength)
-    planes, words = grid[:0], list[Word]()
+    planes, words, risen = grid[:0], list[Word](), 0.0
     while len(planes) < most and not late():
         scores = search.gains(rough, grid, _single(len(grid)), False).max(1).values
         if not len(planes):
@@ -135,7 +136,7 @@ def find_mirrors(
         plane, level, gain = found
         if gain < PARAMETERS * worth:
             break
-        planes = torch.cat([planes, plane[None]])
+        planes, risen = torch.cat([planes, plane[None]]), risen + gain
         fresh = (len(planes) - 1,)
         rough, probes = (_with(search, each, planes, fresh, level) for each in (rough, probes))
         words.append(fresh)
@@ -149,7 +150,8 @@ def find_mirrors(
             break
         probes = _with(search, probes, planes, pairs[number], level)
         words.append(pairs.pop(number))
-    return planes, tuple(words)
+        risen += gain
+    return (planes, tuple(words)) if 2 * risen > LEAST * numbers else (planes[:0], ())
 
 
 def candidates(
