@@ -19,6 +19,7 @@ from gsparc.methods.power_kernel import BAD, PowerKernel, bounds_of, kernel_of
 
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
 MOST_LOOKS = 40
+EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
 TINY = 1e-30  # an amplitude has a logarithm
 
 
@@ -119,4 +120,7 @@ def _density(parameters: Tensor, sample: Sample) -> tuple[Tensor, Tensor]:
     else:
         squared = (sample.value - torch.einsum("tk,tkp->tp", weights, sample.near)).square().mean(1)
     amplitude = (squared / variance).mean().clamp_min(TINY)
-    return 0.5 * (amplitude.log() + variance.log().mean()), amplitude
+    # Near rows alone tell no long process of a huge amplitude from one of the values' own, see `left_out`.
+    excess = (amplitude / sample.value.square().mean().clamp_min(TINY)).log().clamp_min(0.0)
+    density = 0.5 * (amplitude.log() + variance.log().mean())
+    return density + EXCESS * excess.square() / len(variance), amplitude
