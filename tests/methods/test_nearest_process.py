@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from releases import real
 
+from gsparc.data.own import interpret
+from gsparc.data.raw import read_raw
+from gsparc.data.selection import keep_above
+from gsparc.data.splits import SplitSettings, make_split
 from gsparc.methods import neighbourhood, power_process
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.kriging import Kriging
+from gsparc.methods.method import FitContext
 from gsparc.methods.nearest_process import Values, given
 from gsparc.methods.power_kernel import PowerKernel
 from gsparc.methods.power_process import conditioned, exact
@@ -177,3 +183,17 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     assert torch.allclose(near.mean_at(batch.tx, batch.rx), said.mean)
     lean = reduced(near, {"confidence": False}, {}).predict(batch.tx, batch.rx)
     assert lean.variance is None and torch.allclose(lean.mean, said.mean)
+
+
+@pytest.mark.slow
+def test_near_rows_do_not_choose_a_process_of_a_thousand_times_the_power():
+    """Squares of 0.6 m of the plane: a length of 1.8 m, an amplitude of 3e5 dB^2 and errors of 30 dB."""
+    path = real("real/techtile-power-reci-rf-1.npz")
+    data = interpret(keep_above(read_raw(path), -75, path).raw, path).data
+    split = SplitSettings(name="blocks", side_m=0.6, seed=9)
+    fold = make_split(data.moving, split, place=data.place).folds[0]
+    method = GaussianProcess()
+    method.fit(data, fold, FitContext())
+    batch = data.batch(fold.test)
+    error = (method.predict(batch.tx, batch.rx).mean / batch.target).clamp_min(1e-30).log10() * 10
+    assert error.square().mean().sqrt() < 6.0
