@@ -288,12 +288,17 @@ def test_the_field_is_a_candidate_that_is_stored(kind, tmp_path):
     torch.testing.assert_close(again.answer(batch).mean, method.answer(batch).mean)
     assert again.label == method.label and again.size() == method.size()
     assert isinstance(again, HasGaussians)
-    rendered = [one for one in method._fitted if one.has_gaussians and one.size()]
     if kind == "images":
-        assert len(again.gaussians(batch.tx, batch.rx)) == rendered[0].size()
-    else:
-        with pytest.raises(ValueError, match="nothing here is rendered"):
-            again.gaussians(batch.tx, batch.rx)
+        (rendered,) = (one for one in method._fitted if one.has_gaussians)
+        assert len(again.gaussians(batch.tx, batch.rx)) == rendered.size()
+
+
+def test_what_holds_no_gaussians_says_so(tmp_path):
+    data = street(60)
+    method = Auto(["mean"])
+    fold, _ = fitted(method, data, tmp_path)
+    with pytest.raises(ValueError, match=r"auto \(mean\): nothing here is rendered"):
+        method.gaussians(*_ends(data, fold.test))
 
 
 def test_an_interrupt_is_not_swallowed(tmp_path):
