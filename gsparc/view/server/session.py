@@ -139,15 +139,13 @@ class Session:
         self._layers_panel(gui)
         with gui.add_folder("Operating point"):
             last = len(viewed.ways) - 1
-            self.way = self.front = None
+            self.way = None
             if last:
                 self.way = gui.add_slider("fast to accurate", 0, last, 1, last)
                 self._on(self.way, self._way_changed)
             self.speed = gui.add_markdown("")
             if last:
-                self.front = self._plot(
-                    self._front(), f"{viewed.ways[0].figure} by ms of a query, as swept", DOTS
-                )
+                self._plot(self._front(), f"{viewed.ways[0].figure} by ms of a query, as swept", DOTS)
         with gui.add_folder("Notes", expand_by_default=False):
             gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
         self._legends()
@@ -258,19 +256,12 @@ class Session:
     def _way_changed(self, value: int) -> None:
         self.queries.clear()
         self.delays.clear()
-        if self.front is not None:
-            self.front.data = self._front()
         self.wanted()
 
-    def _front(self) -> tuple[np.ndarray, ...]:
-        """Milliseconds (n,) and accuracies (n,) of operating points, and the accuracy of the chosen alone."""
-        assert self.way is not None
-        ways = self.view.viewed.ways
-        swept = np.array([one.swept or (np.nan, np.nan) for one in ways], np.float64)
-        chosen = np.where(np.arange(len(ways)) == int(self.way.value), swept[:, 0], np.nan)
-        order = np.argsort(swept[:, 1])
-        order = order[np.isfinite(swept[order, 1])]
-        return swept[order, 1], swept[order, 0], chosen[order]
+    def _front(self) -> tuple[np.ndarray, np.ndarray]:
+        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first."""
+        swept = np.array(sorted(one.swept[::-1] for one in self.view.viewed.ways if one.swept is not None))
+        return swept[:, 0], swept[:, 1]
 
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
