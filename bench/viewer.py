@@ -118,9 +118,9 @@ class Hand:
         self.socket.socket.shutdown(socket.SHUT_RDWR)
 
 
-def say(*words: object) -> None:
-    """A line of the table."""
-    sys.stdout.write("\t".join(str(word) for word in words) + "\n")
+def say(*words: object, end: str = "\n") -> None:
+    """A line of the table, or a part of one."""
+    sys.stdout.write("\t".join(str(word) for word in words) + end)
     sys.stdout.flush()
 
 
@@ -157,8 +157,15 @@ def steady(server: Server, hands: list[Hand], seconds: float, every: float) -> N
             told, clock, answers = now, time.process_time(), total
 
 
-def browse(server: Server, seconds: float) -> None:
-    """Drag a handle with a browser's pointer; frames per second and delay from pointer to picture."""
+def browse(server: Server, seconds: float, wait: float, picture: Path | None) -> None:
+    """Drag a handle before a browser; frames per second, and delay from the drag to the changed picture.
+
+    Args:
+        server: of the model.
+        seconds: of dragging.
+        wait: before, for what stands still to be drawn [s].
+        picture: what the page shows in the end.
+    """
     from selenium import webdriver
 
     options = webdriver.ChromeOptions()
@@ -177,23 +184,35 @@ def browse(server: Server, seconds: float) -> None:
         (session,) = server.sessions.values()
         while len(server.work) or not session.answers:
             time.sleep(0.2)
-        time.sleep(10)
+        time.sleep(wait)
         browser.execute_script(WATCH)
-        time.sleep(seconds / 2)
+        time.sleep(seconds / 4)
         still = browser.execute_script("const n = window.frames_; window.frames_ = 0; return n") / (
-            seconds / 2
+            seconds / 4
         )
-        begin, before = time.perf_counter(), session.answers
+        begin, before, clock = time.perf_counter(), session.answers, time.process_time()
         while time.perf_counter() - begin < seconds:
             browser.execute_script("dispatchEvent(new PointerEvent('pointermove'))")
             drag(session, path_of_hand(server.view.viewed.box(), time.perf_counter() - begin))
             time.sleep(1 / RATE_HZ)
-        spent = time.perf_counter() - begin
+        spent, cpu = time.perf_counter() - begin, 1e3 * (time.process_time() - clock)
         frames, delays = browser.execute_script("return [window.frames_, window.delays_]")
-        say("frames per s still", "dragging", "answers per s", "drag to picture ms p50", "p90", "n", "load")
+        say(
+            "frames per s still",
+            "dragging",
+            "answers per s",
+            "query ms p50",
+            "server's cpu ms an answer",
+            end="\t",
+        )
+        say("drag to picture ms p50", "p90", "n", "load")
         p50, p90 = np.percentile(delays, [50, 90]) if delays else (np.nan, np.nan)
-        rates = f"{still:.1f}", f"{frames / spent:.1f}", f"{(session.answers - before) / spent:.1f}"
-        say(*rates, f"{p50:.0f}", f"{p90:.0f}", len(delays), f"{os.getloadavg()[0]:.1f}")
+        count = session.answers - before
+        rates = f"{still:.1f}", f"{frames / spent:.1f}", f"{count / spent:.1f}"
+        costs = f"{np.median(session.queries):.2f}", f"{cpu / max(count, 1):.1f}"
+        say(*rates, *costs, f"{p50:.0f}", f"{p90:.0f}", len(delays), f"{os.getloadavg()[0]:.1f}")
+        if picture is not None:
+            browser.save_screenshot(str(picture))
     finally:
         browser.quit()
 
@@ -207,6 +226,8 @@ def main() -> None:
     parser.add_argument("--clients", type=int, default=1)
     parser.add_argument("--step_m", type=float, default=None)
     parser.add_argument("--browser", action="store_true")
+    parser.add_argument("--wait", type=float, default=10.0)
+    parser.add_argument("--picture", type=Path, default=None)
     given = parser.parse_args()
     viewed = open_viewed(given.ckpt)
     view = SiteView(viewed, Given(), grid_for(viewed, {"step_m": given.step_m}))
@@ -215,7 +236,7 @@ def main() -> None:
     say(given.ckpt, f"{viewed.predictor.method.size()} Gaussians, sources or rows, {cells} cells")
     try:
         if given.browser:
-            return browse(server, given.seconds)
+            return browse(server, given.seconds, given.wait, given.picture)
         hands = [Hand(server) for _ in range(given.clients)]
         while not all(hand.session.answers for hand in hands):
             time.sleep(0.1)

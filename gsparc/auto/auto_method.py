@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import logging
 import math
@@ -17,6 +18,7 @@ from torch import Tensor
 from gsparc.auto.contest import LEAST_S, Contest, figure_of
 from gsparc.auto.mixture import mixed
 from gsparc.auto.trials import Course, Trial, course, products, variances
+from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.inner_folds import cut_inside
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import POSITIVE, SettingError, check_arguments, or_null, whole
@@ -24,7 +26,7 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.methods import stacking
-from gsparc.methods.method import FitContext, FitReport, Method, Prediction, PredictsVariance
+from gsparc.methods.method import FitContext, FitReport, HasGaussians, Method, Prediction, PredictsVariance
 from gsparc.methods.registry import METHODS, method_class
 from gsparc.methods.time_budget import less_repeatable
 from gsparc.ops import Pose
@@ -277,6 +279,14 @@ class Auto(PredictsVariance):
                 count = sum(one.size() for one in self._fitted if one.has_gaussians)
                 return {**method.facts(), "model/num_gaussians": count}
         return super().facts()
+
+    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+        """See `HasGaussians`; those of the heaviest that renders any."""
+        for method in self._fitted:
+            if isinstance(method, HasGaussians):
+                with contextlib.suppress(ValueError):  # this one did not, of these data
+                    return method.gaussians(tx, rx)
+        raise ValueError(f"{self.label}: nothing here is rendered from Gaussians")
 
     def objects(self) -> SiteObjects:
         """Those of the heaviest that found any."""

@@ -197,13 +197,16 @@ def _per_fold(train_s: float | Sequence[float] | None, count: int) -> tuple[floa
 
 
 def _columns(scores: Scores, others: Mapping[str, Fitted], data: Measurements) -> dict[str, Any]:
-    world = data.moving[scores.row] + data.site.origin
+    world = data.moving[scores.row][:, -3:] + data.site.origin
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     columns: dict[str, Any] = {
         "fold": scores.fold, "row": scores.row, "name": [names[i] for i in scores.row],
         "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
         "confidence": scores.confidence, "variance": scores.variance, **scores.samples,
     }  # fmt: skip
+    if data.site.static_end is None:
+        other = data.tx[scores.row] + data.site.origin
+        columns |= {f"tx_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}
     for name, other in others.items():
         columns |= {f"baseline/{name}/{k}": v for k, v in paired_values(other.scores.samples).items()}
     return columns

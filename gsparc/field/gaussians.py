@@ -6,9 +6,11 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.limits import POSITIVE, SHARE, Checked, number, or_null, setting, whole
 
 FLAT = 0.01  # [m], least extent of a box when Gaussians are sized to fill it
@@ -73,6 +75,13 @@ class GaussianField(nn.Module):
     def geometry(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Means, quaternions, scales and opacities, as the rasterizer takes them."""
         return self.means, self.quats, self.scales, self.opacities
+
+    @torch.no_grad()
+    def cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
+        """As a picture or a file needs them, with what each emits (N,), in the unit of `label`."""
+        means, quats, scales, opacities = (part.double().numpy() for part in self.geometry())
+        quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
+        return GaussianCloud(means, scales, quats, opacities, strengths.double().numpy(), label)
 
     @property
     def scales(self) -> Tensor:

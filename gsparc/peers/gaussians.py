@@ -1,4 +1,4 @@
-"""Initial Gaussians of a peer, and the grid and cut-offs they are rendered with."""
+"""Gaussians of a peer: their start, how they are rendered, and what they are for a picture."""
 
 from __future__ import annotations
 
@@ -7,16 +7,48 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.field.gaussians import FieldSettings, GaussianField, initial_field
 from gsparc.field.model import FULL_SPHERE_ROWS
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
-from gsparc.peers.network import Scene
+from gsparc.peers.network import Network, Scene
+from gsparc.peers.trained import TrainedPeer
 
 MARGIN = 2.0  # [m] around the moving end's box
 OPACITY = 0.3
 GEOMETRY_RATES = {  # learning rates of a `GaussianField` called `field`
     "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
 }  # fmt: skip
+
+
+class GaussianPeer(TrainedPeer):
+    """A peer whose network is a `GaussianNetwork`."""
+
+    has_gaussians = True
+
+    @torch.no_grad()
+    def gaussians(self, tx: Tensor, rx: Pose) -> GaussianCloud:
+        """See `HasGaussians`."""
+        network = self.fitted()
+        assert isinstance(network, GaussianNetwork)
+        emitted = [
+            network.emitted(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx) for i in range(len(tx))
+        ]
+        return network.cloud(torch.stack(emitted).square().mean(0).sqrt())
+
+
+class GaussianNetwork(Network):
+    """Renders Gaussians that lie in `field`."""
+
+    field: GaussianField
+
+    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+        """What each Gaussian emits (N,) for one position (1, 3)."""
+        raise NotImplementedError
+
+    def cloud(self, strengths: Tensor) -> GaussianCloud:
+        """The Gaussians, with what each emits (N,)."""
+        return self.field.cloud(strengths, "emission of a Gaussian")
 
 
 def gaussians_of(scene: Scene, count: int) -> GaussianField:

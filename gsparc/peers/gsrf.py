@@ -20,16 +20,21 @@ from torch import Tensor, nn
 
 from gsparc.data.schema import Batch, Kind
 from gsparc.ops import FrozenPlan, Pose, composite, freeze, make_plan, mean_weights
-from gsparc.peers.gaussians import GEOMETRY_RATES, gaussians_of, rendering_of
+from gsparc.peers.gaussians import (
+    GEOMETRY_RATES,
+    GaussianNetwork,
+    GaussianPeer,
+    gaussians_of,
+    rendering_of,
+)
 from gsparc.peers.network import Network, Scene
 from gsparc.peers.radiance import fourier_legendre, terms
-from gsparc.peers.trained import TrainedPeer
 
 TINY = 1e-8  # under the root of a magnitude, whose slope at zero is infinite
 
 
 @dataclass(eq=False, kw_only=True)
-class GSRF(TrainedPeer):
+class GSRF(GaussianPeer):
     """Spectra and channels.
 
     Args:
@@ -41,7 +46,6 @@ class GSRF(TrainedPeer):
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum", "csi")
     rates: ClassVar[dict[str, float]] = GEOMETRY_RATES
-    has_gaussians = True
     name: str = "gsrf"
     count: int = 500
     degree: int = 3
@@ -53,7 +57,7 @@ class GSRF(TrainedPeer):
         return ComplexGaussians(scene, self.count, self.degree, self.order, self.fourier_weight)
 
 
-class ComplexGaussians(Network):
+class ComplexGaussians(GaussianNetwork):
     """N Gaussians, each with K complex coefficients."""
 
     def __init__(self, scene: Scene, count: int, degree: int, order: int, fourier_weight: float) -> None:
@@ -94,6 +98,11 @@ class ComplexGaussians(Network):
             arriving = seen * torch.view_as_complex(sent.contiguous())
             return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
         return _magnitude(composite(plan, *geometry, sent).image)
+
+    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""
+        sent = self.radiance(tx, rx)[0].norm(dim=1)
+        return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
 
     def loss(self, batch: Batch, draw: torch.Generator) -> Tensor:
         """The base's, and for spectra the mean distance of the two-dimensional Fourier transforms."""

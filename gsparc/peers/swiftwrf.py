@@ -16,25 +16,27 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from gsparc.data.gaussian_cloud import GaussianCloud
 from gsparc.data.schema import Kind
 from gsparc.ops import Cutoff, Pose, SphereGrid
 from gsparc.peers.deformation import Deformation
-from gsparc.peers.gaussians import render_each
+from gsparc.peers.gaussians import GaussianNetwork, GaussianPeer, render_each
 from gsparc.peers.network import Network, Scene
-from gsparc.peers.trained import TrainedPeer
 
 CHANGES = (2, 2, 1, 1)  # centre, log of the two widths, angle, strength
 THIN = 1e-3  # opacity of every Gaussian; a hundred on top of each other lose a twentieth on average
 CUTOFF = Cutoff(3e-3, relative=True)
+FLAT = 1e-4  # [m] of the third axis, at a metre
 SHIFT = 0.1  # [rad] per unit of the network's output
 
 
 @dataclass(eq=False, kw_only=True)
-class SwiftWRF(TrainedPeer):
+class SwiftWRF(GaussianPeer):
     """Spectra.
 
     Args:
@@ -47,7 +49,6 @@ class SwiftWRF(TrainedPeer):
     rates: ClassVar[dict[str, float]] = {
         "centres": 2e-3, "log_widths": 5e-3, "angles": 5e-3, "strengths": 1e-2,
     }  # fmt: skip
-    has_gaussians = True
     name: str = "swiftwrf"
     count: int = 300
     width: int = 64
@@ -59,7 +60,7 @@ class SwiftWRF(TrainedPeer):
         return PlanarGaussians(scene, self.count, self.width, self.depth, self.octaves)
 
 
-class PlanarGaussians(Network):
+class PlanarGaussians(GaussianNetwork):
     """N Gaussians on the sphere; each moves and turns in its own tangent plane."""
 
     base: Tensor
@@ -84,13 +85,12 @@ class PlanarGaussians(Network):
 
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W)."""
-        changes = self.deformation(self.base, self.scene.site.moving(tx, rx))
-        move, stretch, turn, light = changes.split(CHANGES, -1)
+        move, stretch, turn, light = self._changes(tx, rx)
         moved = self.centres + SHIFT * move
         directions = self.base + (moved.unsqueeze(-2) @ self.axes).squeeze(-2)
         directions = directions / directions.norm(dim=-1, keepdim=True)
         widths = (self.log_widths + stretch.clamp(-3, 3)).exp()
-        flat = torch.full_like(widths[..., :1], 1e-4)
+        flat = torch.full_like(widths[..., :1], FLAT)
         angle = (self.angles.unsqueeze(-1) + turn) / 2
         batch = len(moved)
         quats = turned_about_normal(self.frames, angle)
@@ -100,6 +100,35 @@ class PlanarGaussians(Network):
         here = Pose(torch.zeros(3), torch.eye(3))
         image = render_each(geometry, strength, here, self.grid, cutoff=CUTOFF, compensate=False)
         return image.squeeze(1)
+
+    def _changes(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
+        return self.deformation(self.base, self.scene.site.moving(tx, rx)).split(CHANGES, -1)
+
+    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `GaussianNetwork`."""
+        return self.strengths + self._changes(tx, rx)[-1][0, :, 0]
+
+    def cloud(self, strengths: Tensor) -> GaussianCloud:
+        """A metre from the receiver, before they are moved; opacities are strengths, as nothing is occluded.
+
+        Raises:
+            ValueError: the receiver moves: they are directions, and lie nowhere.
+        """
+        receiver = self.scene.receiver
+        if receiver is None:
+            raise ValueError("Gaussians of directions around a receiver that moves lie nowhere")
+        towards = self.base + (self.centres.unsqueeze(-2) @ self.axes).squeeze(-2)
+        means = receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
+        turned = turned_about_normal(self.frames, self.angles[None, :, None] / 2)[0]
+        quats = Rotation.from_matrix(receiver.rotation.numpy()) * Rotation.from_quat(
+            turned.numpy(), scalar_first=True
+        )
+        widths = self.log_widths.exp().double().numpy()
+        return GaussianCloud(
+            means.double().numpy(), np.column_stack([widths, np.full(len(widths), FLAT)]),
+            quats.as_quat(scalar_first=True), strengths.double().clamp(0, 1).numpy(),
+            strengths.double().numpy(), "emission of a Gaussian",
+        )  # fmt: skip
 
 
 def lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:

@@ -19,16 +19,22 @@ from torch import Tensor, nn
 from gsparc.data.schema import Kind
 from gsparc.ops import Pose
 from gsparc.peers.deformation import Deformation
-from gsparc.peers.gaussians import GEOMETRY_RATES, gaussians_of, render_each, rendering_of
+from gsparc.peers.gaussians import (
+    GEOMETRY_RATES,
+    GaussianNetwork,
+    GaussianPeer,
+    gaussians_of,
+    render_each,
+    rendering_of,
+)
 from gsparc.peers.network import Network, Scene
-from gsparc.peers.trained import TrainedPeer
 
 CHANGES = (3, 4, 3, 1, 1)  # place, rotation, log scale, opacity logit, signal
 SHIFT = 0.1  # [m] that a place moves by per unit of the network's output
 
 
 @dataclass(eq=False, kw_only=True)
-class WRFGSPlus(TrainedPeer):
+class WRFGSPlus(GaussianPeer):
     """Spectra.
 
     Args:
@@ -39,7 +45,6 @@ class WRFGSPlus(TrainedPeer):
 
     kinds: ClassVar[tuple[Kind, ...]] = ("spectrum",)
     rates: ClassVar[dict[str, float]] = {**GEOMETRY_RATES, "signals": 1e-2}
-    has_gaussians = True
     name: str = "wrfgs"
     count: int = 500
     width: int = 64
@@ -51,7 +56,7 @@ class WRFGSPlus(TrainedPeer):
         return DeformedGaussians(scene, self.count, self.width, self.depth, self.octaves)
 
 
-class DeformedGaussians(Network):
+class DeformedGaussians(GaussianNetwork):
     """Static Gaussians and the network that deforms them."""
 
     def __init__(self, scene: Scene, count: int, width: int, depth: int, octaves: int) -> None:
@@ -66,8 +71,7 @@ class DeformedGaussians(Network):
     def forward(self, tx: Tensor, rx: Pose) -> Tensor:
         """Spectra (B, H, W)."""
         field = self.field
-        changes = self.deformation(field.means, self.scene.site.moving(tx, rx))
-        place, turn, stretch, fade, light = changes.split(CHANGES, -1)
+        place, turn, stretch, fade, light = self._changes(tx, rx)
         geometry = (
             field.means + SHIFT * place,
             field.quats + turn,
@@ -76,3 +80,11 @@ class DeformedGaussians(Network):
         )
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
         return render_each(geometry, signal, rx, self.grid, **self.options).squeeze(1)
+
+    def _changes(self, tx: Tensor, rx: Pose) -> tuple[Tensor, ...]:
+        changes = self.deformation(self.field.means, self.scene.site.moving(tx, rx))
+        return changes.split(CHANGES, -1)
+
+    def emitted(self, tx: Tensor, rx: Pose) -> Tensor:
+        """See `GaussianNetwork`; these are drawn where they lie before they are moved."""
+        return torch.sigmoid(self.signals + self._changes(tx, rx)[-1][0, :, 0])

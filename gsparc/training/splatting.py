@@ -334,10 +334,7 @@ class LearnedField(Method):
         model, square = self.model, torch.zeros(self.size())
         for i in range(len(tx)):  # one at a time: features of all would be gigabytes
             square += model.features(tx[i : i + 1], rx[i : i + 1] if rx.batched else rx)[0].square().sum(1)
-        means, quats, scales, opacities = (part.double().numpy() for part in model.gaussians.geometry())
-        quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
-        strength = (square / max(len(tx), 1)).sqrt().double().numpy()
-        return GaussianCloud(means, scales, quats, opacities, strength, "emission of a Gaussian")
+        return model.gaussians.cloud((square / max(len(tx), 1)).sqrt(), "emission of a Gaussian")
 
     def mean_at(self, tx: Tensor, rx: Pose) -> Tensor:
         """The model's own mean, not clamped; see `Differentiable`.

@@ -18,6 +18,7 @@ from gsparc.methods.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown
 NEAREST_M = 0.1  # where a distance law ends
+PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Usual:
         slope: [dB per decade].
         spread_db: of what was measured about it.
         tree: of measured places, world.
-        distance_m: (n,) of what was measured; empty without a static end.
+        distance_m: (n,) of what was measured; empty where the other end is unknown.
         level_db: (n,) there.
     """
 
@@ -138,14 +139,15 @@ class Usual:
     level_db: np.ndarray
 
 
-def usual(places: np.ndarray, level_db: np.ndarray, still: np.ndarray | None) -> Usual:
-    """The distance law of measured levels (n,) [dB] at places (n, 3) [m]; NaN without a static end."""
+def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
+    """The distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or (n, 3);
+    NaN where that is unknown."""
     known = np.isfinite(level_db)
     tree = cKDTree(places)
     level = level_db[known]
-    if still is None or len(level) < 3:
+    if other is None or len(level) < 3:
         return Usual(np.nan, np.nan, np.nan, tree, np.zeros(0), level)
-    distance = np.maximum(np.linalg.norm(places[known] - still, axis=1), NEAREST_M)
+    distance = np.maximum(np.linalg.norm((places - other)[known], axis=1), NEAREST_M)
     far = np.log10(distance)
     slope, at_one = np.polyfit(far, level, 1) if np.ptp(far) > 0 else (0.0, level.mean())
     spread = float(np.std(level - at_one - slope * far))
@@ -185,7 +187,8 @@ def reasons(
                 "by the model"
             )
     if known is not None:
-        said.append(f"nearest measurement: {known.tree.query(here)[0]:.3g} m away")
+        apart = float(known.tree.query(here)[0])
+        said.append("measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away")
     if answer.paths is not None and len(answer.paths.gain_db):
         rays = answer.paths
         more = ""
@@ -195,6 +198,13 @@ def reasons(
             f"{len(rays.gain_db)} paths within {SILENT_DB:g} dB; strongest {rays.gain_db[0]:.1f} dB at "
             f"{rays.delay_ns[0]:.1f} ns{more}"
         )
+        if answer.level_db is not None and len(rays.gain_db) > 1:
+            gap = answer.level_db - 10 * np.log10((10 ** (rays.gain_db / 10)).sum())
+            if abs(gap) >= PHASES_DB:
+                how = "cancel each other" if gap < 0 else "add up"
+                said.append(
+                    f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers"
+                )
     return said
 
 

@@ -31,6 +31,7 @@ RANGE_DB = 30.0  # of emissions that are told apart
 RADIUS = 0.08  # of a sphere of power, of the extent of the site
 SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
 REACH = 0.8  # of the extent, that rays are drawn to at most
+PATHS = Legend("gain of a path [dB of the strongest]", -SILENT_DB, 0.0, "plasma")
 VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
     "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
 )  # fmt: skip
@@ -296,8 +297,7 @@ def rays_of(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     length = paths.delay_ns * 0.299792458
     shown = np.minimum(length, REACH * extent)
     ends = receiver + paths.towards * shown[:, None]
-    top = paths.gain_db.max(initial=-np.inf)
-    colours = Legend("", top - SILENT_DB, top, "plasma").of(paths.gain_db)
+    colours = PATHS.of(paths.gain_db - paths.gain_db.max(initial=-np.inf))
     segments = np.stack([np.broadcast_to(receiver, ends.shape), ends], axis=1)
     return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)
 

@@ -17,13 +17,9 @@ class Newest:
     A job is a function that returns an iterator: after each `yield` another job may have its turn. Those that
     are urgent go first, the others follow in rotation, so that a long job does not delay a short one by more
     than one of its steps, and a client that asks often does not keep others waiting.
-
-    Attributes:
-        replaced: jobs that a newer one took the place of.
     """
 
     def __init__(self) -> None:
-        self.replaced = 0
         self._wake = threading.Condition()
         self._jobs: dict[Hashable, tuple[bool, Job]] = {}
         self._begun: dict[Hashable, Iterator[object]] = {}
@@ -34,7 +30,7 @@ class Newest:
     def ask(self, key: Hashable, job: Job, urgent: bool = False) -> None:
         """Have a job done in place of the key's present one; returns at once."""
         with self._wake:
-            self.replaced += self._jobs.pop(key, None) is not None
+            self._jobs.pop(key, None)
             self._begun.pop(key, None)
             self._jobs[key] = urgent, job
             self._wake.notify_all()

@@ -9,9 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from gsparc.data.schema import Kind
 from gsparc.maps.area import Grid
-from gsparc.maps.levels import MAPPED, predicted
+from gsparc.maps.levels import predicted
 from gsparc.maps.making import ends_of
 from gsparc.methods.method import Prediction
 from gsparc.methods.predictor import Predictor
@@ -35,11 +34,6 @@ class Plane:
     grid: Grid
     level_db: np.ndarray
     stride: int
-
-
-def has_power(kind: Kind) -> bool:
-    """Whether a level can be mapped."""
-    return kind in MAPPED
 
 
 def lifted(grid: Grid, height: float) -> Grid:

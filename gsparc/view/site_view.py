@@ -11,10 +11,10 @@ import numpy as np
 
 from gsparc.data.site_objects import SiteObjects
 from gsparc.maps.area import Grid, grid_of
+from gsparc.maps.levels import MAPPED
 from gsparc.maps.pictures import Layer
 from gsparc.view.answer import Usual, usual
 from gsparc.view.building import VALUES, Given, Sphere, build, start_place
-from gsparc.view.plane import has_power
 from gsparc.view.scene import EXTENT, Legend, Scene
 from gsparc.view.viewed import Measured, Viewed
 
@@ -66,11 +66,16 @@ class SiteView:
         return self.viewed.unit
 
     def station(self, name: str | None) -> StationView:
-        """Of a station; made when it is first asked for."""
-        with self._lock:
-            if name not in self._made:
-                self._made[name] = self._make(name)
-            return self._made[name]
+        """Of a station; made when it is first asked for, which takes seconds. Those made wait for nobody."""
+        if name not in self._made:
+            with self._lock:
+                if name not in self._made:
+                    self._made[name] = self._make(name)
+        return self._made[name]
+
+    def has(self, name: str | None) -> bool:
+        """Whether a station was made."""
+        return name in self._made
 
     def _make(self, name: str | None) -> StationView:
         viewed = self.viewed
@@ -78,9 +83,9 @@ class SiteView:
         scene = build(viewed, self.given, name, measured)
         known = None
         if measured is not None:
-            levels = measured.values if has_power(viewed.site.kind) else np.full(len(measured.values), np.nan)
-            known = usual(measured.places, levels, viewed.still(name))
-        power = scene.legends.get(VALUES) if has_power(viewed.site.kind) else None
+            levels = measured.values if viewed.site.kind in MAPPED else np.full(len(measured.values), np.nan)
+            known = usual(measured.places, levels, viewed.others(name))
+        power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
         return StationView(scene, measured, known, viewed.asked(name).method.objects(), power)
 
     def extent(self, name: str | None) -> float:
@@ -113,7 +118,7 @@ class SiteView:
 
 def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
     """Cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
-    if not has_power(viewed.site.kind):
+    if viewed.site.kind not in MAPPED:
         return None
     return grid_of(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)
 

@@ -34,14 +34,18 @@ class Way:
     """One way of answering.
 
     Attributes:
-        label: the operating point in words, with the accuracy that was shown with it.
+        label: the operating point in words.
         predictor: answers so.
         threads: CPU threads; None: as they are.
+        swept: accuracy and median milliseconds that `gsparc tradeoff` measured; None where it did not.
+        figure: name of the accuracy.
     """
 
     label: str
     predictor: Predictor
     threads: int | None = None
+    swept: tuple[float, float] | None = None
+    figure: str = ""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Viewed:
 
     Attributes:
         name: of the checkpoint.
-        ways: operating points, the fastest first; at least one.
+        ways: operating points, the fastest first, as trained last.
         data: in the model's coordinates and units; None where they are gone.
         test: (n,) rows that were not learned from.
         stations: that it answers for; one, None, where there is one static end or none.
@@ -88,9 +92,7 @@ class Viewed:
     @property
     def predictor(self) -> Predictor:
         """As trained."""
-        return next(
-            (way.predictor for way in self.ways if way.predictor.point is None), self.ways[-1].predictor
-        )
+        return self.ways[-1].predictor
 
     @property
     def site(self) -> Site:
@@ -112,6 +114,12 @@ class Viewed:
         site = self.site if station is None else self.predictor.at(station).site
         place = site.static_position
         return None if place is None else place + site.origin
+
+    def others(self, station: str | None) -> np.ndarray | None:
+        """World places (3,) [m] of the static end, or (n, 3) of transmitters where both ends moved."""
+        if self.data is None or self.site.static_end is not None:
+            return self.still(station)
+        return np.asarray(self.data.tx[self.rows(station)] + self.site.origin)
 
     def box(self) -> np.ndarray:
         """(2, 3) world corners of where the moving end was [m]."""
@@ -135,12 +143,8 @@ class Viewed:
         data, rows = self.data, self.rows(station)
         places = data.moving[rows][:, -3:] + data.site.origin
         if data.site.kind == "spectrum":
-            values = np.concatenate(
-                [
-                    data.targets(rows[i : i + CHUNK]).flatten(1).mean(1).numpy()
-                    for i in range(0, len(rows), CHUNK)
-                ]
-            )
+            chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))
+            values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
             label, error_label = "mean of a measured spectrum", "PSNR of test rows [dB]"
         else:
             values, silent = levels.measured(data, rows)
@@ -149,11 +153,7 @@ class Viewed:
             label, error_label = f"measured {what} [{self.unit}]", "|error| of test rows [dB]"
         errors = np.full(len(rows), np.nan)
         held = np.flatnonzero(np.isin(rows, self.test))
-        held = (
-            held[np.linspace(0, len(held) - 1, min(len(held), MOST_ERRORS)).astype(int)]
-            if len(held)
-            else held
-        )
+        held = held[np.linspace(0, len(held) - 1, min(len(held), MOST_ERRORS)).astype(int)]
         for start in range(0, len(held), CHUNK):
             part = held[start : start + CHUNK]
             errors[part] = _errors(self.predictor, data, rows[part], values[part])
@@ -206,16 +206,22 @@ def open_viewed(
     points, measured = kept(stored.extra)
     ways = [
         Way(
-            f"{point.label}, {point.figure[0]} {point.figure[1]:.4g}",
+            point.label,
             Predictor(
                 reduced(method, point.settings, measured), site, method, point, trusted, None, stored.extra
             ),
             point.threads,
+            (point.figure[1], point.p50_ms),
+            point.figure[0],
         )
         for point in sorted(points, key=lambda point: point.p50_ms)
         if point.settings
     ]
-    ways.append(Way("as trained", Predictor(method, site, trusted=trusted, extra=stored.extra)))
+    whole = [(point.figure[1], point.p50_ms) for point in points if not point.settings]
+    figure = points[0].figure[0] if points else ""
+    known = min(whole, key=lambda one: one[1]) if whole else None
+    trained = Predictor(method, site, trusted=trusted, extra=stored.extra)
+    ways.append(Way("as trained", trained, None, known, figure))
     return Viewed(
         str(path), tuple(ways), data, test, _stations(ways[-1].predictor, station), tuple(notes), unit
     )

@@ -18,7 +18,7 @@ def headline(answer: Answer, unit: str = "dB") -> str:
         spread = "" if answer.spread_db is None else f" ± {answer.spread_db:.1f}"
         said.append(f"{answer.level_db:.1f}{spread} {unit}")
     if answer.strongest is not None:
-        said.append("strongest from azimuth {:.0f}°, elevation {:.0f}°".format(*answer.strongest))
+        said.append("strongest from azimuth {:.0f}°, elevation {:.0f}° (world)".format(*answer.strongest))
     said.append("no confidence" if answer.confidence is None else f"confidence {answer.confidence:.2f}")
     return ", ".join(said)
 

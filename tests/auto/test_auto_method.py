@@ -21,7 +21,7 @@ from gsparc.data.splits import Fold, make_split
 from gsparc.evaluation.console import one_line
 from gsparc.evaluation.scores import score
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext, FitReport, Method, Prediction
+from gsparc.methods.method import FitContext, FitReport, HasGaussians, Method, Prediction
 from gsparc.methods.per_station import PerStation, for_links
 from gsparc.methods.registry import build, method_class
 
@@ -287,6 +287,18 @@ def test_the_field_is_a_candidate_that_is_stored(kind, tmp_path):
     batch = data.batch(fold.test)
     torch.testing.assert_close(again.answer(batch).mean, method.answer(batch).mean)
     assert again.label == method.label and again.size() == method.size()
+    assert isinstance(again, HasGaussians)
+    if kind == "images":
+        (rendered,) = (one for one in method._fitted if one.has_gaussians)
+        assert len(again.gaussians(batch.tx, batch.rx)) == rendered.size()
+
+
+def test_what_holds_no_gaussians_says_so(tmp_path):
+    data = street(60)
+    method = Auto(["mean"])
+    fold, _ = fitted(method, data, tmp_path)
+    with pytest.raises(ValueError, match=r"auto \(mean\): nothing here is rendered"):
+        method.gaussians(*_ends(data, fold.test))
 
 
 def test_an_interrupt_is_not_swallowed(tmp_path):

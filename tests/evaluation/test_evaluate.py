@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from gsparc.data.own import from_arrays
 from gsparc.evaluation.baseline_cache import BASELINES, baseline
 from gsparc.evaluation.evaluate import evaluate, paired_differences
 from gsparc.evaluation.scores import score
@@ -243,3 +244,14 @@ def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_p
     assert 0 < facts["test/decided_by/nmse_median"] < 3
     assert decided_by_a_row(facts)[0].startswith(f"row {row} alone makes 100.0% of the error or power")
     write_summary(tmp_path / "summary.json", facts)
+
+
+def test_rows_of_links_whose_both_ends_moved_name_both_places(folds, tmp_path):
+    """Training ended with an error after it: six coordinates of a link were taken for three."""
+    ends = np.random.default_rng(0).uniform(0, 10, (2, 40, 3))
+    power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
+    data = from_arrays({"tx_position": ends[0], "rx_position": ends[1], "rssi_db": power, "carrier_hz": 1e9})
+    methods, seconds = fit_all(InverseDistance, data, folds(40), tmp_path)
+    found = evaluate(methods, seconds, data, folds(40), baselines=(), clock=QUICK).columns
+    for end, names in zip(ends, (("tx_x_m", "tx_y_m", "tx_z_m"), ("x_m", "y_m", "z_m")), strict=True):
+        np.testing.assert_allclose(np.column_stack([found[n] for n in names]), end[found["row"]], atol=1e-6)

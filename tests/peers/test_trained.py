@@ -13,7 +13,7 @@ from clocks import wound
 from scenes import lobes, room
 
 from gsparc.methods import checkpoint
-from gsparc.methods.method import FitContext
+from gsparc.methods.method import FitContext, HasGaussians
 from gsparc.methods.registry import method_class
 from gsparc.peers.trained import rate_factor
 
@@ -128,3 +128,44 @@ def test_a_loss_that_is_not_finite_stops_training(tmp_path):
     data.target[fold.train] = np.nan
     with pytest.raises(RuntimeError, match="NaN or infinite at step 0"):
         brief("ngrf").fit(data, fold, FitContext(tmp_path))
+
+
+@pytest.mark.parametrize(("name", "kind"), [("gsrf", "spectrum"), ("gsrf", "csi"), ("wrfgs", "spectrum")])
+def test_a_peer_shows_its_gaussians_and_what_they_emit(tmp_path, name, kind):
+    data, fold = lobes(tmp_path) if kind == "spectrum" else room(40, directions=True)[:2]
+    method = brief(name)
+    assert isinstance(method, HasGaussians)
+    with pytest.raises(ValueError, match="not fitted"):
+        method.gaussians(torch.zeros(1, 3), None)
+    method.fit(data, fold, FitContext(tmp_path))
+    one, other = (data.batch(fold.test[i : i + 1]) for i in (0, 1))
+    cloud, elsewhere = (method.gaussians(batch.tx, batch.rx) for batch in (one, other))
+    np.testing.assert_allclose(cloud.means, method.network.field.means.detach(), rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(cloud.quats, axis=1), 1)
+    assert len(cloud) == method.size() and (cloud.strengths >= 0).all() and np.ptp(cloud.strengths) > 0
+    assert (cloud.strengths != elsewhere.strengths).any()
+    both = data.batch(fold.test[:2])
+    square = (cloud.strengths**2 + elsewhere.strengths**2) / 2
+    np.testing.assert_allclose(method.gaussians(both.tx, both.rx).strengths ** 2, square, rtol=1e-5)
+
+
+def test_planar_gaussians_are_shown_in_the_directions_that_they_brighten(tmp_path):
+    data, fold = lobes(tmp_path)
+    method = brief("swiftwrf")
+    method.fit(data, fold, FitContext(tmp_path))
+    network, batch = method.network, data.batch(fold.test[:1])
+    with torch.no_grad():
+        network.strengths.zero_()
+        network.strengths[7] = 0.9
+    cloud = method.gaussians(batch.tx, batch.rx)
+    receiver = data.site.static_position
+    np.testing.assert_allclose(np.linalg.norm(cloud.means - receiver, axis=1), 1, rtol=1e-5)
+    assert cloud.strengths.argmax() == 7
+    brightest = int(method.predict(batch.tx, batch.rx).mean[0].argmax())
+    towards = data.site.grid.directions().reshape(-1, 3)[brightest].double().numpy()
+    turn = np.eye(3) if data.site.rx_rotation is None else data.site.rx_rotation
+    assert turn @ towards @ (cloud.means[7] - receiver) > 0.95
+    moving, fold = lobes(tmp_path, "rx")
+    method.fit(moving, fold, FitContext(tmp_path))
+    with pytest.raises(ValueError, match="a receiver that moves"):
+        method.gaussians(batch.tx, batch.rx)

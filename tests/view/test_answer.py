@@ -9,6 +9,8 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.view.answer import Answer, Rays, ask, crossed_losses, reasons, usual
 from gsparc.view.building import rays_of
 
+HERE = np.zeros(3)
+
 
 def blocker(loss: float = 10.0, turn: float = 0.0) -> SiteObjects:
     """One Gaussian in the origin, 2 m along its first axis and 0.5 m across."""
@@ -35,6 +37,8 @@ def test_the_distance_law_of_measurements_is_found_and_missing_ones_left_out():
     law = usual(places, level, np.zeros(3))
     assert (law.at_one, law.slope) == (pytest.approx(-30), pytest.approx(25)) and law.spread_db < 1e-6
     assert np.isnan(usual(places, level, None).at_one)
+    apart = usual(places + 7, level, np.full((200, 3), 7.0))  # where the other end moved as well
+    assert (apart.at_one, apart.slope) == (pytest.approx(-30), pytest.approx(25))
 
 
 def test_a_weak_place_behind_something_is_explained():
@@ -47,6 +51,18 @@ def test_a_weak_place_behind_something_is_explained():
     said = " | ".join(reasons(answer, "rx", law, blocker(), np.zeros(3)))
     assert "20 m from the other end" in said and "weaker" in said
     assert "crosses 1 Gaussians that take 10.0 dB" in said and "nearest measurement" in said
+
+
+def test_a_fade_is_said_to_be_one():
+    paths = Rays(np.array([-40.0, -40.5]), np.array([10.0, 20]), None)
+    said = " | ".join(
+        reasons(Answer({"rx": HERE}, 1.0, level_db=-60.0, paths=paths), "rx", None, SiteObjects.of(), HERE)
+    )
+    assert "they cancel each other: 22.8 dB less than their powers" in said
+    said = " | ".join(
+        reasons(Answer({"rx": HERE}, 1.0, level_db=-37.5, paths=paths), "rx", None, SiteObjects.of(), HERE)
+    )
+    assert "their powers" not in said
 
 
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):

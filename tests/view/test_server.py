@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import re
+import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,8 +16,9 @@ from campaigns import compose, spectra
 import gsparc
 from gsparc.commands.train import train
 from gsparc.maps.pictures import layers
-from gsparc.view.site_view import SiteView
-from gsparc.view.viewed import open_viewed
+from gsparc.methods.reduced import reduced
+from gsparc.view.site_view import SiteView, grid_for
+from gsparc.view.viewed import Way, open_viewed
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -63,7 +66,7 @@ def test_a_drag_is_answered_with_what_the_model_says_there(visit, power_view):
     asked = power_view.viewed.asked("west")
     assert said == pytest.approx(10 * np.log10(asked.rssi(rx=[20.0, 30.0, 1.5])[0]), abs=0.06)
     assert session.vectors["rx"].value == pytest.approx((20.0, 30.0, 1.5), abs=1e-3)
-    assert "query" in session.speed.content and "all asked" in session.progress.content
+    assert "query" in session.speed.content and "cells of 2 m, " in session.progress.content
 
 
 def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view):
@@ -107,6 +110,62 @@ def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
     assert "plane" not in session.nodes
 
 
+def test_operating_points_are_steps_with_their_accuracy_and_live_milliseconds(visit, spectrum_view):
+    trained = spectrum_view.viewed.ways[-1]
+    coarse = gsparc.load(spectrum_view.viewed.name)
+    coarse.method = reduced(coarse.method, {"stride": 2}, {})
+    ways = Way("stride 2", coarse, 1, (20.0, 0.5), "psnr_db"), replace(trained, swept=(25.0, 2.0))
+    session = visit(SiteView(replace(spectrum_view.viewed, ways=ways)))
+    settle(session)
+    assert re.search(r"as trained.*\*\*[\d.]+ ms\*\*", session.speed.content)
+    full = session.picture.image.copy()
+    session.way.value = 0
+    session._way_changed(0)
+    settle(session)
+    assert re.search(r"stride 2, psnr_db 20: query \*\*[\d.]+ ms\*\*", session.speed.content)
+    assert (session.picture.image != full).any()
+    assert [list(part) for part in session._front()] == [[0.5, 2.0], [20.0, 25.0]]
+
+
+def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
+    """Where both ends moved the plane stayed that of the transmitter's first place."""
+    rng = np.random.default_rng(0)
+    ends = rng.uniform(0, 10, (2, 60, 3))
+    power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
+    np.savez(tmp_path / "both.npz", tx_position=ends[0], rx_position=ends[1], rssi_db=power, carrier_hz=1e9)
+    file = f"dataset.file={tmp_path / 'both.npz'}"
+    train(compose("dataset=own", file, "model=idw", "baselines=[]", "logger=none"), tmp_path)
+    viewed = open_viewed(tmp_path / "model.ckpt")
+    session = visit(SiteView(viewed, grid=grid_for(viewed, {"step_m": 2.0})))
+    settle(session)
+    before = session.plane.level_db
+    drag(session, "rx", [1.0, 1.0, 1.0])
+    settle(session)
+    assert session.plane.level_db is before
+    drag(session, "tx", [9.0, 9.0, 9.0])
+    settle(session)
+    assert np.abs(session.plane.level_db - before).max() > 1
+    assert "distance alone" in session.said.content
+
+
+def test_a_station_that_is_being_made_keeps_nobody_waiting(visit, power_view, monkeypatch):
+    """Pictures of a station were made on the event loop: all clients stood still for seconds."""
+    session = visit(power_view)
+    settle(session)
+    make, go = SiteView._make, threading.Event()
+    monkeypatch.setattr(SiteView, "_make", lambda view, name: go.wait(20) and make(view, name))
+    choosing = threading.Thread(target=session._station_changed, args=("east",))
+    choosing.start()
+    drag(session, "rx", [20.0, 30.0, 1.5])
+    settle(session)
+    assert session.station == "west" and "receiver at 20.00, 30.00" in session.said.content
+    assert "being prepared" in session.title.content and not go.is_set()
+    go.set()
+    choosing.join()
+    settle(session)
+    assert session.station == "east" and session.title.content.endswith("east**")
+
+
 def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(visit, power_view):
     session = visit(power_view)
     settle(session)
@@ -114,7 +173,7 @@ def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(v
     session._station_changed("east")
     settle(session)
     assert session.said.content != first and "east" in session.title.content
-    session._go("weakest of plane")
+    session._go("weakest cell")
     settle(session)
     level = session.plane.level_db
     said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])

@@ -5,16 +5,18 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
-from viser import uplot
 
 from gsparc.view.answer import Answer, ask, reasons
 from gsparc.view.building import (
     ERRORS,
     GAUSSIANS,
+    PATHS,
+    RAYS,
     SPHERE,
     SPLATS,
     VALUES,
@@ -23,7 +25,7 @@ from gsparc.view.building import (
     rays_of,
 )
 from gsparc.view.newest import Newest
-from gsparc.view.panel import response_db, response_db_of_antennas, spectrum_image, tones_mhz
+from gsparc.view.panel import degrees_of, response_db, response_db_of_antennas, spectrum_image, tones_mhz
 from gsparc.view.plane import Plane, lifted, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
 from gsparc.view.scene import EXTENT, Legend, Points
@@ -32,9 +34,12 @@ from gsparc.view.site_view import SiteView
 from gsparc.view.words import ENDS, answer_markdown, legend_html
 
 PREDICTED, NOTHING = "predicted power", "nothing"
+FIRST_PLACE, WEAKEST = "first place", "weakest cell"
 PLANE = "plane"
 KEPT = 50  # times that a median is taken of
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+DOTS = tuple({"width": 0, "stroke": colour, "points": {"show": True, "size": 7}} for colour in COLOURS)
+LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
 
 
 class Session:
@@ -49,13 +54,15 @@ class Session:
     def __init__(self, client: Any, view: SiteView, work: Newest, threads: int) -> None:
         self.client, self.view, self.work, self.threads = client, view, work, threads
         self.site = view.viewed.site
-        self.station = view.viewed.stations[0]
+        self.station = self.chosen_station = view.viewed.stations[0]
+        self.one = view.station(self.station)
         self.places = {end: np.asarray(at, np.float64) for end, at in view.starts(self.station).items()}
         self.asked_s = time.perf_counter()
         self.delays: deque[float] = deque(maxlen=KEPT)
         self.queries: deque[float] = deque(maxlen=KEPT)
         self.answers = 0  # that were shown
         self.plane: Plane | None = None
+        self.power: Legend | None = None  # of the plane, where it is predicted
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
         self.sphere = view.sphere(self.station)
@@ -69,7 +76,7 @@ class Session:
     @property
     def scene(self) -> Any:
         """Of the station that is shown."""
-        return self.view.station(self.station).scene
+        return self.one.scene
 
     # -- drawing what stands still -----------------------------------------------------------------
 
@@ -113,7 +120,8 @@ class Session:
         self.title = gui.add_markdown(f"**{self.scene.title}**")
         if len(viewed.stations) > 1:
             names = tuple(str(name) for name in viewed.stations)
-            self._on(gui.add_dropdown("station", names, initial_value=names[0]), self._station_changed)
+            choice = gui.add_dropdown("station", names, initial_value=names[0])
+            choice.on_update(lambda event: self._station_changed(event.target.value))
         self.said = gui.add_markdown("asking ...")
         self.picture: Any = None
         self.curve: Any = None
@@ -123,9 +131,12 @@ class Session:
             vector = gui.add_vector3(f"{ENDS[end]} [m]", tuple(np.round(place, 3)), step=0.01)
             self._on(vector, self._typed(end))
             self.vectors[end] = vector
-        row = ["first place"] + (["weakest of plane"] if self.view.grid is not None else [])
+        row = [FIRST_PLACE] + ([WEAKEST] if self.view.grid is not None else [])
         buttons = gui.add_button_group("go to", row)
         buttons.on_click(lambda event: self._go(event.target.value))
+        with gui.add_folder("Colours"):
+            self.legend = gui.add_html("")
+        self._layers_panel(gui)
         with gui.add_folder("Operating point"):
             last = len(viewed.ways) - 1
             self.way = None
@@ -133,9 +144,8 @@ class Session:
                 self.way = gui.add_slider("fast to accurate", 0, last, 1, last)
                 self._on(self.way, self._way_changed)
             self.speed = gui.add_markdown("")
-        self._layers_panel(gui)
-        with gui.add_folder("Colours"):
-            self.legend = gui.add_html("")
+            if last:
+                self._plot(self._front(), f"{viewed.ways[0].figure} by ms of a query, as swept", DOTS)
         with gui.add_folder("Notes", expand_by_default=False):
             gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
         self._legends()
@@ -174,6 +184,10 @@ class Session:
             said.append(
                 f"the {ENDS[self.site.static_end]} stood still when measured: the model knows it there alone"
             )
+        else:
+            said.append(
+                "both ends moved: measured points are where the receiver was, wherever its transmitter"
+            )
         if len(self.view.viewed.ways) == 1:
             said.append("`gsparc tradeoff ckpt=FILE` stores faster operating points with the model")
         return said
@@ -192,7 +206,7 @@ class Session:
     def _dragged(self, end: str) -> Any:
         async def moved(event: Any) -> None:
             self.places[end] = self.scene.frame.world(event.target.position)
-            self.wanted()
+            self._moved(end)
 
         return moved
 
@@ -205,12 +219,17 @@ class Session:
     def _move(self, end: str, place: np.ndarray) -> None:
         self.places[end] = place
         self.gizmos[end].position = self.scene.frame.drawn(place)
+        self._moved(end)
+
+    def _moved(self, end: str) -> None:
         self.wanted()
+        if end == "tx" and self.site.static_end is None:
+            self.want_plane()  # which shows the power of this transmitter
 
     def _go(self, where: str) -> None:
         moving = self.view.viewed.moving[-1]
         place = self.view.starts(self.station)[moving]
-        if where != "first place":
+        if where == WEAKEST:
             found = None if self.plane is None else weakest(self.plane)
             if found is None:
                 return
@@ -239,12 +258,22 @@ class Session:
         self.delays.clear()
         self.wanted()
 
+    def _front(self) -> tuple[np.ndarray, np.ndarray]:
+        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first."""
+        swept = np.array(sorted(one.swept[::-1] for one in self.view.viewed.ways if one.swept is not None))
+        return swept[:, 0], swept[:, 1]
+
     def _station_changed(self, value: str) -> None:
-        self.station = value
-        self.work.ask((self.client.client_id, "station"), self._show_station, urgent=True)
+        """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
+        self.chosen_station = value
+        if not self.view.has(value):
+            self.title.content = f"**{value} is being prepared ...**"
+        self.view.station(value)
+        if self.chosen_station == value:
+            self.work.ask((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
 
     def _download(self) -> None:
-        cloud = cloud_of(self.view.viewed, self.station, self.view.station(self.station).measured)
+        cloud = cloud_of(self.view.viewed, self.station, self.one.measured)
         if cloud is not None:
             self.client.send_file_download("gaussians.ply", ply_bytes(cloud, cloud_colours(cloud)[1]))
 
@@ -259,7 +288,8 @@ class Session:
         """Have the present plane drawn."""
         self.work.ask((self.client.client_id, PLANE), self._planes)
 
-    def _show_station(self) -> Iterator[None]:
+    def _show_station(self, name: str) -> Iterator[None]:
+        self.station, self.one = name, self.view.station(name)
         choices = (VALUES, ERRORS, GAUSSIANS, SPLATS)
         shown = {name: self.nodes[name].visible for name in choices if name in self.nodes}
         with self.client.atomic():
@@ -288,14 +318,15 @@ class Session:
         self.answers += 1
         self.queries.append(answer.query_ms)
         self.delays.append((time.perf_counter() - since) * 1e3)
+        accuracy = "" if way.swept is None else f", {way.figure} {way.swept[0]:.4g}"
         self.speed.content = (
-            f"{way.label}: query **{np.median(self.queries):.2f} ms**, with confidence, reasons and drawing "
-            f"{np.median(self.delays):.1f} ms (medians of {len(self.queries)})"
+            f"{way.label}{accuracy}: query **{np.median(self.queries):.2f} ms**, with confidence, reasons "
+            f"and drawing {np.median(self.delays):.1f} ms (medians of the last {len(self.queries)})"
         )
         yield
 
     def _show(self, answer: Answer) -> None:
-        one = self.view.station(self.station)
+        one = self.one
         why = reasons(answer, self.view.viewed.moving[-1], one.usual, one.objects, self.site.origin)
         with self.client.atomic():
             self.said.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
@@ -310,9 +341,12 @@ class Session:
     def _show_spectrum(self, spectrum: np.ndarray, receiver: np.ndarray | None) -> None:
         image = spectrum_image(spectrum)
         if self.picture is None:
-            self.picture = self.client.gui.add_image(
-                image, label="power by direction", jpeg_quality=85, order=self._after()
+            left, right, low, high = degrees_of(self.site.grid)  # type: ignore[arg-type]
+            label = (
+                f"power by direction at the receiver: azimuth {round(left)} to {round(right)}° to the "
+                f"right, elevation {round(low)} to {round(high)}° upwards"
             )
+            self.picture = self.client.gui.add_image(image, label=label, jpeg_quality=85, order=self._after())
         else:
             self.picture.image = image
         if self.sphere is not None and receiver is not None:
@@ -323,45 +357,41 @@ class Session:
         if response.size == 1:
             return
         if response.shape[1] > 1:
-            lines, x, label = (
-                response_db(response),
-                tones_mhz(self.site, response.shape[1]),
-                "frequency [MHz]",
-            )
+            lines, x = response_db(response), tones_mhz(self.site, response.shape[1])
+            title = "channel [dB] by frequency [MHz]"
+            if len(lines) > 1:
+                title += f", {len(lines)} of {len(response)} antennas"
         else:
-            lines, x, label = response_db_of_antennas(response)[None], np.arange(len(response)), "antenna"
+            lines, x = response_db_of_antennas(response)[None], np.arange(len(response))
+            title = "channel [dB] by antenna"
         data = (np.asarray(x, np.float64), *(np.asarray(line, np.float64) for line in lines))
         if self.curve is None:
-            each = [
-                uplot.Series(label=f"{n}" if len(lines) > 1 else "dB", stroke=COLOURS[n], width=2)
-                for n in range(len(lines))
-            ]
-            series = (uplot.Series(label=label), *each)
-            self.curve = self._plot(data, series, "channel [dB]", label)
+            self.curve = self._plot(data, title, LINES, self._after())
         else:
             self.curve.data = data
 
     def _show_rays(self, answer: Answer) -> None:
         rays = rays_of(answer, self.view.extent(self.station))
         if rays is not None:
+            first = RAYS not in self.nodes
             for part in rays:
                 self.nodes[part.name] = draw(self.client.scene, self.scene.frame, part)
+            if first:
+                self._legends()
         if answer.paths is None or not len(answer.paths.gain_db):
             return
         order = np.argsort(answer.paths.delay_ns)
         data = (answer.paths.delay_ns[order], answer.paths.gain_db[order])
         if self.delay_curve is None:
-            points = uplot.Series(label="dB", stroke=COLOURS[1], width=0, points={"show": True, "size": 7})
-            self.delay_curve = self._plot(
-                data, (uplot.Series(label="ns"), points), "paths: gain [dB] by delay", "delay [ns]"
-            )
+            self.delay_curve = self._plot(data, "paths: gain [dB] by delay [ns]", DOTS, self._after())
         else:
             self.delay_curve.data = data
 
-    def _plot(self, data: Any, series: Any, title: str, label: str) -> Any:
+    def _plot(self, data: Any, title: str, looks: Any, order: float | None = None) -> Any:
+        series = ({}, *looks[: len(data) - 1])
         return self.client.gui.add_uplot(
-            data, series, title=title, scales={"x": uplot.Scale(time=False)}, height=190,
-            axes=(uplot.Axis(label=label), uplot.Axis()), order=self._after(),
+            data, series, title=title, scales={"x": {"time": False}}, legend={"show": False}, height=170,
+            order=order,
         )  # fmt: skip
 
     def _after(self) -> float:
@@ -370,10 +400,11 @@ class Session:
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
         made = next(((grid, layer) for grid, layer in self.view.layers if layer.name == name), None)
+        self.power = None
         if made is not None:
             grid, layer = made
             self._lay(sheet(PLANE, grid, layer.values, Legend(layer.label, *layer.range(), layer.colours)))
-            self.progress.content = "as `gsparc map` made it"
+            self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name == PREDICTED and self.view.grid is not None:
             yield from self._predicted_plane()
         elif PLANE in self.nodes:
@@ -385,17 +416,22 @@ class Session:
         grid = lifted(self.view.grid, float(self.height.value))  # type: ignore[arg-type]
         predictor = self.view.viewed.asked(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
-        legend, begin = self.view.station(self.station).power, time.perf_counter()
+        legend, begin = self.one.power, time.perf_counter()
         for plane in refining(predictor, grid, None if other is None else other.tolist()):
             if plane is None:
                 yield
                 continue
-            legend = legend or Legend.over(f"predicted power [{self.view.unit}]", plane.level_db)
-            self.plane = plane
+            first, legend = (
+                self.power is None,
+                legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db),
+            )
+            self.plane, self.power = plane, legend
             self._lay(sheet(PLANE, grid, plane.level_db, legend))
-            asked = "all asked" if plane.stride == 1 else f"every {plane.stride}th asked"
+            if first:
+                self._legends()
+            asked = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
             self.progress.content = (
-                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m, {asked}, "
+                f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{asked}, "
                 f"{time.perf_counter() - begin:.1f} s"
             )
             yield
@@ -406,6 +442,8 @@ class Session:
     def _legends(self) -> None:
         legends = self.scene.legends
         shown = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
+        shown += [PATHS] if RAYS in self.nodes else []
+        shown += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
         shown += [
             Legend(one.label, *one.range(), one.colours) for _, one in self.view.layers if one.name == name
