@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 from gsparc.commands.listing import COMMANDS, listed, nearest
 
+READER_LEFT = 141  # a shell's status of a process that wrote to a closed pipe
+
 
 def main() -> None:
     """Run the command named first; without one, list them. Exit status 0 only when the job was done."""
+    try:
+        try:
+            _run()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # `| head` has its lines
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
+        sys.exit(READER_LEFT)
+
+
+def _run() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
     if name in ("--help", "-h", "help"):
         sys.stdout.write(listed())

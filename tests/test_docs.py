@@ -49,6 +49,14 @@ def test_links_and_paths_lead_somewhere(page):
 
 
 @PER_PAGE
+def test_files_that_are_shown_are_shown(page):
+    """A formatter once wrote `--8 < --`, and the site showed that line in place of the template."""
+    marks = [line for line in page.read_text(encoding="utf-8").splitlines() if line.startswith("--8")]
+    found = [re.fullmatch(r'--8<-- "([^"]+)"', line) for line in marks]
+    assert all(match and (ROOT / match[1]).exists() for match in found), marks
+
+
+@PER_PAGE
 def test_tests_that_are_named_exist(page):
     for file, name in re.findall(r"`([\w/]*test_\w+\.py)::(\w+)`", page.read_text(encoding="utf-8")):
         found = [path for path in (ROOT / "tests").rglob(Path(file).name) if path.as_posix().endswith(file)]

@@ -56,7 +56,7 @@ def site(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 def test_links_lead_somewhere_and_nothing_is_fetched(site):
     pages = [page for page in site.rglob("*.html") if page.name != "404.html"]
     assert len(pages) > 30 and "rasterize" in (site / "search" / "search_index.js").read_text()
@@ -71,7 +71,7 @@ def test_links_lead_somewhere_and_nothing_is_fetched(site):
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("page", ["index.html", "reference/rasterizer.html"])
 def test_pages_are_searched_from_a_folder(site, browser, page):
     browser.get((site / page).as_uri())

@@ -1,4 +1,4 @@
-"""Draws `accuracy-against-time.png`: PSNR of every method over its training time and over its query time.
+"""Draws `accuracy-against-time.png`: PSNR of every method over its training time, and query time if known.
 
 python docs/images/accuracy_against_time.py
 
@@ -11,41 +11,25 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter
+from gsparc.evaluation.drawing import logarithmic, look, panels, save
 
 HERE = Path(__file__).parent
 TABLE = HERE.parent / "results" / "compare" / "compare.csv"
 DATASET, SPLIT = "rfid", "random"
-SLOWEST_MS = 4.0  # queries beyond this are named at the edge
-
-GROUPS = {  # label, colour, marker, size
-    "ours": ("gsparc, the default of this repository", "#c1121f", "*", 19),
-    "field": (
-        "Gaussian fields trained by gradient: splat (settings of this repository), paper (published)",
-        "#e07b00",
-        "D",
-        7,
-    ),
-    "published": ("other published methods, as implemented here", "#1d6fb8", "o", 7),
-    "plain": ("interpolation and the mean spectrum", "#666666", "s", 7),
-}
-# Per method: group, label, and the label's offset from the point [points] in the left and in the right panel.
-METHODS: dict[str, tuple[str, str, tuple[int, int], tuple[int, int]]] = {
-    "gsparc": ("ours", "gsparc", (-4, 13), (-12, 9)),
-    "splat": ("field", "splat", (9, 0), (8, -7)),
-    "paper": ("field", "paper", (5, 10), (9, 4)),
-    "swiftwrf": ("published", "SwiftWRF", (9, 5), (9, 5)),
-    "wrfgs": ("published", "WRF-GS+", (9, -6), (9, -6)),
-    "ngrf": ("published", "nGRF", (9, -6), (9, -7)),
-    "nerf2": ("published", "NeRF2", (9, 5), (0, 0)),
-    "gsrf": ("published", "GSRF", (9, -2), (-9, -2)),
-    "gp": ("plain", "Gaussian process", (-9, 2), (10, 2)),
-    "idw": ("plain", "inverse distance", (9, 0), (-9, 2)),
-    "kriging": ("plain", "kriging", (9, 0), (-9, 0)),
-    "nearest": ("plain", "nearest neighbour", (9, -3), (-9, 0)),
-    "mean": ("plain", "mean spectrum", (9, 0), (9, 0)),
+# Per method: its name in the literature, and the label's offset from the point [points] in the left and the
+# right panel.
+METHODS: dict[str, tuple[str, tuple[int, int], tuple[int, int]]] = {
+    "gsparc": ("gsparc", (-10, 10), (-10, 10)),
+    "gp": ("Gaussian process", (-8, 0), (9, 2)),
+    "idw": ("inverse distance", (8, 0), (-8, 0)),
+    "kriging": ("kriging", (8, 0), (8, 0)),
+    "nearest": ("nearest neighbour", (8, -3), (-8, -3)),
+    "mean": ("mean spectrum", (8, 0), (8, 0)),
+    "swiftwrf": ("SwiftWRF", (8, 4), (8, 4)),
+    "wrfgs": ("WRF-GS+", (8, -4), (8, -4)),
+    "ngrf": ("nGRF", (8, 0), (8, 0)),
+    "gsrf": ("GSRF", (8, 0), (-8, 0)),
+    "paper": ("GSpaRC, as published", (8, -2), (8, -2)),
 }
 
 
@@ -56,62 +40,25 @@ def main() -> None:
     unknown = {r["method"] for r in rows} - METHODS.keys()
     if unknown:
         raise ValueError(f"{TABLE}: no place for the label of {', '.join(sorted(unknown))} in METHODS")
-    figure = Figure(figsize=(11.5, 5.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    training, query = figure.subplots(1, 2, sharey=True)
-    for name, (group, text, beside_training, beside_query) in METHODS.items():
-        own = sorted((r for r in rows if r["method"] == name), key=lambda r: float(r["budget_s"] or 0))
-        label, colour, marker, size = GROUPS[group]
-        if name == "gsparc":
-            own = own[:1]  # a longer budget changes nothing
-        look = {"color": colour, "marker": marker, "markersize": size, "linewidth": 1, "capsize": 2}
-        scores = [float(r["score_db"]) for r in own]
-        spreads = [float(r["spread_db"] or 0) for r in own]
-        seconds = [float(r["train_cpu_s"]) for r in own]
-        training.errorbar(seconds, scores, spreads, **look)
-        _say(training, text, (seconds[-1], scores[-1]), beside_training, colour, bold=group == "ours")
-        milliseconds = float(own[-1]["query_ms"])
-        if milliseconds > SLOWEST_MS:
-            query.annotate(
-                f"{text}: {milliseconds:,.0f} ms",
-                (SLOWEST_MS, scores[-1]),
-                (-45, 0),
-                textcoords="offset points",
-                ha="right",
-                va="center",
-                arrowprops={"arrowstyle": "->", "color": colour},
-                **_text(colour),
-            )
-        else:
-            query.errorbar([milliseconds], scores[-1:], spreads[-1:], **look)
-            _say(query, text, (milliseconds, scores[-1]), beside_query, colour, bold=group == "ours")
-    for label, colour, marker, size in GROUPS.values():
-        training.plot([], [], marker, color=colour, markersize=min(size, 13), label=label)
-    training.set(xlim=(2e-4, 8e3), ylim=(15, 30.3), ylabel="PSNR of 32 test spectra [dB], higher is better")
-    training.set_xlabel("training, processor seconds (lines join 60 s and 300 s)")
-    query.set_xlim(0.02, SLOWEST_MS)
-    query.set_xlabel("one query, milliseconds (median)")
-    for axis in (training, query):
-        axis.set_xscale("log")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.grid(alpha=0.25)
-    query.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    query.xaxis.set_major_formatter("{x:g}")
-    figure.legend(loc="outside lower center", ncols=2, fontsize=9.5, frameon=False)
-    figure.savefig(HERE / "accuracy-against-time.png", dpi=110)
-
-
-def _text(colour: str, *, bold: bool = False) -> dict[str, object]:
-    return {"color": colour, "fontsize": 12 if bold else 9, "fontweight": "bold" if bold else "normal"}
-
-
-def _say(
-    axis, text: str, point: tuple[float, float], beside: tuple[int, int], colour: str, *, bold: bool
-) -> None:
-    side = "left" if beside[0] > 0 else "right"
-    axis.annotate(
-        text, point, beside, textcoords="offset points", ha=side, va="center", **_text(colour, bold=bold)
-    )
+    timed = all(row["query_ms"] for row in rows)
+    figure, (axes,) = panels(9.0 if timed else 6.5, 4.2, 1, 1 + timed, sharey=True)
+    for row in rows:
+        text, *beside = METHODS[row["method"]]
+        colour, mark = look(row["method"])
+        ours = row["method"] == "gsparc"
+        for axis, cost, (right, up) in zip(axes, ("train_cpu_s", "query_ms"), beside, strict=False):
+            place = max(float(row[cost]), 1e-3), float(row["score_db"])
+            axis.plot(*place, mark, color=colour, markersize=15 if ours else 7)
+            axis.annotate(
+                text, place, (right, up), textcoords="offset points", ha="left" if right > 0 else "right",
+                va="center", color=colour, fontsize=12 if ours else 9.5, fontweight="bold" if ours else None,
+            )  # fmt: skip
+    labels = ("training, seconds of one processor", "one query [ms], one thread")
+    for axis, label, limits in zip(axes, labels, ((3e-4, 600), (0.01, 20)), strict=False):
+        axis.set(xlabel=label, xlim=limits, ylim=(15, 30.5))
+        logarithmic(axis, fine=False)
+    axes[0].set_ylabel("PSNR of 32 test spectra [dB]")
+    save(figure, HERE / "accuracy-against-time.png")
 
 
 if __name__ == "__main__":

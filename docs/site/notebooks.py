@@ -14,7 +14,7 @@ from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[2]
 DONE = ROOT / "build" / "executed" / "tutorials"  # pages.py takes the notebooks from here where they are
-LIMIT_S = 150  # of a cell
+LIMIT_S = 900  # of a cell by the clock, which a busy machine stretches
 
 log = logging.getLogger(__name__)
 

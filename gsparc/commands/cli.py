@@ -56,6 +56,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     except KeyboardInterrupt as interrupt:
         _say(str(interrupt) or "interrupted")
         sys.exit(130)
+    except BrokenPipeError:  # of Hydra's own lists: gsparc/__main__.py ends quietly
+        raise
     except InUse as busy:
         _say(str(busy))
         sys.exit(1)

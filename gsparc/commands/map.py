@@ -179,10 +179,11 @@ def task(config: DictConfig) -> dict[str, Any]:
         found = map_of(predictor, promise=promise, asked=tick, **asked)
     kept = None if promise is None else promise.coverage(how.share)
     lines = lines_of(found, kept)
-    drawn = list(layers(found, config.unit))
+    unit = str(config.unit or predictor.site.level_unit)
+    drawn = list(layers(found, unit))
     found.save(run_dir / "map.npz")
     if config.pictures:
-        draw(found, predictor, run_dir, config.unit, floor)
+        draw(found, predictor, run_dir, unit, floor)
     origin = predictor.site.georeference
     if origin is not None and geotiff.wanted(config.geotiff, origin):
         geotiff.write_geotiff(run_dir / "map.tif", found, origin)

@@ -100,6 +100,7 @@ class Site:
         georeference: where on Earth the world's origin lies; None when unknown.
         moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*; (2, 6)
             of both as in `Measurements.moving`; None in models of earlier versions.
+        level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
     """
 
     name: str
@@ -124,6 +125,7 @@ class Site:
     stations: Stations | None = None
     georeference: Georeference | None = None
     moving_box: np.ndarray | None = None
+    level_unit: str = "dB"
 
     @property
     def moving_end(self) -> Literal["rx", "tx"]:

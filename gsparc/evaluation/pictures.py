@@ -32,7 +32,7 @@ def draw_predictions(method: Method, data: Measurements, fold: Fold, title: str,
     true, predicted = batch.target.numpy(), found.mean.numpy()
     if not spectra:
         scale = data.site.target_scale
-        unit = data.provenance.get("level_unit", "dB") if data.site.kind == "rssi" else "dB"
+        unit = data.site.level_unit if data.site.kind == "rssi" else "dB"
         return draw_points(true * scale, predicted * scale, title, path, unit)
     assert data.site.grid is not None
     confidence = None if found.confidence is None else found.confidence.numpy()

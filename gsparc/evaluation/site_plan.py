@@ -88,8 +88,8 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     total, number = (np.bincount(which[row], w, minlength=count) for w in (value, None))
     mean = np.where(number > 0, total / np.maximum(number, 1), np.nan)
     if data.site.kind == "rssi":
-        unit = data.provenance.get("level_unit", "dB")
-        return mean, "received power" + (", mean of the stations heard" if several else "") + f" [{unit}]"
+        of = ", mean of the stations heard" if several else ""
+        return mean, f"received power{of} [{data.site.level_unit}]"
     with np.errstate(divide="ignore"):
         return 10 * np.log10(mean), "mean channel power" + (" of all stations" if several else "") + " [dB]"
 

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from gsparc.__main__ import main
+from gsparc.__main__ import READER_LEFT, main
 from gsparc.commands.listing import COMMANDS
 
 
@@ -42,6 +42,16 @@ def test_help_says_what_a_command_does_and_what_its_settings_mean(command, monke
     assert status == 0 and f"gsparc {command}" in out
     if COMMANDS[command].configured:
         assert "hydra.run.dir" not in out.partition("powered by Hydra")[0] and "  # " in out
+
+
+@pytest.mark.parametrize("words", [[], pytest.param(["train"], marks=pytest.mark.slow)])
+def test_a_reader_that_leaves_early_is_no_error(words):
+    """`gsparc train --help | head -1` once ended in a traceback."""
+    command = [sys.executable, "-m", "gsparc", *words, "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        running.stdout.close()
+        said = running.stderr.read()
+    assert (said, running.returncode) == ("", READER_LEFT)
 
 
 def test_help_of_a_kind_of_study_has_its_settings(monkeypatch, capsys):

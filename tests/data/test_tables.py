@@ -403,6 +403,13 @@ def test_an_index_of_parquet_was_dropped(tmp_path):
         ]
 
 
+@pytest.mark.parametrize(("head", "unit"), [("RSRP [dBm]", "dBm"), ("RSRP [dBW]", "dBm"), ("rssi", "dB")])
+def test_pictures_name_the_unit_that_levels_were_turned_into(write, head, unit):
+    """A column in dBW is read as dBm; its pictures said dBW, and those of a map dB whatever was measured."""
+    data = interpret(read_table(write(f"x,y,z,{head}\n1,2,3,-80\n4,5,6,-81.5\n")), "drive").data
+    assert data.site.level_unit == unit
+
+
 def test_parquet_without_pyarrow(write, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyarrow", None)
     with pytest.raises(DataError, match=r"Parquet needs pyarrow; say: pip install 'gsparc\[tables\]'"):

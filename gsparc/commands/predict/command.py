@@ -107,8 +107,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     """What the command does; returns the facts it wrote to `summary.json` in the run directory."""
     RunSettings.of(config)
     run_dir = run_directory()
+    predictor = load(config.ckpt, confidence=config.confidence)
     facts = predict(
-        load(config.ckpt, confidence=config.confidence),
+        predictor,
         config.places,
         config.out,
         station=None if config.station is None else str(config.station),
@@ -121,6 +122,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         f", {stations} station{'s' * (stations > 1)}" if stations else ""
     )
     if "predict/lowest_db" in facts:
-        said += f": {facts['predict/lowest_db']:.1f} to {facts['predict/highest_db']:.1f} dB"
+        low, high = facts["predict/lowest_db"], facts["predict/highest_db"]
+        said += f": {low:.1f} to {high:.1f} {predictor.site.level_unit}"
     show(run_dir, before=f"{said}; predictions in {facts['out']}; summary ")
     return facts

@@ -136,7 +136,7 @@ def _targets(data: Measurements) -> str:
 def neighbours(positions: np.ndarray, wavelength: float | None) -> str:
     """How far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
     distance = cKDTree(positions).query(positions, k=2)[0][:, 1]
-    text = f"the nearest one is {np.median(distance):.3g} m away (median)"
+    text = f"the nearest other place is {np.median(distance):.3g} m away (median)"
     if wavelength is not None:
         text += f", {np.median(distance) / wavelength:.2g} wavelengths"
     same = int((distance == 0).sum())

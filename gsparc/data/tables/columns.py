@@ -271,22 +271,23 @@ def _names(columns: Iterable[Column]) -> str:
 def _note(columns: tuple[Column, ...]) -> str:
     first = columns[0]
     kind = KINDS[first.role]
-    unit = f" [{_schema_unit(first)}]" if kind in SCHEMA else ""
+    unit = f" [{schema_unit(first)}]" if kind in SCHEMA else ""
     what = f"{_names(columns)} taken as {first.role}{unit}"
     if len(columns) > 1:
         labels = [column.label for column in columns]
         of = "frequencies" if first.role in CHANNELS else "stations"
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
     turned = first.unit is not None and first.unit.changes
-    return what + (f", {first.unit.name} turned into {_schema_unit(first)}" if turned and first.unit else "")
+    return what + (f", {first.unit.name} turned into {schema_unit(first)}" if turned and first.unit else "")
 
 
 def _conversion(column: Column) -> str:
     assert column.unit is not None
-    return f"column {column.head!r}: {column.unit.name} turned into {_schema_unit(column)}"
+    return f"column {column.head!r}: {column.unit.name} turned into {schema_unit(column)}"
 
 
-def _schema_unit(column: Column) -> str:
+def schema_unit(column: Column) -> str:
+    """Unit of the column's values once they are read."""
     unit = SCHEMA[KINDS[column.role]]
     return "dB" if unit == "dBm" and column.unit is not None and column.unit.name == "dB" else unit
 

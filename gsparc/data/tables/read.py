@@ -11,7 +11,7 @@ from gsparc.data.errors import DataError, Problems
 from gsparc.data.raw import Raw
 from gsparc.data.tables import TEXT_SUFFIXES
 from gsparc.data.tables.arrays import Builder
-from gsparc.data.tables.columns import choose
+from gsparc.data.tables.columns import choose, schema_unit
 from gsparc.data.tables.sheet import Sheet, read_parquet
 from gsparc.data.tables.stations import read_stations
 from gsparc.data.tables.text import read_text
@@ -71,8 +71,8 @@ def understand_table(
     builder = Builder(sheet, chosen, listed, problems)
     arrays = builder.build()
     problems.raise_if_any()
-    unit = chosen["rssi_db"][0].unit if "rssi_db" in chosen else None
-    about = {} if unit is None else {"level_unit": unit.name}
+    level = chosen["rssi_db"][0] if "rssi_db" in chosen else None
+    about = {} if level is None or level.unit is None else {"level_unit": schema_unit(level)}
     return Table(Raw(arrays, about), (*notes, *guessed, *builder.notes))
 
 

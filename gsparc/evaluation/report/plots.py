@@ -78,7 +78,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     best = front([x for x, _ in points], [score_of(name, y) for _, y in points])
     x, y = [points[i][0] for i in best], [points[i][1] for i in best]
     axes.step(x, y, where="post", lw=0.6, c="0.7", label="Pareto front")
-    axes.set_xscale("log")
+    logarithmic(axes)
     _accuracy_axis(axes, name)
     if name == "psnr_db" and len(points) > 1:  # a black image at 6 dB would flatten everything above 25
         values = [value for _, value in points]
@@ -146,7 +146,7 @@ def latency_cdf(runs: Sequence[Run]) -> Figure | None:
     axes = _axes()
     for (setting, group), color in _coloured(timed):
         _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, color)
-    axes.set_xscale("log")
+    logarithmic(axes)
     axes.set_ylabel("share of queries")
     title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
     return _finished(axes, title, "one query, end to end [ms]")
@@ -174,7 +174,7 @@ def learning(runs: Sequence[Run]) -> Figure:
         if len(group) > 1 and len({len(seconds) for seconds, _ in curves}) == 1:
             when, every = (np.stack(parts) for parts in zip(*curves, strict=True))
             axes.fill_between(when.mean(0), every.min(0), every.max(0), color=color, alpha=0.15, lw=0)
-    axes.set_xscale("log")
+    logarithmic(axes)
     _accuracy_axis(axes, name)
     what = "seconds of learning (diamond: trained in one piece, test rows)"
     return _finished(axes, "Validation accuracy against training time (band: seeds)", what)
@@ -230,7 +230,7 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
         mean, low, high = ([float(of(by_count[n])) for n in counts] for of in (np.mean, min, max))
         axes.plot(counts, mean, "o-", ms=3, lw=1, color=color, label=method)
         axes.fill_between(counts, low, high, color=color, alpha=0.15, lw=0)
-    axes.set_xscale("log")
+    logarithmic(axes)
     _accuracy_axis(axes, name)
     title = "Accuracy against the number of measurements (band: seeds)"
     return _finished(axes, title, "measurements learned from")
