@@ -56,11 +56,11 @@ class CalibratedRayTracer(Method):
     kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
     scene: str | None = None
     start: Start = "generic"
-    steps: int = 60
+    steps: int = 40
     depth: int = 5
     diffraction: bool = True
     samples: int = 100_000
-    batch: int = 200
+    batch: int = 400
     learned: Calibration | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:

@@ -105,7 +105,7 @@ class Replay:
 
     def powers(self) -> np.ndarray:
         """(R,) sums of path powers under the scene's present materials; 0 where no path arrives."""
-        return self._powers("symbolic").numpy().astype(np.float64)
+        return self._powers().numpy().astype(np.float64)
 
     def decibels(
         self, materials: Mapping[str, np.ndarray], slopes: Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -130,7 +130,7 @@ class Replay:
             there[name].relative_permittivity = 1 + dr.exp(pair[0])
             there[name].conductivity = dr.exp(pair[1])
             free += pair
-        power = self._powers("evaluated")
+        power = self._powers()
         level = 10 / math.log(10) * dr.log(power + TINY_W)
         value, by_level = slopes(dr.detach(level).numpy().astype(np.float64))
         dr.backward(dr.sum(level * mi.Float(by_level.astype(np.float32))))
@@ -140,14 +140,14 @@ class Replay:
         )  # without gradients
         return value, np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
 
-    def _powers(self, mode: str) -> Any:
-        """(R,) as the solver's array; `evaluated` loops have gradients, `symbolic` ones are faster."""
+    def _powers(self) -> Any:
+        """(R,) as the solver's array, with gradients: evaluated loops have them, and cost the same here."""
         import drjit as dr
         import mitsuba as mi
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
 
         calculator, total = FieldCalculator(), dr.zeros(mi.Float, self._count)
-        calculator.loop_mode = mode
+        calculator.loop_mode = "evaluated"
         for arguments, owner in self._parts:
             # The buffer is shared by all calls: each writes its own coefficients and flags.
             valid = arguments["paths"].valid
