@@ -109,12 +109,11 @@ class CalibratedRayTracer(Method):
         start = own if self.start == "scene" else dict.fromkeys(own, GENERIC)
         apply(tracer, start)
         replay = Replay(tracer, places, self._traced_effects())
-        reached = replay.powers() > 0
+        traced = replay.powers()
+        reached = traced > 0
         if reached.sum() < 2:
             raise ValueError(f"{self.name}: paths reach {reached.sum()} training rows; is this the scene?")
-        if not reached.all():
-            replay = Replay(tracer, places[reached], self._traced_effects())
-        self.learned = calibrate(replay, start, measured[reached], self.steps)
+        self.learned = calibrate(replay, start, traced, measured, self.steps)
         # Without paths in training, what is weakest there is the best guess of what lies deeper.
         self._silent_db = float(np.median(measured[~reached]) if not reached.all() else measured.min())
         if data.site.kind == "csi":

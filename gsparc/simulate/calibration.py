@@ -23,7 +23,8 @@ TAILS = 4.0  # degrees of freedom of Student's t, the density of residuals: shad
 TINY_W = 1e-30  # power that has a logarithm, far below any path's
 PRIOR = (1.0, 2.0)  # deviation of the logarithms of permittivity - 1 and of conductivity about the start
 RANGE = 4.0  # of a logarithm about its start, in these deviations
-SCALE_DB = (0.05, 60.0)  # bounds of the residuals' scale
+LEAST_DB = 0.5  # scale of the residuals: below, the posterior is a needle that no search finds
+ROUNDS = 100  # of expectation maximisation
 
 
 @dataclass(frozen=True)
@@ -79,11 +80,15 @@ def _read(material: Any) -> Material:
 
 def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
     """Give the scene's surfaces these materials."""
+    import drjit as dr
+    import mitsuba as mi
+
     there = tracer.surfaces()
     for name, material in materials.items():
         if name in there:
-            there[name].relative_permittivity = material.permittivity
-            there[name].conductivity = material.conductivity
+            # Plain numbers are constants of kernels: every other value would compile all of them anew.
+            there[name].relative_permittivity = dr.opaque(mi.Float, material.permittivity)
+            there[name].conductivity = dr.opaque(mi.Float, material.conductivity)
 
 
 class Replay:
@@ -102,6 +107,10 @@ class Replay:
         for found, count in tracer.solutions(receivers, effects):
             self._parts.append(_kept(tracer, found, effects, first))
             first += count
+
+    def apply(self, materials: Mapping[str, Material]) -> None:
+        """Give the scene these materials."""
+        apply(self._tracer, materials)
 
     def powers(self) -> np.ndarray:
         """(R,) sums of path powers under the scene's present materials; 0 where no path arrives."""
@@ -124,7 +133,7 @@ class Replay:
 
         there, free = self._tracer.surfaces(), []
         for name, logarithms in materials.items():
-            pair = [mi.Float(float(value)) for value in logarithms]
+            pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply`
             for one in pair:
                 dr.enable_grad(one)
             there[name].relative_permittivity = 1 + dr.exp(pair[0])
@@ -182,58 +191,76 @@ def _kept(tracer: RayTracer, found: Any, effects: Effects, first: int) -> tuple[
 
 
 def calibrate(
-    replay: Replay, start: Mapping[str, Material], measured_db: np.ndarray, steps: int
+    replay: Replay, start: Mapping[str, Material], traced: np.ndarray, measured_db: np.ndarray, steps: int
 ) -> Calibration:
     """Materials, one gain and the residuals' scale of largest posterior.
 
-    Residuals have Student's density of `TAILS` degrees of freedom; logarithms of the materials a normal prior
-    about the start, so that those that no path meets stay there.
+    Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from the
+    materials (`gain_and_scale`). Logarithms of the materials have a normal prior about the start, so that
+    those that no path meets stay there. The replay's scene keeps the materials.
 
     Args:
-        replay: paths, of which every receiver has one.
+        replay: paths to R receivers.
         start: materials to begin with, and the prior's mean.
+        traced: (R,) powers under them; receivers without any are not learned from.
         measured_db: (R,) [dB].
-        steps: most evaluations.
+        steps: most evaluations; 0 learns gain and scale alone.
     """
+    reached = traced > 0
+    gain, scale = gain_and_scale(measured_db[reached] - 10 * np.log10(traced[reached]))
+    if not steps:
+        return Calibration(dict(start), gain, scale, 0)
     centre = np.concatenate([one.logarithms() for one in start.values()])
     deviation = np.tile(PRIOR, len(start))
+    best = (np.inf, centre, gain, scale)
     spent = 0
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal spent
+        nonlocal spent, best
         spent += 1
-        held: dict[str, float] = {}
+        held = [0.0, 0.0]
 
-        def slopes(traced_db: np.ndarray) -> tuple[float, np.ndarray]:
-            value, by_residual, held["scale"] = student(traced_db + x[0] - measured_db, math.exp(x[1]))
-            held["gain"] = float(by_residual.sum())
-            return value, by_residual
+        def slopes(level: np.ndarray) -> tuple[float, np.ndarray]:
+            # Of largest likelihood gain and scale have no slope: that of the rest is the whole one.
+            missed, by_level = measured_db[reached] - level[reached], np.zeros(len(level))
+            held[:] = gain_and_scale(missed)
+            value, by_level[reached] = student(held[0] - missed, held[1])
+            return value, by_level
 
-        named = dict(zip(start, x[2:].reshape(-1, 2), strict=True))
-        value, by_material = replay.decibels(named, slopes)
-        away = (x[2:] - centre) / deviation
-        gradient = np.concatenate([[held["gain"], held["scale"]], by_material + away / deviation])
-        return value + 0.5 * float(away @ away), gradient
+        value, by_material = replay.decibels(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
+        away = (x - centre) / deviation
+        # Of a row: the search begins with a step as long as the gradient.
+        value = (value + 0.5 * float(away @ away)) / len(traced)
+        if value < best[0]:
+            best = (value, x.copy(), held[0], held[1])
+        return value, (by_material + away / deviation) / len(traced)
 
-    apply(replay._tracer, start)
-    traced = 10 * np.log10(replay.powers() + TINY_W)
-    gain = float(np.median(measured_db - traced))
-    scale = float(np.clip(1.5 * np.median(np.abs(measured_db - traced - gain)), 0.5, 20.0))
-    bounds = [(None, None), tuple(np.log(SCALE_DB))]
-    bounds += [(c - RANGE * d, c + RANGE * d) for c, d in zip(centre, deviation, strict=True)]
-    first = np.concatenate([[gain, math.log(scale)], centre])
+    bounds = [(c - RANGE * d, c + RANGE * d) for c, d in zip(centre, deviation, strict=True)]
     options = {"maxfun": steps, "maxiter": steps}
-    found = minimize(objective, first, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    materials = {
-        name: Material.of(pair) for name, pair in zip(start, found.x[2:].reshape(-1, 2), strict=True)
-    }
-    apply(replay._tracer, materials)
-    return Calibration(materials, float(found.x[0]), math.exp(found.x[1]), spent)
+    minimize(objective, centre, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    _, x, gain, scale = best
+    materials = {name: Material.of(pair) for name, pair in zip(start, x.reshape(-1, 2), strict=True)}
+    replay.apply(materials)
+    return Calibration(materials, gain, scale, spent)
 
 
-def student(residual: np.ndarray, scale: float) -> tuple[float, np.ndarray, float]:
-    """Negative log likelihood of residuals (n,) but for a constant, its slopes (n,), and by log(scale)."""
+def gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
+    """Location and scale of largest likelihood of Student's density, `missed` (n,) [dB].
+
+    Expectation maximisation (K. L. Lange et al., J. Am. Stat. Assoc. 84 (1989)); a scale of at least
+    `LEAST_DB`.
+    """
+    gain = float(np.median(missed))
+    scale = max(float(np.median(np.abs(missed - gain))), LEAST_DB)
+    for _ in range(ROUNDS):
+        weight = (TAILS + 1) / (TAILS + ((missed - gain) / scale) ** 2)
+        gain = float(weight @ missed / weight.sum())
+        scale = max(math.sqrt(float(weight @ (missed - gain) ** 2) / len(missed)), LEAST_DB)
+    return gain, scale
+
+
+def student(residual: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
+    """Negative log likelihood of residuals (n,) but for a constant, and its slopes (n,)."""
     z = residual / scale
     value = float((TAILS + 1) / 2 * np.log1p(z**2 / TAILS).sum() + len(z) * math.log(scale))
-    slope = (TAILS + 1) * z / (TAILS + z**2)
-    return value, slope / scale, float(len(z) - (slope * z).sum())
+    return value, (TAILS + 1) * z / (TAILS + z**2) / scale
