@@ -52,7 +52,7 @@ class CalibratedRayTracer(Method):
         samples, batch: of the solver, see `Sampling`.
     """
 
-    name: ClassVar[str] = "calibrated_raytracer"
+    name = "calibrated_raytracer"
     kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
     scene: str | None = None
     start: Start = "generic"

@@ -30,7 +30,7 @@ from gsparc.simulate.scenes.build import SceneSettings, known_scene, names_scene
 STATION = np.array([-2.5, 0.0, 3.0])
 CARRIER_HZ = 3.5e9
 PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
-TRUE = Material(2.2, 0.4)
+TRUE = Material(4.0, 0.2)
 GAIN_DB = 17.0
 ALL = np.arange(60)
 FOLD = Fold(ALL[:40], ALL[40:45], ALL[45:])

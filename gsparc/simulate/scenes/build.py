@@ -172,8 +172,8 @@ def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: f
     else:
         suffix = Path(stated).suffix.lower()
         builtin = "builder" if stated in BUILDERS else "builtin"
-        source = {".osm": "file", ".xml": "xml"}.get(suffix, builtin)
-        scene = SceneSettings(stated, MIN_RECEIVERS, carrier_hz, 0.0, 1, **{source: stated})
+        given: dict[str, Any] = {{".osm": "file", ".xml": "xml"}.get(suffix, builtin): stated}
+        scene = SceneSettings(stated, MIN_RECEIVERS, carrier_hz, 0.0, 1, **given)
     for path in (scene.file, scene.xml):
         if path is not None and not Path(path).is_file():
             raise ValueError(f"the scene's file {path} is not here; name it with model.scene=FILE")
