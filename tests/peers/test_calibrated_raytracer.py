@@ -141,17 +141,18 @@ def test_a_replay_is_the_trace(wall):
 
 
 @pytest.mark.slow
-def test_materials_and_gain_are_found_again(wall):
-    materials = used_materials(wall)
+def test_gain_and_powers_elsewhere_are_found_again(wall):
+    """Not the materials one by one: sheets resonate, and several explain the powers alike."""
+    materials, learned = used_materials(wall), slice(0, 60)
     apply(wall, dict.fromkeys(materials, TRUE))
-    measured = 10 * np.log10(wall.trace(places(), PLAIN).received_power()) + GAIN_DB
+    measured = 10 * np.log10(wall.trace(places(90), PLAIN).received_power()) + GAIN_DB
     start = dict.fromkeys(materials, GENERIC)
     apply(wall, start)
-    replay = Replay(wall, places(), PLAIN)
-    found = calibrate(replay, start, replay.powers(), measured, 80)
+    replay = Replay(wall, places(90)[learned], PLAIN)
+    found = calibrate(replay, start, replay.powers(), measured[learned], 80)
     assert found.gain_db == pytest.approx(GAIN_DB, abs=0.3) and found.scale_db == 0.5
-    for material in found.materials.values():
-        assert material.permittivity == pytest.approx(TRUE.permittivity, rel=0.25)
+    again = 10 * np.log10(wall.trace(places(90)[60:], PLAIN).received_power()) + found.gain_db
+    assert np.sqrt(np.mean((again - measured[60:]) ** 2)) < 0.5
 
 
 @pytest.mark.slow
