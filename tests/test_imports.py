@@ -28,7 +28,7 @@ ARROWS = {
     "training": "data field methods ops",
     "array": "data field methods ops physics training",
     "multipath": "data field methods ops physics",
-    "peers": "data field methods ops physics training",
+    "peers": "data field methods ops physics simulate training",
     "auto": "data methods ops",
     "evaluation": "data methods",
     "maps": "data evaluation methods",

@@ -75,6 +75,32 @@ def read_query_places(
         raise DataError(first + (f" (and {more} more)" if more else "")) from None
 
 
+def read_times(path: str | Path) -> np.ndarray | None:
+    """When each place was visited, (n,) [s], from the column or array `time_s`; None where there is none.
+
+    Raises:
+        DataError: no such file, or a time that is no number, with its row.
+    """
+    if is_table(path):
+        sheet, _ = sheet_of(path)
+        if "time_s" not in sheet.heads:
+            return None
+        problems = Problems(path)
+        times, rows = sheet.numbers("time_s", problems), sheet.rows
+        problems.raise_if_any()
+    else:
+        raw = read_raw(path)
+        if "time_s" not in raw.arrays:
+            return None
+        times = _numbers(raw, str(path), "time_s", 1)
+        rows = tuple(f"row {i}" for i in range(len(times)))
+    assert times is not None
+    if not np.isfinite(times).all():
+        row = rows[int(np.argmin(np.isfinite(times)))]
+        raise DataError(f"{path}, time_s, {row}: no number; expected seconds")
+    return times
+
+
 def _of_table(path: str | Path, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
     sheet, notes = sheet_of(path)
     problems = Problems(path)

@@ -26,6 +26,7 @@ METHODS = {
     "nerf2": "gsparc.peers.nerf2.NeRF2",
     "ngrf": "gsparc.peers.ngrf.NGRF",
     "newrf": "gsparc.peers.newrf.NeWRF",
+    "calibrated_raytracer": "gsparc.peers.calibrated_raytracer.CalibratedRayTracer",
     "ridge": "gsparc.methods.ridge.Ridge",
     "fire": "gsparc.peers.fire.Fire",
     "uplink": "gsparc.multipath.uplink.method.UplinkField",

@@ -29,7 +29,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     best = by_station.argmax(0) * len(places) + np.arange(len(places))
     heard, spread = outcome.made.power[best], outcome.made.delay_spread[best]
     extent = np.ptp(places[:, :2], axis=0)
-    high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 0.9
+    high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 1.3
     figure = Figure(figsize=(5.4 * count, high), layout="constrained")
     FigureCanvasAgg(figure)
     panels = figure.subplots(1, count)
@@ -55,8 +55,10 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
         panel.set_aspect("equal")
         panel.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper right", fontsize="small")
-    title = f"{outcome.made.data.site.name}: {len(places)} receivers, {outcome.effects}"
+    # Below: beside the title it would cover the last effects.
+    handles = panels[0].get_legend_handles_labels()
+    figure.legend(*handles, loc="outside lower center", ncols=2, fontsize="small")
+    title = f"{outcome.made.data.site.name}: {len(places)} receivers\n{outcome.effects}"
     figure.suptitle(title, fontsize="medium")
     figure.savefig(path, dpi=110)
 

@@ -8,7 +8,7 @@ specular chains lost to one another (a hash table large enough for a batch), dup
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from hashlib import sha256
@@ -130,6 +130,16 @@ class RayTracer:
             for name, m in self._scene.radio_materials.items()
         }
 
+    @property
+    def scene(self) -> Any:
+        """Sionna's (`sionna.rt.Scene`)."""
+        return self._scene
+
+    def surfaces(self) -> dict[str, Any]:
+        """Sionna's materials (`sionna.rt.RadioMaterial`) of the scene's objects, by name."""
+        used = {thing.radio_material.name for thing in self._scene.objects.values()}
+        return {name: one for name, one in self._scene.radio_materials.items() if name in used}
+
     def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> Paths:
         """Paths from the transmitter to receivers (R, 3) [m].
 
@@ -141,34 +151,47 @@ class RayTracer:
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
         """
-        rays, size = self.sampling.seed if seed is None else seed, self.sampling.batch
-        starts = range(0, len(receivers), size)
-        return join([self._batch(receivers[i : i + size], effects, rays) for i in starts])
+        found = self.solutions(receivers, effects, seed)
+        return join([_collect(solution, count) for solution, count in found])
 
-    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Paths:
+    def solutions(
+        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
+    ) -> Iterator[tuple[Any, int]]:
+        """Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
+
+        The scene holds these receivers until the next is asked for. Arguments and errors as of `trace`.
+        """
+        rays, size = self.sampling.seed if seed is None else seed, self.sampling.batch
+        for first in range(0, len(receivers), size):
+            yield from self._batch(receivers[first : first + size], effects, rays)
+
+    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Iterator[tuple[Any, int]]:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
         # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
         batch = max(self.sampling.batch, len(receivers))
         limit = min(CANDIDATES_PER_RECEIVER * boost * batch, LARGEST_BUFFER)
-        paths = self._solve(receivers, effects, seed, limit)
-        if paths is not None:
-            return paths
+        found = self._solve(receivers, effects, seed, limit)
+        if found is not None:
+            yield found, len(receivers)
+            return
         self.retried += 1
         if limit < LARGEST_BUFFER:
             log.info("candidate paths were cut off at %d; tracing %d receivers again", limit, len(receivers))
             self._buffer_factor[effects] = boost * 4
-            return self._batch(receivers, effects, seed)
+            yield from self._batch(receivers, effects, seed)
+            return
         if len(receivers) == 1:
             raise RuntimeError(
                 f"one receiver has over {LARGEST_BUFFER} candidate paths; lower sampling.samples"
             )
         half = len(receivers) // 2
         log.info("candidate paths were cut off at %d; tracing halves of %d receivers", limit, len(receivers))
-        return join([self._batch(part, effects, seed) for part in (receivers[:half], receivers[half:])])
+        for part in (receivers[:half], receivers[half:]):
+            yield from self._batch(part, effects, seed)
 
-    def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Paths | None:
-        """Paths, or None when the solver ran into `limit` and left some out."""
+    def _solve(self, receivers: np.ndarray, effects: Effects, seed: int, limit: int) -> Any | None:
+        """Sionna's paths, or None when the solver ran into `limit` and left some out."""
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
@@ -191,7 +214,7 @@ class RayTracer:
             edge_diffraction=effects.edge_diffraction,
             seed=seed,
         )
-        return None if counting.stored() >= limit else _collect(found, len(receivers))
+        return None if counting.stored() >= limit else found
 
     def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
         """Place transmitter and receivers in the scene."""

@@ -23,6 +23,7 @@ from gsparc.methods.registry import METHODS
 from gsparc.methods.stored_front import kept
 from gsparc.multipath import complex_gp
 from gsparc.ops import Pose
+from gsparc.peers.calibrated_raytracer import CalibratedRayTracer
 
 FIXTURES = Path(__file__).parent / "old_checkpoints"
 FILES = {  # of methods whose name has changed since
@@ -32,6 +33,7 @@ FILES = {  # of methods whose name has changed since
 DECLARED = {
     **dict.fromkeys(("zero", "mean", "nearest", "idw", "ridge", "fire", "uplink"), ""),
     **dict.fromkeys(("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf"), ""),
+    "calibrated_raytracer": "",
     "kriging": "HasVariance",
     "auto": "HasVariance",
     "distance_law": "HasVariance Differentiable",
@@ -70,6 +72,8 @@ def chosen() -> Method:
 
 
 def fitted(name: str) -> Method:
+    if name == "calibrated_raytracer":  # fitted where a scene and Sionna are: tests/peers
+        return CalibratedRayTracer()
     return chosen() if name == "auto" else read(FILES.get(name, name))[0]
 
 

@@ -91,8 +91,22 @@ def test_it_is_read_as_spectra_and_as_channels(tmp_path):
     assert spectra.site.sha256 != csi.site.sha256
     assert len(spectra.release_split[1]) == 18
     assert load({"name": "sionna", "file": str(tmp_path / "box.h5")}).site.kind == "spectrum"
-    with pytest.raises(DataError, match=r"dataset\.target=rssi"):
-        load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": "rssi"})
+    with pytest.raises(DataError, match=r"dataset\.target=power.* holds spectrum and csi and rssi"):
+        load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": "power"})
+
+
+def test_it_is_read_as_powers(tmp_path):
+    """Sums of path powers; where no path arrives, a power is below the weakest that was heard."""
+    blocked = replace(SCENE, room={**SCENE.room, "boxes_m": [[[2.6, 0, 0], [3.0, 4.0, 3]]]})
+    direct = Effects(**{**vars(MIRROR), "specular": False, "depth": 0})
+    made = simulate(plan(scene=blocked, effects=direct), tmp_path / "box.h5").made
+    data = load({"name": "sionna", "file": str(tmp_path / "box.h5"), "target": "rssi"})
+    heard = made.power > 0
+    assert data.site.kind == "rssi" and 0 < heard.sum() < 60 and data.site.convergence_error is None
+    np.testing.assert_array_equal(data.censored, ~heard)
+    powers = data.target[:, 0] * data.site.target_scale
+    np.testing.assert_allclose(powers[heard], made.power[heard], rtol=1e-4)
+    np.testing.assert_allclose(powers[~heard], made.power[heard].min(), rtol=1e-4)
 
 
 def test_noise_is_as_loud_as_said(tmp_path):
@@ -292,8 +306,9 @@ def test_where_few_are_left_everything_is_kept(tmp_path):
     ({"receivers": {"knd": "grid"}}, "no such setting"),
 ])  # fmt: skip
 def test_scenes_that_cannot_be_are_refused(tmp_path, changes, words):
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=words) as raised:
         simulate(plan(scene=SceneSettings(**{**vars(SCENE), **changes})), tmp_path / "box.h5")
+    assert "\n" not in str(raised.value)
     assert not list(tmp_path.iterdir())
 
 

@@ -33,6 +33,7 @@ class Contender:
         budget: overrides with `{budget_s}`; empty when its time cannot be chosen.
         kinds: of data it serves; empty for all.
         stations: takes part only where there are several stations, some rows of each being learned from.
+        scene: takes part only where the measurements name the scene that they were made in.
         reserve_s: part of the budget that its own `budget_s` does not count [s].
         only_longest: too slow for any but the longest budget.
         timed_only: too slow to be scored at all: fitted for its latency.
@@ -43,6 +44,7 @@ class Contender:
     budget: tuple[str, ...] = ()
     kinds: tuple[str, ...] = ()
     stations: bool = False
+    scene: bool = False
     reserve_s: float = 0.0
     only_longest: bool = False
     timed_only: bool = False
@@ -136,10 +138,12 @@ def plan(
     Raises:
         ValueError: a pattern that no cell matches.
     """
-    able = [
-        (p, [m for m in methods.values() if (not m.kinds or p.kind in m.kinds) and p.stations >= m.stations])
-        for p in problems
-    ]
+
+    def serves(method: Contender, problem: Problem) -> bool:
+        kind = not method.kinds or problem.kind in method.kinds
+        return kind and problem.stations >= method.stations and problem.scene >= method.scene
+
+    able = [(p, [m for m in methods.values() if serves(m, p)]) for p in problems]
 
     def cell(problem: Problem, method: Contender, budget_s: float | None, seed: int | None) -> Cell:
         drawn = seed if problem.draw is None else problem.draw

@@ -169,6 +169,7 @@ def fill(prepared: Prepared) -> Filled:
         "model/notes": "; ".join(found.notes),
         "problem/drawn": prepared.problem.draw is not None,
         "problem/stations": prepared.problem.stations,
+        "problem/scene": prepared.problem.scene,
         "seed": prepared.cell.seed,
         "budget_s": prepared.cell.budget_s,
         "made": datetime.now(UTC).isoformat(timespec="seconds"),

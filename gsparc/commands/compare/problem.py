@@ -18,6 +18,7 @@ from gsparc.commands.settings import plain
 from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
+from gsparc.simulate.scenes.build import names_scene
 
 RESULT = "cell.json"
 
@@ -60,6 +61,7 @@ class Problem:
         hashes: of measurements and folds.
         draw: number of the split's draw; None where it is not drawn again.
         stations: whether there are several.
+        scene: whether they name a scene that a ray tracer loads.
         chosen: overrides of train.yaml for dataset and split, but for the draw.
         data: measurements; None where they are not here.
         folds: which rows learn and which test.
@@ -71,6 +73,7 @@ class Problem:
     hashes: tuple[str, str]
     draw: int | None = None
     stations: bool = False
+    scene: bool = False
     chosen: tuple[str, ...] = ()
     data: Measurements | None = None
     folds: Split | None = None
@@ -116,8 +119,9 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
             folds = split_for(plain(config.split), data)
             hashes = (data.site.sha256, folds.sha256)
             several = data.site.stations is not None and folds.name != "stations"
+            known = names_scene(data.provenance)
             problems.append(
-                Problem(name, split.name, data.site.kind, hashes, draw, several, chosen, data, folds)
+                Problem(name, split.name, data.site.kind, hashes, draw, several, known, chosen, data, folds)
             )
     return problems
 
@@ -130,13 +134,16 @@ def stored_problems(kept: Path, dataset: str, splits: Sequence[SplitChoice]) -> 
         facts = [json.loads(file.read_text(encoding="utf-8")) for file in files]
         for draw in split.numbers:
             known = Counter(
-                (f["dataset/kind"], f["dataset/sha256"], f["split/sha256"], bool(f.get("problem/stations")))
+                (
+                    *(f[of] for of in ("dataset/kind", "dataset/sha256", "split/sha256")),
+                    *(bool(f.get(f"problem/{of}")) for of in ("stations", "scene")),
+                )
                 for f in facts
                 if draw is None or f["seed"] == draw
             )
             if known:
-                kind, data, folds, several = known.most_common(1)[0][0]
-                found.append(Problem(dataset, split.name, kind, (data, folds), draw, several))
+                kind, data, folds, several, scene = known.most_common(1)[0][0]
+                found.append(Problem(dataset, split.name, kind, (data, folds), draw, several, scene))
     return found
 
 

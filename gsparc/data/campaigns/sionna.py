@@ -1,4 +1,4 @@
-"""Files of `gsparc simulate` with spectra, channels and paths, read as spectra or as channels."""
+"""Files of `gsparc simulate` with spectra, channels and paths, read as spectra, channels or powers."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from gsparc.data.schema import Measurements
 
 log = logging.getLogger(__name__)
 
-TARGETS = ("spectrum", "csi")
+TARGETS = ("spectrum", "csi", "rssi")
+STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}  # array that a target is read from
 
 
 def load_sionna(path: str | Path, target: str | None = None, truth: str | Path | None = None) -> Measurements:
-    """A simulated dataset as spectra or as channels.
+    """A simulated dataset as spectra, as channels or as powers, the sums of path powers.
 
     Args:
         path: file that the simulator wrote.
-        target: `spectrum` or `csi`; None for the one the file was mainly made for.
+        target: one of `TARGETS`; None for the one the file was mainly made for.
         truth: another simulation of the same receivers, whose targets replace those of the test rows: the
             loss by training on a simulation with fewer effects.
 
@@ -61,7 +62,7 @@ def _load(path: str | Path, target: str | None) -> Measurements:
     if "simulator" not in raw.attributes:
         raise DataError(f"{path}: not written by gsparc simulate; read it with dataset=own")
     target = str(target or raw.attributes.get("measurement"))
-    held = [name for name in TARGETS if name in raw.arrays]
+    held = [name for name in TARGETS if STORED[name] in raw.arrays]
     if target not in held:
         raise DataError(f"dataset.target={target}: {path} holds {' and '.join(held)}")
     reading = interpret(read_as(raw, target), path)
@@ -72,12 +73,27 @@ def _load(path: str | Path, target: str | None) -> Measurements:
 
 def read_as(raw: Raw, target: str) -> Raw:
     """The same file with one measurement, its array, noise and solver error."""
-    other = [name for name in TARGETS if name != target]
+    other = [name for name in ("spectrum", "csi") if name != target]
     arrays = {k: v for k, v in raw.arrays.items() if k not in (*other, "array_position", "noise_variance")}
     names = {f"{target}_array_position": "array_position", f"{target}_noise_variance": "noise_variance"}
     attributes = {**raw.attributes, "measurement": target}
+    if target == "rssi":
+        arrays |= _heard(np.asarray(arrays.pop("received_power"), dtype=np.float64))
+        attributes["measurement"] = "rssi_db"
+        attributes.pop("convergence_error", None)  # it is of channels
     if target == "spectrum" and "convergence_spectrum_nmse" in attributes:
         attributes["convergence_error"] = attributes["convergence_spectrum_nmse"]
-    if target == "csi":
+    if target != "spectrum":
         attributes["normalisation"] = "none"
     return renamed(Raw(arrays, attributes, raw.units), names)
+
+
+def _heard(power: np.ndarray) -> dict[str, np.ndarray]:
+    """Powers (S,) in decibels; where no path arrives, they lie below the weakest that one brings."""
+    with np.errstate(divide="ignore"):
+        decibels = 10 * np.log10(power)
+    silent = ~np.isfinite(decibels)
+    if not silent.any():
+        return {"rssi_db": decibels}
+    level = decibels[~silent].min(initial=np.inf)
+    return {"rssi_db": np.where(silent, np.nan, decibels), "sensitivity_db": np.array(level)}

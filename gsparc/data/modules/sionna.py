@@ -14,7 +14,7 @@ class Sionna(DataModule):
 
     Args:
         file: *.h5.
-        target: `spectrum` or `csi`; None takes what the file was mainly made for.
+        target: `spectrum`, `csi` or `rssi`; None takes what the file was mainly made for.
         truth: another simulation of the same receivers, which test rows are compared with.
         name, batch_size: see `DataModule`.
     """
@@ -31,5 +31,5 @@ class Sionna(DataModule):
         self.file, self.target, self.truth = Path(file), target, truth
 
     def load(self) -> Measurements:
-        """Spectra (S, H, W) or channels (S, A, K)."""
+        """Spectra (S, H, W), channels (S, A, K) or powers (S, 1)."""
         return load_sionna(self.file, self.target, self.truth)

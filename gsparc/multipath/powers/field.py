@@ -385,9 +385,9 @@ def initialise(
     if found is None:
         return bare, (*notes, "no Gaussians: no candidate in the paths' way explains enough of the powers")
     gain = gain_of_groups(seen, data.site, settings, seed, budget, known)
-    if gain is None and known is None:
+    if gain is None and (known is None or (budget is not None and budget.over())):
         return bare, (*notes, "no Gaussians: no time to try them on groups of places that are left out")
-    said = "too few rows or too little time for trying them on groups of places that are left out"
+    said = "too few rows for trying them on groups of places that are left out"
     if gain is not None:
         before, after = math.sqrt(gain.others), math.sqrt(max(gain.others - gain.squares, 0.0))
         said = f"groups of places left out: rmse {before:.3g} dB without Gaussians, {after:.3g} dB with them"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from gsparc.simulate.scenes.osm import Town, read_town
 from gsparc.simulate.scenes.placement import clear_of
 from gsparc.simulate.scenes.receivers import layout, receivers
 from gsparc.simulate.scenes.solid import Solid
-from gsparc.simulate.scenes.transmitters import Antenna, Transmitter, stations
+from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna, Transmitter, stations
 from gsparc.simulate.shoebox import Room
 from gsparc.simulate.shoebox_engine import ShoeboxEngine
 from gsparc.simulate.survey import Survey
@@ -29,6 +30,8 @@ log = logging.getLogger(__name__)
 BUILDERS = {"conference_room": conference_room}
 SOURCES = ("builder", "builtin", "xml", "file", "room")
 OVER = ("zero", "ground", "roofs")
+MIN_RECEIVERS = 20
+SAME_PLACE_M = 0.01  # a station nearer to a transmitter of the scene is that transmitter
 CLEARANCE = 0.1  # [m] of receivers from any surface of a scene that comes as a file
 WIDEST_M = 400.0  # of an area that nobody states
 MAST_M = 10.0  # height of a transmitter that nobody states, above what stands in the middle
@@ -96,8 +99,8 @@ class SceneSettings:
             raise ValueError(f"scene.transmitter_m={self.transmitter_m}: expected three finite numbers [m]")
         if self.over not in OVER:
             raise ValueError(f"scene.over={self.over}: expected one of {', '.join(OVER)}")
-        if layout(self.receivers).kind == "area" and self.num_receivers < 20:
-            raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least 20")
+        if layout(self.receivers).kind == "area" and self.num_receivers < MIN_RECEIVERS:
+            raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
         if not (self.carrier_hz > 0 and self.bandwidth_hz >= 0 and self.subcarriers >= 1):
             raise ValueError("scene: carrier_hz is positive, bandwidth_hz at least 0, subcarriers at least 1")
         if not 0 < self.test_share < 1:
@@ -146,6 +149,60 @@ def build(scene: SceneSettings, sampling: Sampling) -> Survey:
     )
     engines = [tracer.at(mast.position, mast.antenna) for mast in masts]
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
+
+
+def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: float) -> SceneSettings:
+    """The scene that measurements were made in.
+
+    Args:
+        stated: the name of a scene that comes with Sionna or is built here, or the path of an extract of
+            OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that a simulated file names.
+        provenance: of the measurements.
+        carrier_hz: that materials are taken at [Hz].
+
+    Raises:
+        ValueError: no scene is known, or not one that a ray tracer loads.
+    """
+    if stated is None:
+        if not names_scene(provenance):
+            raise ValueError(
+                "the data name no scene of triangles; say model.scene=NAME, TOWN.osm or SCENE.xml"
+            )
+        scene = from_config(json.loads(provenance["scene"]))
+    else:
+        suffix = Path(stated).suffix.lower()
+        builtin = "builder" if stated in BUILDERS else "builtin"
+        given: dict[str, Any] = {{".osm": "file", ".xml": "xml"}.get(suffix, builtin): stated}
+        scene = SceneSettings(stated, MIN_RECEIVERS, carrier_hz, 0.0, 1, **given)
+    for path in (scene.file, scene.xml):
+        if path is not None and not Path(path).is_file():
+            raise ValueError(f"the scene's file {path} is not here; name it with model.scene=FILE")
+    return replace(scene, carrier_hz=carrier_hz)
+
+
+def names_scene(provenance: Mapping[str, str]) -> bool:
+    """Whether measurements come out of a scene that a ray tracer loads."""
+    try:
+        return json.loads(provenance["scene"])["room"] is None
+    except (KeyError, TypeError, ValueError):
+        return False
+
+
+def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarray, name: str) -> RayTracer:
+    """The scene alone, to be traced from a place (3,) [m] with the antenna that it states there.
+
+    Of several there, sectors of a mast, it is the one that `name` ends with; without one an isotropic one.
+
+    Raises:
+        ValueError, SimulatorMissing: see `build`.
+    """
+    town = None if scene.file is None else read_town(scene.file, scene.carrier_hz)
+    tracer = RayTracer(_source(scene, town)[0], np.zeros(3), scene.carrier_hz, sampling, scene.scattering)
+    georeference = None if town is None else town.georeference
+    masts = _stated(scene, lambda across: tracer.surface(across)[0], georeference) or []
+    here = [mast for mast in masts if np.linalg.norm(mast.position - transmitter) < SAME_PLACE_M]
+    called = [mast for mast in here if name.endswith(mast.name)]
+    return tracer.at(transmitter, next((mast.antenna for mast in called or here), ISOTROPIC))
 
 
 def _shoebox(scene: SceneSettings) -> Survey:

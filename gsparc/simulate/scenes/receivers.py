@@ -5,17 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-import pandas as pd
 
 from gsparc.data.errors import DataError
 from gsparc.data.instantiate import known_keys
 from gsparc.data.links.georeference import Georeference
-from gsparc.data.query_places import read_query_places
-from gsparc.data.tables import is_table
+from gsparc.data.query_places import read_query_places, read_times
 from gsparc.simulate.scenes.placement import place
 
 log = logging.getLogger(__name__)
@@ -203,7 +200,7 @@ def _of_file(
     if how.file is None:
         raise ValueError("scene.receivers.file is missing; expected a table with x and y, or degrees")
     try:
-        asked = read_query_places(how.file, ["rx"])
+        asked, time_s = read_query_places(how.file, ["rx"]), read_times(how.file)
     except DataError as error:
         raise ValueError(f"scene.receivers.file: {error}") from None
     for note in asked.notes:
@@ -215,12 +212,8 @@ def _of_file(
             raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
         across = georeference.from_degrees(*across.T)
     above = np.full(len(across), height) if there.height is None else there.height
-    time_s = None
-    if is_table(how.file) and Path(how.file).suffix == ".csv":
-        table = pd.read_csv(how.file)
-        if "time_s" in table:
-            time_s = pd.to_numeric(table["time_s"], errors="coerce").to_numpy(np.float64)
-            if not np.isfinite(time_s).all():
-                row = int(np.argmin(np.isfinite(time_s)))
-                raise ValueError(f"{how.file}, time_s, row {row}: expected seconds")
+    if time_s is not None and len(time_s) != len(across):
+        raise ValueError(
+            f"scene.receivers.file: {how.file}, time_s: {len(time_s)} times for {len(across)} places"
+        )
     return np.column_stack([across, above]), time_s

@@ -64,6 +64,12 @@ def test_all_stations_together_are_learned_where_there_are_several():
     assert found == ["b"]
 
 
+def test_a_ray_tracer_takes_part_where_a_scene_is_known():
+    methods = {"one": Contender("one", ("model=calibrated_raytracer",), scene=True)}
+    found = [cell.dataset for _, cell in plan([problem("a"), problem("b", scene=True)], methods, [])]
+    assert found == ["b"]
+
+
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
     assert names("*/gp/*", "*/fast/300/*") == ["rfid/random/gp/any/any", "rfid/random/fast/300/0"]
     with pytest.raises(ValueError, match="only: 'rfid/rndom/\\*' matches no cell"):

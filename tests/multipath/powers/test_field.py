@@ -271,6 +271,14 @@ def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
     assert errors[0] < 0.9 * errors[1], errors
 
 
+def test_known_walls_that_there_is_no_time_to_try_are_left_out(tmp_path):
+    """They were kept untried: 5.4 dB instead of 1.9 dB in a street of 300 rows."""
+    (tmp_path / "town.yaml").write_text(TOWN_WALL, encoding="utf-8")
+    init, none = InitSettings("scene", file=str(tmp_path / "town.yaml")), FitContext(budget_s=1e-6)
+    field, report = field_initialiser("powers")(town(150), np.arange(150), init, True, none)
+    assert field.count == 0, report
+
+
 def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch):
     data, field = blocked[0], blocked[1]
     rows = np.arange(240)

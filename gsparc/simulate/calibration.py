@@ -1,0 +1,266 @@
+"""Materials of a known scene, from received powers: paths are traced once, fields computed in every step.
+
+J. Hoydis et al., "Learning Radio Environments by Differentiable Ray Tracing", IEEE Trans. Mach. Learn.
+Commun. Netw. 2 (2024), arXiv:2311.18558: relative permittivity and conductivity by gradient, through
+Sionna's Fresnel and diffraction coefficients. Where rays go does not depend on materials, so that one step
+is a replay of the stored paths under other materials and not a trace.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from gsparc.simulate.effects import Effects
+from gsparc.simulate.raytracer import RayTracer
+
+TAILS = 4.0  # degrees of freedom of Student's t, the density of residuals: shadows are missed by tens of dB
+TINY_W = 1e-30  # power that has a logarithm, far below any path's
+PRIOR = (1.0, 2.0)  # deviation of the logarithms of permittivity - 1 and of conductivity about the start
+RANGE = 4.0  # of a logarithm about its start, in these deviations
+LEAST_DB = 0.5  # scale of the residuals: below, the posterior is a needle that no search finds
+ROUNDS = 100  # of expectation maximisation
+
+
+@dataclass(frozen=True)
+class Material:
+    """Of a surface.
+
+    Attributes:
+        permittivity: relative, above 1.
+        conductivity: [S/m].
+    """
+
+    permittivity: float
+    conductivity: float
+
+    def logarithms(self) -> np.ndarray:
+        """(2,) what is optimised."""
+        return np.log([max(self.permittivity - 1, 1e-3), max(self.conductivity, 1e-6)])
+
+    @staticmethod
+    def of(logarithms: np.ndarray) -> Material:
+        """From (2,)."""
+        return Material(1 + math.exp(logarithms[0]), math.exp(logarithms[1]))
+
+
+GENERIC = Material(5.0, 0.05)  # between brick and concrete at a few GHz (ITU-R P.2040)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was learned.
+
+    Attributes:
+        materials: by name.
+        gain_db: measured over traced power [dB].
+        scale_db: of the residuals' density [dB].
+        steps: evaluations of the likelihood and its gradient.
+    """
+
+    materials: dict[str, Material]
+    gain_db: float
+    scale_db: float
+    steps: int
+
+
+def used_materials(tracer: RayTracer) -> dict[str, Material]:
+    """Materials of the scene's surfaces, as the tracer has them."""
+    return {name: _read(one) for name, one in sorted(tracer.surfaces().items())}
+
+
+def _read(material: Any) -> Material:
+    return Material(float(material.relative_permittivity[0]), float(material.conductivity[0]))
+
+
+def apply(tracer: RayTracer, materials: Mapping[str, Material]) -> None:
+    """Give the scene's surfaces these materials."""
+    import drjit as dr
+    import mitsuba as mi
+
+    there = tracer.surfaces()
+    for name, material in materials.items():
+        if name in there:
+            # Plain numbers are constants of kernels: every other value would compile all of them anew.
+            there[name].relative_permittivity = dr.opaque(mi.Float, material.permittivity)
+            there[name].conductivity = dr.opaque(mi.Float, material.conductivity)
+
+
+class Replay:
+    """Paths of receivers, kept with what is needed to send fields along them again.
+
+    Args:
+        tracer: of the scene; its present materials decide which paths are tried.
+        receivers: (R, 3) [m], world.
+        effects: that are traced.
+    """
+
+    def __init__(self, tracer: RayTracer, receivers: np.ndarray, effects: Effects) -> None:
+        self._tracer, self._count = tracer, len(receivers)
+        self._parts: list[tuple[dict[str, Any], Any]] = []
+        first = 0
+        for found, count in tracer.solutions(receivers, effects):
+            self._parts.append(_kept(tracer, found, effects, first))
+            first += count
+
+    def apply(self, materials: Mapping[str, Material]) -> None:
+        """Give the scene these materials."""
+        apply(self._tracer, materials)
+
+    def powers(self) -> np.ndarray:
+        """(R,) sums of path powers under the scene's present materials; 0 where no path arrives."""
+        return self._powers().numpy().astype(np.float64)
+
+    def decibels(
+        self, materials: Mapping[str, np.ndarray], slopes: Callable[[np.ndarray], tuple[float, np.ndarray]]
+    ) -> tuple[float, np.ndarray]:
+        """A function of the powers in decibels, and its gradient by the materials.
+
+        Args:
+            materials: logarithms (2,) by name.
+            slopes: (R,) [dB] -> the function's value and its slopes (R,).
+
+        Returns:
+            The value, and its slopes (2 per material, in their order).
+        """
+        import drjit as dr
+        import mitsuba as mi
+
+        there, free = self._tracer.surfaces(), []
+        for name, logarithms in materials.items():
+            pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply`
+            for one in pair:
+                dr.enable_grad(one)
+            there[name].relative_permittivity = 1 + dr.exp(pair[0])
+            there[name].conductivity = dr.exp(pair[1])
+            free += pair
+        power = self._powers()
+        level = 10 / math.log(10) * dr.log(power + TINY_W)
+        value, by_level = slopes(dr.detach(level).numpy().astype(np.float64))
+        dr.backward(dr.sum(level * mi.Float(by_level.astype(np.float32))))
+        gradient = np.array([dr.grad(one).numpy()[0] for one in free], dtype=np.float64)
+        apply(
+            self._tracer, {name: Material.of(pair) for name, pair in materials.items()}
+        )  # without gradients
+        return value, np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+
+    def _powers(self) -> Any:
+        """(R,) as the solver's array, with gradients: evaluated loops have them, and cost the same here."""
+        import drjit as dr
+        import mitsuba as mi
+        from sionna.rt.path_solvers.field_calculator import FieldCalculator
+
+        calculator, total = FieldCalculator(), dr.zeros(mi.Float, self._count)
+        calculator.loop_mode = "evaluated"
+        for arguments, owner in self._parts:
+            # The buffer is shared by all calls: each writes its own coefficients and flags.
+            valid = arguments["paths"].valid
+            gains = calculator(**arguments).a
+            arguments["paths"].valid = valid
+            for row in gains:
+                for gain in row:
+                    dr.scatter_add(total, dr.square(dr.real(gain)) + dr.square(dr.imag(gain)), owner)
+        return total
+
+
+def _kept(tracer: RayTracer, found: Any, effects: Effects, first: int) -> tuple[dict[str, Any], Any]:
+    """Arguments of the field calculator, and the receivers of the paths, from `first` on."""
+    import mitsuba as mi
+
+    scene, buffer = tracer.scene, found._paths_buffer
+    sources, turned, *_ = scene.sources(True, True)
+    targets, facing, *_ = scene.targets(True, True)
+    arguments = {
+        "wavelength": scene.wavelength,
+        "paths": buffer,
+        "samples_per_src": tracer.sampling.samples,
+        "diffraction": effects.diffraction,
+        "src_positions": sources,
+        "tgt_positions": targets,
+        "src_orientations": turned,
+        "tgt_orientations": facing,
+        "src_antenna_patterns": scene.tx_array.antenna_pattern.patterns,
+        "tgt_antenna_patterns": scene.rx_array.antenna_pattern.patterns,
+    }
+    return arguments, mi.UInt(buffer.target_indices) + first
+
+
+def calibrate(
+    replay: Replay, start: Mapping[str, Material], traced: np.ndarray, measured_db: np.ndarray, steps: int
+) -> Calibration:
+    """Materials, one gain and the residuals' scale of largest posterior.
+
+    Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from the
+    materials (`gain_and_scale`). Logarithms of the materials have a normal prior about the start, so that
+    those that no path meets stay there. The replay's scene keeps the materials.
+
+    Args:
+        replay: paths to R receivers.
+        start: materials to begin with, and the prior's mean.
+        traced: (R,) powers under them; receivers without any are not learned from.
+        measured_db: (R,) [dB].
+        steps: most evaluations; 0 learns gain and scale alone.
+    """
+    reached = traced > 0
+    gain, scale = gain_and_scale(measured_db[reached] - 10 * np.log10(traced[reached]))
+    if not steps:
+        return Calibration(dict(start), gain, scale, 0)
+    centre = np.concatenate([one.logarithms() for one in start.values()])
+    deviation = np.tile(PRIOR, len(start))
+    best = (np.inf, centre, gain, scale)
+    spent = 0
+
+    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+        nonlocal spent, best
+        spent += 1
+        held = [0.0, 0.0]
+
+        def slopes(level: np.ndarray) -> tuple[float, np.ndarray]:
+            # Of largest likelihood gain and scale have no slope: that of the rest is the whole one.
+            missed, by_level = measured_db[reached] - level[reached], np.zeros(len(level))
+            held[:] = gain_and_scale(missed)
+            value, by_level[reached] = student(held[0] - missed, held[1])
+            return value, by_level
+
+        value, by_material = replay.decibels(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
+        away = (x - centre) / deviation
+        # Of a row: the search begins with a step as long as the gradient.
+        value = (value + 0.5 * float(away @ away)) / len(traced)
+        if value < best[0]:
+            best = (value, x.copy(), held[0], held[1])
+        return value, (by_material + away / deviation) / len(traced)
+
+    bounds = [(c - RANGE * d, c + RANGE * d) for c, d in zip(centre, deviation, strict=True)]
+    options = {"maxfun": steps, "maxiter": steps}
+    minimize(objective, centre, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    _, x, gain, scale = best
+    materials = {name: Material.of(pair) for name, pair in zip(start, x.reshape(-1, 2), strict=True)}
+    replay.apply(materials)
+    return Calibration(materials, gain, scale, spent)
+
+
+def gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
+    """Location and scale of largest likelihood of Student's density, `missed` (n,) [dB].
+
+    Expectation maximisation (K. L. Lange et al., J. Am. Stat. Assoc. 84 (1989)); a scale of at least
+    `LEAST_DB`.
+    """
+    gain = float(np.median(missed))
+    scale = max(float(np.median(np.abs(missed - gain))), LEAST_DB)
+    for _ in range(ROUNDS):
+        weight = (TAILS + 1) / (TAILS + ((missed - gain) / scale) ** 2)
+        gain = float(weight @ missed / weight.sum())
+        scale = max(math.sqrt(float(weight @ (missed - gain) ** 2) / len(missed)), LEAST_DB)
+    return gain, scale
+
+
+def student(residual: np.ndarray, scale: float) -> tuple[float, np.ndarray]:
+    """Negative log likelihood of residuals (n,) but for a constant, and its slopes (n,)."""
+    z = residual / scale
+    value = float((TAILS + 1) / 2 * np.log1p(z**2 / TAILS).sum() + len(z) * math.log(scale))
+    return value, (TAILS + 1) * z / (TAILS + z**2) / scale
