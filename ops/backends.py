@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from types import ModuleType
 
 import torch
@@ -34,6 +35,7 @@ def named(name: str) -> ModuleType:
     raise ValueError(f"backend is 'reference', 'cpu' or 'cuda', got {name!r}")
 
 
+@cache
 def _cpu() -> ModuleType:
     try:
         from gsparc.ops import native

@@ -51,7 +51,7 @@ def channels(
     tones = [first_hz, step_hz]
     served = not beyond_kernels(gains, steering, delays)
     if served and built.kernels() is not None and "channels" in KERNELS.get(gains.device.type, ()):
-        return channels_op(gains, steering, delays, tones, subcarriers)
+        return channels_op.of(gains, steering, delays, tones, subcarriers)
     return summed(gains, steering, delays, tones, subcarriers)
 
 

@@ -34,7 +34,7 @@ def networks(encoded: Tensor, weight1: Tensor, bias1: Tensor, weight2: Tensor, b
         fits &= weight1.shape[1] <= kernels.MOST_INPUTS and weight2.shape[2] <= kernels.MOST_OUTPUTS
     if fits:
         backends.named(encoded.device.type)  # loads its kernels
-        return networks_op(encoded, weight1, bias1, weight2, bias2)
+        return networks_op.of(encoded, Layers(weight1, bias1, weight2, bias2))
     return products(encoded, weight1, bias1, weight2, bias2)
 
 

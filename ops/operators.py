@@ -20,7 +20,7 @@ from gsparc.ops.geometry import Gaussians, Pose, SphereGrid
 from gsparc.ops.plan import Plan
 from gsparc.ops.results import visible_share
 from gsparc.ops.settings import KernelSettings, Optics, kernel_settings
-from gsparc.ops.transforms import carries_tangent
+from gsparc.ops.transforms import carries_tangent, differentiated_forward, transforming
 
 KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
 """What computes an operator, by type of device and name; see `kernel`."""
@@ -92,11 +92,19 @@ class Operator:
 
     Attributes:
         defined: the operator as torch knows it.
+        fill: what computes it in the end, of arguments in their named tuples.
     """
 
-    def __init__(self, defined: CustomOpDef) -> None:
-        self.defined = defined
+    def __init__(self, defined: CustomOpDef, fill: Callable[..., Any]) -> None:
+        self.defined, self.fill = defined, fill
         self.register_autograd = defined.register_autograd
+
+    def of(self, *values: Any) -> Any:
+        """Call it with arguments in their named tuples, past torch's dispatcher where it only passes on."""
+        leaves = _leaves(value for value in values if type(value) is not KernelSettings)
+        if unwatched(leaves):
+            return self.fill(*values)
+        return self(*_leaves(packed(value) if type(value) is KernelSettings else value for value in values))
 
     def __call__(self, *flat: Any) -> Any:
         """Call it (RuntimeError for tangents of forward mode, which a kernel does not see)."""
@@ -105,6 +113,22 @@ class Operator:
                 f"{self.defined._qualname} has no forward-mode derivative; take backend='reference'"
             )
         return self.defined(*flat)
+
+
+def unwatched(values: Iterable[Any]) -> bool:
+    """Whether torch would only pass a call on: nothing records, traces, maps, fakes or differentiates."""
+    if transforming() or differentiated_forward() or torch.compiler.is_compiling():
+        return False
+    if torch._C._get_tracing_state() is not None or torch._C._len_torch_function_stack():
+        return False
+    if torch._C._len_torch_dispatch_stack():
+        return False
+    recorded, plain = torch.is_grad_enabled(), (Tensor, torch.nn.Parameter)
+    return all(
+        type(value) in plain and value.is_cpu and not (recorded and value.requires_grad)
+        for value in values
+        if isinstance(value, Tensor)
+    )
 
 
 def _no_second_derivative(ctx, *slopes):
@@ -136,11 +160,13 @@ def operator(shapes: Callable[..., Any]) -> Operator:
     def grouped(flat: tuple[Any, ...]) -> list[Any]:
         return [make(flat[first:last]) if make else flat[first] for make, first, last in groups]
 
+    def fill(*values: Any) -> Any:
+        out, first = shapes(*values), _leaves(values[:1])[0]
+        own = KERNELS[first.device.type][name](out, **dict(zip(hints, values, strict=True)))
+        return _outputs(out if own is None else own, first)
+
     def compute(*flat: Any) -> Any:
-        values = grouped(flat)
-        out = shapes(*values)
-        own = KERNELS[flat[0].device.type][name](out, **dict(zip(hints, values, strict=True)))
-        return _outputs(out if own is None else own, flat[0])
+        return fill(*grouped(flat))
 
     kind = inspect.Parameter.POSITIONAL_OR_KEYWORD
     parameters = [inspect.Parameter(key, kind, annotation=hint) for key, hint in arguments.items()]
@@ -154,7 +180,7 @@ def operator(shapes: Callable[..., Any]) -> Operator:
     defined.register_fake(lambda *flat: _outputs(shapes(*grouped(flat)), flat[0]))
     if name.endswith("_backward"):
         defined.register_autograd(_no_second_derivative)
-    return Operator(defined)
+    return Operator(defined, fill)
 
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -318,9 +344,8 @@ weights_op.register_autograd(_weights_backward, setup_context=_weights_setup)
 
 def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
     """Project, cull, order and bin."""
-    *buffers, means2d, radii, visible = plan_op(
-        *gaussians, ids, pose.position, pose.rotation, packed(kernel_settings(grid, optics))
-    )
+    poses = Poses(pose.position, pose.rotation)
+    *buffers, means2d, radii, visible = plan_op.of(gaussians, ids, poses, kernel_settings(grid, optics))
     device = gaussians.means.device.type
     return Plan(pose, grid, optics, device, means2d, radii, visible, Buffers(*buffers))
 
@@ -328,23 +353,23 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
 def view_of(plan: Plan) -> tuple[Any, ...]:
     """The last arguments of an operator on a plan."""
     settings = kernel_settings(plan.grid, plan.optics)
-    return plan.pose.position, plan.pose.rotation, *plan.buffers, packed(settings)
+    return Poses(plan.pose.position, plan.pose.rotation), Buffers(*plan.buffers), settings
 
 
 def kernel_view(plan: Plan, gaussians: Gaussians) -> dict[str, Any]:
     """A plan as kernels receive it (`kernel`): buffers, gaussians, poses and settings."""
-    poses, settings = Poses(plan.pose.position, plan.pose.rotation), kernel_settings(plan.grid, plan.optics)
-    return {"buffers": Buffers(*plan.buffers), "gaussians": gaussians, "poses": poses, "settings": settings}
+    poses, buffers, settings = view_of(plan)
+    return {"buffers": buffers, "gaussians": gaussians, "poses": poses, "settings": settings}
 
 
 def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
     """Image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
-    return composite_op(means2d, *gaussians, features, *view_of(plan))
+    return composite_op.of(means2d, gaussians, features, *view_of(plan))
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, Tensor]:
     """Mean over pixels of alpha T, and its share of alpha: both (P, N)."""
-    seen, total = weights_op(*gaussians, *view_of(plan))
+    seen, total = weights_op.of(gaussians, *view_of(plan))
     return seen / (plan.grid.height * plan.grid.width), visible_share(seen, total)
 
 

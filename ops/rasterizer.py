@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 
 import torch
@@ -55,9 +56,9 @@ def make_plan(
     gaussians = validation.gaussians(means, quats, scales, opacities, extinctions, ids)
     pose_trained = pose.position.requires_grad or pose.rotation.requires_grad
     validation.transforms(gaussians, pose, pose_trained)
-    with torch.no_grad():
-        chosen = backends.choose(backend, means.device)
-        optics = Optics(projection, low_pass, compensate, near, cutoff)
+    chosen = backends.choose(backend, means.device)
+    optics = Optics(projection, low_pass, compensate, near, cutoff)
+    with torch.no_grad() if torch.is_grad_enabled() else nullcontext():
         still = Gaussians._make(None if tensor is None else tensor.detach() for tensor in gaussians)
         poses = validation.poses(pose, means)
         plan = chosen.make_plan(validation.strongest(still), ids, poses, grid, optics)

@@ -19,9 +19,14 @@ def full_precision(function: _Function) -> _Function:
     return cast(_Function, exact)
 
 
+def differentiated_forward() -> bool:
+    """Whether forward mode is under way anywhere: this is asked at every call."""
+    return forward_ad._current_level >= 0
+
+
 def carries_tangent(*values: Any) -> bool:
     """Whether a tensor among `values` is differentiated in forward mode, by `torch.func.jvp` for example."""
-    if forward_ad._current_level < 0:  # no forward mode anywhere: this is asked at every call
+    if not differentiated_forward():
         return False
     tensors = (v for v in values if isinstance(v, Tensor) and v.is_floating_point())
     return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)

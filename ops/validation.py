@@ -10,7 +10,14 @@ from torch import Tensor
 from gsparc.ops import built
 from gsparc.ops.geometry import Gaussians, Pose
 from gsparc.ops.settings import FARTHEST, SKEW, WIDEST
-from gsparc.ops.transforms import carries_tangent, full_precision, mapped, unwrapped
+from gsparc.ops.transforms import (
+    carries_tangent,
+    differentiated_forward,
+    full_precision,
+    mapped,
+    transforming,
+    unwrapped,
+)
 
 
 class UnsoundGaussian(ValueError):
@@ -54,6 +61,8 @@ def gaussians(
 
 def transforms(gaussians: Gaussians, pose: Pose, pose_trained: bool) -> None:
     """Refuse a pose whose gradient is asked for, which would be none, and Gaussians under `torch.vmap`."""
+    if not pose_trained and not transforming() and not differentiated_forward():
+        return
     ends = (pose.position, pose.rotation)
     if (pose_trained and torch.is_grad_enabled()) or carries_tangent(*ends):
         raise ValueError("a pose has no gradients here: detach it, or move the Gaussians instead")
@@ -101,12 +110,13 @@ def strongest(gaussians: Gaussians) -> Gaussians:
 
 def raise_for_status(status: int, pose: Pose) -> None:
     """Raise for a plan's status: UNSOUND_POSE, EQUAL_IDS, 4 * Gaussian + parameter, or -1 if valid."""
+    if status < 0:
+        return
     if status == built.kernels().UNSOUND_POSE:
         raise_for_pose(pose)
     if status == built.kernels().EQUAL_IDS:
         raise_for_ids()
-    if status >= 0:
-        raise_for(Gaussians._fields[status % 4], status // 4)
+    raise_for(Gaussians._fields[status % 4], status // 4)
 
 
 def raise_for(name: str, index: int) -> None:
@@ -168,6 +178,10 @@ def poses(pose: Pose, means: Tensor) -> Pose:
     for name, part in vars(pose).items():
         if part.dtype not in (torch.float32, torch.float64):
             raise TypeError(f"a pose needs float32 or float64, got a {name} in {part.dtype}; convert it")
+    ends = (pose.position, pose.rotation)
+    fits = all(t.dtype == means.dtype and t.device == means.device for t in ends) and pose.batched
+    if fits and not transforming() and not any(t.requires_grad or not t.is_contiguous() for t in ends):
+        return pose  # as most often: what follows takes longer than planning a hundred Gaussians
     position = pose.position.detach().to(means).reshape(-1, 3).contiguous()
     rotation = pose.rotation.detach().to(means).reshape(-1, 3, 3).contiguous()
     return Pose(position, rotation)

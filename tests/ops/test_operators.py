@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 import torch
+import torch.utils.flop_counter
 from rasters import poses, random_scene
+from torch._subclasses import FakeTensorMode
 from torch.library import opcheck
 
 from gsparc.ops import (
@@ -120,3 +122,40 @@ def test_arguments_of_an_operator_have_names():
     settings = kernel_settings(GRID, Optics(projection="equirect"))
     again = operators._unpacked((operators.packed(settings),))
     assert again == settings and list(map(type, again)) == list(map(type, settings))
+
+
+def test_a_call_past_the_dispatcher_is_the_same_and_never_hides_anything():
+    """Only what torch would pass on goes straight to the kernel: no gradient, mode or trace is missed."""
+    scene, pose = random_scene(n=9), poses(0)
+    model = [t.clone().requires_grad_() for t in (scene.means, scene.quats, scene.scales, scene.opacities)]
+    assert not operators.unwatched(model)
+    with torch.no_grad():
+        assert operators.unwatched(model)
+        with torch.utils.flop_counter.FlopCounterMode(display=False):
+            assert not operators.unwatched(model)
+        with torch.autograd.forward_ad.dual_level():
+            assert not operators.unwatched(model)
+        with FakeTensorMode() as fake:
+            assert not operators.unwatched([fake.from_tensor(model[0])])
+        plan = make_plan(*model, pose, GRID)
+        straight = composite(plan, *model, scene.features).image
+    recorded = composite(plan, *model, scene.features).image
+    assert recorded.requires_grad and torch.equal(straight, recorded)
+
+
+def test_the_page_shows_every_operator_where_it_is_computed_and_tested():
+    for module in ("native", "cuda", "channels", "networks", "similarity"):
+        importlib.import_module(f"gsparc.ops.{module}")
+    page = (ROOT / "docs" / "reference" / "rasterizer.md").read_text(encoding="utf-8")
+    rows = [
+        [cell.strip(" `") for cell in line.split("|")[1:-1]]
+        for line in page.splitlines()
+        if line[:3] == "| `"
+    ]
+    shown = {name: (*found, tested) for name, _, *found, tested in rows}
+    assert shown.keys() == operators.KERNELS["cpu"].keys()
+    for name, (*found, tested) in shown.items():
+        served = [operators.KERNELS[device].get(name) for device in ("cpu", "cuda")]
+        wanted = [f and f"{f.__module__.split('.')[-1]}.{f.__name__}" for f in served]
+        assert found == [function or "PyTorch" for function in wanted], name
+        assert name in (ROOT / tested).read_text(encoding="utf-8")

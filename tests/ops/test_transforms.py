@@ -10,6 +10,7 @@ from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from gsparc.ops import Cutoff, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
 from gsparc.ops.channels import channels
+from gsparc.ops.geometry import Gaussians
 from gsparc.ops.networks import networks
 from gsparc.ops.operators import composite_op, view_of
 from gsparc.training.losses import ssim
@@ -248,7 +249,7 @@ def test_an_operator_by_itself_and_a_frozen_view_refuse():
     with forward_ad.dual_level():
         features = forward_ad.make_dual(model[4], torch.ones_like(model[4]))
         with pytest.raises(RuntimeError, match="gsparc::composite has no forward-mode derivative"):
-            composite_op(plan.means2d, *model[:4], None, features[None], *view_of(plan))
+            composite_op.of(plan.means2d, Gaussians(*model[:4], None), features[None], *view_of(plan))
         with pytest.raises(RuntimeError, match="a frozen view has no derivatives"):
             view.render(features, 0)
         assert forward_ad.unpack_dual(composite(plan, *model[:4], features).image).tangent.abs().max() > 0
