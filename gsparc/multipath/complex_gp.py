@@ -107,7 +107,7 @@ class ComplexGP(PredictsVariance):
     def _fit_many(self, data: Measurements, known: np.ndarray) -> tuple[str, ...]:
         """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours."""
         assert self.site is not None and self.site.wavelength is not None
-        self.targets = np.empty((len(known), int(np.prod(self.shape))), np.complex64)
+        self.targets = empty((len(known), int(np.prod(self.shape))), np.complex64)
         for start in range(0, len(known), MOST_ROWS):  # a block at a time: they may be on disk
             part = known[start : start + MOST_ROWS]
             self.targets[start : start + MOST_ROWS] = data.target[part].reshape(len(part), -1)
