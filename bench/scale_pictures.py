@@ -23,9 +23,10 @@ PANELS = {
         ("rmse", "rmse of a pixel, bars of two standard errors"),
     ),
 }  # fmt: skip
-AXES = {
-    "antennas": "antennas (16 tones)", "tones": "tones (4 antennas)",
-    "stations": "stations, learned together", "gaussians": "rendered Gaussians",
+AXES = {  # what the seconds are of, and the amount
+    "antennas": ("a fit", "antennas (16 tones)"), "tones": ("a fit", "tones (4 antennas)"),
+    "stations": ("a fit", "stations, learned together"), "gaussians": ("a step", "rendered Gaussians"),
+    "receivers": ("a simulation", "receivers"), "processes": ("a step, first process", "processes"),
 }  # fmt: skip
 Line = dict[str, str]
 
@@ -56,13 +57,17 @@ def draw(tables: Path, pictures: Path) -> None:
             save(figure, pictures / f"scale-{source}.png")
     lines = _read(tables / "axes.csv")
     if lines:
-        figure, places = panels(9.0, 6.4, 2, 2)
-        for place, (axis, title) in zip(places.flat, AXES.items(), strict=True):
-            _curves(place, [one for one in lines if one["axis"] == axis], "fit_cpu_s", "amount", 0)
-            place.set_title("processor seconds of a " + ("step" if axis == "gaussians" else "fit"))
-            place.set_xlabel(title)
+        figure, places = panels(11.0, 6.4, 2, 3)
+        for place, (axis, (what, amount)) in zip(places.flat, AXES.items(), strict=True):
+            own = [one for one in lines if one["axis"] == axis]
+            _curves(place, own, "fit_cpu_s", "amount", 0)
+            place.set_title(f"processor seconds of {what}")
+            place.set_xlabel(amount)
             place.set_yscale("log")
             logarithmic(place, fine=False)
+            counts = sorted({int(one["amount"]) for one in own})
+            place.set_xticks(counts, [f"{count:,}" for count in counts])
+            place.set_xticks([], minor=True)
             place.legend()
         save(figure, pictures / "scale-axes.png")
 
