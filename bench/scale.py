@@ -8,7 +8,8 @@ python bench/scale.py axes antennas 4 16 64 >> docs/results/scale/axes.csv    # 
 python bench/scale.py draw docs/results/scale docs/images
 
 Methods may be named behind the numbers. Each is fitted in a process of its own. Seconds are of the processor,
-of the wall, which say little on a machine that others use: its load stands beside them.
+user and system, beside those of the wall, which say little on a machine that others use: its load stands
+beside them.
 """
 
 from __future__ import annotations
