@@ -1,7 +1,8 @@
-"""Seconds of a training step shared by processes: `python bench/processes.py [ROUNDS] [STEPS] [BATCH]`.
+"""Seconds of a training step shared by processes: `python bench/processes.py ddp [ROUNDS] [STEPS] [BATCH]`.
 
-Spectra of 90 x 360, 1,000 Gaussians, one and two processes in turns. Processor seconds are of the first
-process's own thread: a step on idle cores but for waiting, which other work on the machine cannot inflate.
+Spectra of 90 x 360, 1,000 Gaussians, in turns: one process of one thread, one of two, two of one thread each.
+Processor seconds are of the first process's own thread: a step on idle cores but for waiting, which other
+work on the machine cannot inflate.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import statistics
 import sys
 import tempfile
 import time
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,8 +40,32 @@ from gsparc.training.optimizer import OptimizerSettings
 
 log = logging.getLogger(__name__)
 
-ROWS, GAUSSIANS, COUNTS, WARM = 128, 1000, (1, 2), 2
+ROWS, GAUSSIANS, WARM = 128, 1000, 2
 STILL = [4.0, 0.0, 0.0]
+
+
+@dataclass(frozen=True)
+class Work:
+    """What is trained: `steps` of `batch` rows of `data`, by a field of `gaussians`."""
+
+    data: Measurements
+    steps: int
+    batch: int
+    gaussians: int = GAUSSIANS
+
+
+@dataclass(frozen=True)
+class Shared:
+    """By how many processes, and threads of all of them."""
+
+    processes: int
+    threads: int
+
+    def __str__(self) -> str:
+        return f"processes {self.processes}, threads of each {self.threads // self.processes}"
+
+
+TURNS = (Shared(1, 1), Shared(1, 2), Shared(2, 2))
 
 
 class Stopwatch(L.Callback):
@@ -73,16 +99,19 @@ def invented() -> Measurements:
     return Measurements(site, moving, still, turned, target)
 
 
-def seconds(data: Measurements, processes: int, steps: int, batch: int, folder: Path) -> tuple[float, float]:
-    """Wall and processor seconds of a step in so many processes of one thread each."""
+def seconds(work: Work, shared: Shared, folder: Path) -> tuple[float, float]:
+    """Wall and processor seconds of a step; the latter of the first process's first thread."""
+    data, steps, batch = work.data, work.steps, work.batch
     torch.manual_seed(0)
-    torch.set_num_threads(processes)  # divided among them
+    torch.set_num_threads(shared.threads)  # divided among processes
     emission = EmissionSettings(EncodingSettings("raw"), hidden=8, activation="linear", init_bias=0.0)
-    settings = ModelSettings(field=FieldSettings(count=GAUSSIANS, placement="uniform"), emission=emission)
+    settings = ModelSettings(
+        field=FieldSettings(count=work.gaussians, placement="uniform"), emission=emission
+    )
     model = GaussianModel(settings, data.site, Pose.identity(torch.tensor(STILL)))
     module = GaussianModule(model, LossSettings(), OptimizerSettings(), steps, folder)
-    strategy = "ddp_fork" if processes > 1 else "auto"
-    trainer = partial(DEFAULTS, max_steps=steps, devices=processes, strategy=strategy)
+    strategy = "ddp_fork" if shared.processes > 1 else "auto"
+    trainer = partial(DEFAULTS, max_steps=steps, devices=shared.processes, strategy=strategy)
     file, shown = folder / "seconds.json", Loaded(data, batch)
     context = FitContext(
         folder, batch_size=batch, datamodule=shown, trainer=trainer, callbacks=lambda: [Stopwatch(file)]
@@ -95,23 +124,30 @@ def seconds(data: Measurements, processes: int, steps: int, batch: int, folder: 
     return wall, processor
 
 
-def main() -> None:
-    """Rounds in turns; medians and ratios in the log."""
-    given = [int(word) for word in sys.argv[1:]]
-    rounds, steps, batch = [*given, *(5, 22, 16)[len(given) :]]
+def main(kind: str = "ddp", *given: str) -> None:
+    """Rounds in turns; medians and speed-ups over one process of one thread in the log.
+
+    Raises:
+        ValueError: another kind.
+    """
+    if kind != "ddp":
+        raise ValueError(f"{kind}: expected ddp")
+    rounds, steps, batch = [*map(int, given), *(5, 42, 64)[len(given) :]]
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    data = invented()
-    found: dict[int, list[tuple[float, float]]] = {count: [] for count in COUNTS}
+    work = Work(invented(), steps, batch)
+    found: dict[Shared, list[tuple[float, float]]] = {shared: [] for shared in TURNS}
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(rounds):
-            for count in COUNTS:
-                found[count].append(seconds(data, count, steps, batch, Path(folder)))
-    for place, clock in enumerate(("wall", "processor, first process")):
-        ms = {n: 1e3 * statistics.median(pair[place] for pair in pairs) for n, pairs in found.items()}
-        log.info("%s: one %.1f ms a step, two %.1f ms, ratio %.2f", clock, ms[1], ms[2], ms[1] / ms[2])
+            for shared in TURNS:
+                found[shared].append(seconds(work, shared, Path(folder)))
+    for place, clock in enumerate(("wall", "processor, first thread of the first process")):
+        ms = {s: 1e3 * statistics.median(pair[place] for pair in pairs) for s, pairs in found.items()}
+        for shared in TURNS:
+            ratio = ms[TURNS[0]] / ms[shared]
+            log.info("%s: %s: %.1f ms a step, speed-up %.2f", clock, shared, ms[shared], ratio)
     load = os.getloadavg()[0]
     log.info("batches of %d, load %.1f on %d cores, %d rounds", batch, load, os.cpu_count(), rounds)
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

@@ -1,12 +1,15 @@
-"""Seconds, memory and errors against the number of rows.
+"""Seconds, memory and errors against the number of rows, and of what else a site has many.
 
 python bench/scale.py powers town 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
 python bench/scale.py powers city 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
 python bench/scale.py channels hall.h5 10000 100000 >> docs/results/scale/channels.csv
+python bench/scale.py spectra FOLDER 6000 12000 25000 50000 >> docs/results/scale/spectra.csv
+python bench/scale.py axes antennas 4 16 64 >> docs/results/scale/axes.csv    # tones, stations, ...
 python bench/scale.py draw docs/results/scale docs/images
 
-Every method is fitted in a process of its own. Seconds are of the processor, user and system, beside those
-of the wall, which say little on a machine that others use: its load stands beside them.
+Methods may be named behind the numbers. Each is fitted in a process of its own. Seconds are of the processor,
+user and system, beside those of the wall, which say little on a machine that others use: its load stands
+beside them.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import csv
 import os
 import resource
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -24,13 +28,17 @@ from typing import Any
 import numpy as np
 from town import TESTED, city, hall, town
 
+from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.own import load_own
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.methods.method import FitContext, Method
+from gsparc.methods.per_station import for_links
+from gsparc.simulate.rfid_sim import write_rfid_sim
 
 POWERS = ("mean", "distance_law", "idw", "kriging", "gp", "gsparc")
 CHANNELS = ("mean", "nearest", "complex_gp")
+SPECTRA = ("mean", "idw", "gp", "gsparc")
 SINGLE = 40  # queries asked one by one, for the time of one
 HEAD = (
     "source", "method", "label", "rows", "fit_cpu_s", "fit_wall_s", "query_cpu_ms", "rmse", "rmse_error",
@@ -67,12 +75,21 @@ def peak_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-def measured(source: str, name: str, data: Measurements, fold: Fold, error: Callable[..., Any]) -> None:
-    """A line of one method."""
-    held, private, method = peak_gb(), Private(), make(name)
-    cpu, wall = time.process_time(), time.perf_counter()
-    method.fit(data, fold, FitContext())
-    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+def measured(
+    source: str,
+    name: str,
+    data: Measurements,
+    fold: Fold,
+    error: Callable[..., Any],
+    amount: int | None = None,
+) -> None:
+    """A line of one method; `amount` stands in place of the number of rows."""
+    held, private, method = peak_gb(), Private(), for_links(lambda: make(name), data)
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ["XDG_CACHE_HOME"] = folder  # nothing that an earlier fit found is found again
+        cpu, wall = time.process_time(), time.perf_counter()
+        method.fit(data, fold, FitContext(Path(folder), stations="together"))
+        cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
     missed = []
     for part in np.array_split(fold.test, -(-len(fold.test) // 256)):
         batch = data.batch(part)
@@ -86,25 +103,31 @@ def measured(source: str, name: str, data: Measurements, fold: Fold, error: Call
     query = (time.process_time() - began) / SINGLE * 1e3
     spread = squared.std() / (2 * rmse * np.sqrt(len(squared)))
     values = (cpu, wall, query, rmse, spread, held, peak_gb(), private.most, os.getloadavg()[0])
-    count = len(fold.train) + len(fold.val)
+    count = len(fold.train) + len(fold.val) if amount is None else amount
     csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
     sys.stdout.flush()
 
 
 def each(
-    source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any]
-) -> None:
+    source: str, methods: Sequence[str], data: Measurements, fold: Fold, error: Callable[..., Any],
+    amount: int | None = None,
+) -> None:  # fmt: skip
     """A line of every method, each fitted in a child that the measurements are shared with."""
     for name in methods:
         make(name)  # imports it, so that no child does
     for name in methods:
-        child = os.fork()
-        if child == 0:
-            try:
-                measured(source, name, data, fold, error)
-            finally:
-                os._exit(0)
-        os.waitpid(child, 0)
+        aside(lambda name=name: measured(source, name, data, fold, error, amount))
+
+
+def aside(work: Callable[[], Any]) -> None:
+    """Do something in a child, whose memory is then no longer held."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
 
 
 def decibels(found: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -143,12 +166,40 @@ def channels(path: Path, counts: Sequence[int], methods: Sequence[str] = CHANNEL
         path.unlink()
 
 
+def squares(found: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Mean squared errors (B,) of spectra."""
+    return ((found - target) ** 2).mean((1, 2))
+
+
+def spectra(folder: Path, counts: Sequence[int], methods: Sequence[str] = SPECTRA) -> None:
+    """Lines of spectra in the RFID release's layout, all of one folder, a tenth of them for validation."""
+    whole = max(counts) + TESTED
+    if not folder.is_dir():
+        aside(lambda: write_rfid_sim(folder, whole, 0))
+    private, began = Private(), time.process_time()
+    data = load_rfid(folder)
+    spent = time.process_time() - began
+    sys.stderr.write(f"{len(data)} spectra read in {spent:.1f} s, {private.most:.2f} GB private\n")
+    for count in counts:
+        rows = np.random.default_rng(count).permutation(whole - TESTED)[:count]
+        fold = Fold(np.sort(rows[count // 10 :]), np.sort(rows[: count // 10]), np.arange(whole)[-TESTED::4])
+        each("spectra", methods, data, fold, squares)
+
+
 def main(kind: str, *rest: str) -> None:
     """See the head of this file."""
+    counts = [int(word) for word in rest[1:] if word.isdigit()]
+    methods = [word for word in rest[1:] if not word.isdigit()]
     if kind == "powers":
-        powers(rest[0], [int(count) for count in rest[1:]])
+        powers(rest[0], counts, methods or POWERS)
     elif kind == "channels":
-        channels(Path(rest[0]), [int(count) for count in rest[1:]])
+        channels(Path(rest[0]), counts, methods or CHANNELS)
+    elif kind == "spectra":
+        spectra(Path(rest[0]), counts, methods or SPECTRA)
+    elif kind == "axes":
+        from scale_axes import axes
+
+        axes(rest[0], counts)
     elif kind == "head":
         csv.writer(sys.stdout).writerow(HEAD)
     else:

@@ -18,6 +18,7 @@ SCALES = ((6.0, 250.0), (3.0, 40.0), (1.5, 8.0))  # deviation [dB] and wavelengt
 WAVES = 60  # of each
 NOISE_DB = 1.0
 STATION = (1_400.0, 1_600.0, 25.0)
+HEIGHT_M = 1.5  # of what moves
 TESTED = 2_000
 SCATTERERS = 10
 CITY = Path(__file__).parents[2] / "shared" / "data" / "real" / "powder-rss-462mhz.npz"
@@ -31,21 +32,40 @@ def town(count: int, seed: int = 0) -> Measurements:
         count: rows.
         seed: of places and noise.
     """
-    shadows, rng = np.random.default_rng(1), np.random.default_rng([seed, count])
+    rng = np.random.default_rng([seed, count])
     drawn = [np.random.default_rng(2).uniform(0, SIDE_M, (TESTED, 2)), rng.uniform(0, SIDE_M, (count, 2))]
     places = np.concatenate(drawn[::-1])
-    distance = np.hypot(np.linalg.norm(places - STATION[:2], axis=1), STATION[2] - 1.5)
+    decibels = shadowed(places, np.array(STATION), np.random.default_rng(1))
+    decibels += NOISE_DB * rng.standard_normal(len(places))
+    arrays = {
+        "rx_position": np.c_[places, np.full(len(places), HEIGHT_M)], "tx_position": np.array(STATION),
+        "rssi_db": decibels,
+    }  # fmt: skip
+    return from_arrays(arrays, {"name": "town"})
+
+
+def stations(count: int, rows: int, seed: int = 0) -> Measurements:
+    """Powers of so many stations of the town at the same `rows` places; the last tenth is for the test."""
+    rng = np.random.default_rng([seed, count])
+    places, masts = (rng.uniform(0, SIDE_M, (number, 2)) for number in (rows, count))
+    masts = np.c_[masts, np.full(count, STATION[2])]
+    heard = [shadowed(places, mast, np.random.default_rng([1, t])) for t, mast in enumerate(masts)]
+    arrays = {
+        "rx_position": np.c_[places, np.full(rows, HEIGHT_M)], "station_position": masts,
+        "rssi_db": np.stack(heard, 1) + NOISE_DB * rng.standard_normal((rows, count)),
+    }  # fmt: skip
+    return from_arrays(arrays, {"name": "town"})
+
+
+def shadowed(places: np.ndarray, station: np.ndarray, shadows: np.random.Generator) -> np.ndarray:
+    """Powers (n,) [dB] without noise at places (n, 2) [m]: a distance law and shadowing."""
+    distance = np.hypot(np.linalg.norm(places - station[:2], axis=1), station[2] - HEIGHT_M)
     decibels = -20 - 35 * np.log10(distance)
     for deviation, length in SCALES:
         waves, phase = shadows.normal(size=(WAVES, 2)) / length, shadows.uniform(0, 2 * np.pi, WAVES)
         for wave, turn in zip(waves, phase, strict=True):  # one at a time: a million rows stay in memory
             decibels += deviation * np.sqrt(2 / WAVES) * np.cos(places @ wave + turn)
-    decibels += NOISE_DB * rng.standard_normal(len(places))
-    arrays = {
-        "rx_position": np.c_[places, np.full(len(places), 1.5)], "tx_position": np.array(STATION),
-        "rssi_db": decibels,
-    }  # fmt: skip
-    return from_arrays(arrays, {"name": "town"})
+    return decibels
 
 
 def city(count: int, seed: int = 0) -> Measurements:

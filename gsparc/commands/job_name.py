@@ -17,12 +17,14 @@ DIGEST = 8  # characters
 def job_name(overrides: Sequence[str], unnamed: Sequence[str] = ()) -> str:
     """`model.field.count-40_seed-0`; where that is too long, last words of keys and a digest of the whole.
 
+    A path among the values makes no folders within the folder.
+
     Args:
         overrides: of one job, as `key=value`.
         unnamed: keys that are left out.
     """
     split = [one.partition("=") for one in sorted(overrides)]
-    pairs = [(key, value) for key, _, value in split if key not in unnamed]
+    pairs = [(key, value.replace("/", "+")) for key, _, value in split if key not in unnamed]
     whole = "_".join(f"{key}-{value}" for key, value in pairs)
     if len(whole.encode()) <= MOST:
         return whole

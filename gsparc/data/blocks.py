@@ -6,7 +6,8 @@ import math
 import os
 import tempfile
 from collections.abc import Iterator
-from typing import Any
+from multiprocessing import context, reduction
+from typing import IO, Any
 
 import h5py
 import numpy as np
@@ -36,24 +37,73 @@ def contents(array: np.ndarray) -> Iterator[bytes]:
         yield np.ascontiguousarray(array[part]).tobytes()
 
 
-def scratch(shape: tuple[int, ...], dtype: Any) -> np.memmap:
+class OnDisk(np.memmap):
+    """An array in a file. A process that is started with it opens the file, instead of getting a copy.
+
+    Attributes:
+        file: what it maps, kept open; parts of the array have none, and are copied.
+    """
+
+    file: IO[bytes] | None = None
+
+    @classmethod
+    def of(cls, file: IO[bytes], dtype: Any, mode: Any, shape: tuple[int, ...], offset: int = 0) -> OnDisk:
+        """What lies in an open file from `offset` on [bytes]."""
+        array = cls(file, dtype, mode, offset, shape)
+        array.file = file
+        return array
+
+    def __reduce__(self) -> Any:
+        """For a process that is being started: a duplicate of the open file, which may have no name."""
+        if self.file is None or context.get_spawning_popen() is None:
+            return super().__reduce__()
+        own = reduction.DupFd(self.file.fileno())
+        return _opened, (own, self.dtype, self.shape, self.offset)
+
+
+def _opened(handle: Any, dtype: Any, shape: tuple[int, ...], offset: int) -> OnDisk:
+    return OnDisk.of(os.fdopen(handle.detach(), "rb"), dtype, "r", shape, offset)
+
+
+def scratch(shape: tuple[int, ...], dtype: Any) -> OnDisk:
     """An array of zeros in a file without a name (in TMPDIR), which is gone when the array is.
 
     Raises:
         OSError: no room.
     """
-    with tempfile.TemporaryFile(prefix="gsparc-") as file:
-        size = math.prod(shape) * np.dtype(dtype).itemsize
-        if size and hasattr(os, "posix_fallocate"):  # a full disk would end the process at the first write
-            os.posix_fallocate(file.fileno(), 0, size)
-        return np.memmap(file, dtype=dtype, mode="w+", shape=shape)
+    file = tempfile.TemporaryFile(prefix="gsparc-")  # noqa: SIM115 (the array keeps it)
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    if size and hasattr(os, "posix_fallocate"):  # a full disk would end the process at the first write
+        os.posix_fallocate(file.fileno(), 0, size)
+    return OnDisk.of(file, dtype, "w+", shape)
 
 
-def on_disk(dataset: h5py.Dataset) -> np.ndarray:
+def empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+    """An array to be filled, on disk where it is large.
+
+    Raises:
+        OSError: no room.
+    """
+    large = math.prod(shape) * np.dtype(dtype).itemsize >= BIG
+    return scratch(shape, dtype) if large else np.empty(shape, dtype)
+
+
+def taken(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows (n,) of an array, on disk where they are many and lie there already."""
+    if not isinstance(array, np.memmap) or len(rows) * array[:1].nbytes < BIG:
+        return array[rows]
+    copy = scratch((len(rows), *array.shape[1:]), array.dtype)
+    for part in blocks(copy):
+        copy[part] = array[rows[part]]
+    return copy
+
+
+def on_disk(dataset: h5py.Dataset) -> OnDisk:
     """A dataset's values where they are, or, stored in chunks, copied beside them block by block."""
     offset = dataset.id.get_offset()
     if offset is not None and dataset.dtype.isnative:
-        return np.memmap(dataset.file.filename, dataset.dtype, "r", offset, dataset.shape)
+        file = open(dataset.file.filename, "rb")  # noqa: SIM115 (the array keeps it)
+        return OnDisk.of(file, dataset.dtype, "r", dataset.shape, offset)
     copy = scratch(dataset.shape, dataset.dtype)
     for part in blocks(dataset):
         copy[part] = dataset[part]

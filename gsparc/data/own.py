@@ -198,7 +198,7 @@ def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
         return None, kind
     if kind == "csi" and array.size:
         array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
-    if is_big(array) and kind == "csi" and "mask" not in check.raw.arrays:
+    if is_big(array) and kind != "rssi" and len(array) > 1 and "mask" not in check.raw.arrays:
         return array, kind  # its blocks are cast where they are read
     if (
         kind == "rssi" or array.dtype.kind in "fc"
@@ -241,12 +241,21 @@ def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | 
             check.refuse_rows(name, ~_finite(values), unmarked)
         else:
             check.refuse_rows(name, ~np.isfinite(np.abs(values)) & measured, unmarked)
-    if name == "csi":
+    if name == "csi" or values.dtype.kind == "u":
         return
     with np.errstate(invalid="ignore"):
-        bad = np.abs(values) > 400 if name == "rssi_db" else values < 0
+        if name == "rssi_db":
+            bad = np.abs(values) > 400
+        else:
+            bad = values < 0 if mask is not None else _negative(values)
     wanted = "dB between -400 and 400" if name == "rssi_db" else "linear power, at least 0 (is it in dB?)"
-    check.refuse_rows(name, bad & measured, f"out of range; expected {wanted}")
+    check.refuse_rows(name, bad if mask is None else bad & mask, f"out of range; expected {wanted}")
+
+
+def _negative(values: np.ndarray) -> np.ndarray:
+    """Rows (S,) of `values` (S, ...) with an entry below 0."""
+    rows = (values[part].reshape(len(values[part]), -1) for part in blocks(values))
+    return np.concatenate([(part < 0).any(1) for part in rows])
 
 
 def _finite(values: np.ndarray) -> np.ndarray:
@@ -329,14 +338,14 @@ def _scaled(
     if scale <= 0:
         return values, 0.0
     lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
-    if mask_or_level is None and name == "csi" and is_big(values):
-        target = scratch(values.shape, np.complex64)
-        with np.errstate(over="ignore"):
-            for part in blocks(values):
-                target[part] = values[part].astype(np.complex128) * lift / (scale * lift)
-        return target, scale
+    stored, exact = (np.complex64, np.complex128) if name == "csi" else (np.float32, np.float64)
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
-        return (values * lift / (scale * lift)).astype(np.complex64 if name == "csi" else np.float32), scale
+        if mask_or_level is not None or name == "rssi_db" or not is_big(values):
+            return (values * lift / (scale * lift)).astype(stored), scale
+        target = scratch(values.shape, stored)
+        for part in blocks(values):
+            target[part] = values[part].astype(exact) * lift / (scale * lift)
+        return target, scale
 
 
 __all__ = ["DataError", "Reading", "from_arrays", "interpret", "load_own", "write_own"]

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.blocks import taken
 from gsparc.ops import Pose, SphereGrid
 
 if TYPE_CHECKING:
@@ -214,7 +215,7 @@ class Batch:
 
 @dataclass(frozen=True)
 class Measurements:
-    """A whole dataset in memory; the arrays keep the precision and type they were stored in.
+    """A whole dataset, in memory but for large targets; arrays keep their stored precision and type.
 
     Attributes:
         site: the fixed facts.
@@ -278,7 +279,7 @@ class Measurements:
                 if value is None
                 else [value[i] for i in rows]
                 if isinstance(value, list)
-                else value[rows]
+                else taken(value, rows)
             )
 
         whole = ("site", "provenance", "release_split")

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.blocks import taken
 from gsparc.data.errors import DataError
 from gsparc.data.fields import MEASUREMENTS
 from gsparc.data.instantiate import suggest
@@ -209,7 +210,7 @@ def take_rows(raw: Raw, rows: np.ndarray, source: str | Path) -> Raw:
     raw = replace(raw, arrays={"row_name": numbered_rows(count), **raw.arrays})  # numbers stay the file's
     arrays = {}
     for name, array in raw.arrays.items():
-        arrays[name] = array[rows] if _per_row(name, array, count, stations, source) else array
+        arrays[name] = taken(array, rows) if _per_row(name, array, count, stations, source) else array
     if "path_offsets" in arrays:
         arrays |= _paths(raw, rows, count, source)
     for name in SPLIT:

@@ -32,6 +32,7 @@ SIDE = 2048  # pixels of an image looked at for it
 WHOLE = 3_000  # places whose system is factored as one: that costs their number cubed
 NEAREST = 100  # places that a query is kriged from, of more than these
 BLOCK = 256  # queries whose systems are solved at a time: memory
+BYTES = 2**27  # of measured rows beside them
 JITTER = 1e-9  # of the variance, only so that a system without nugget can be solved
 
 
@@ -163,9 +164,13 @@ class Kriging(Interpolator, PredictsVariance):
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
+    def _block(self) -> int:
+        """Queries answered at a time, of more."""
+        return max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))
+
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        if self.tree is not None and len(queries) > BLOCK:
-            return _joined([self._look_up(queries[i : i + BLOCK]) for i in range(0, len(queries), BLOCK)])
+        if self.tree is not None and len(queries) > (block := self._block()):
+            return _joined([self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)])
         place, weights, left = self._weights(queries)
         shares = torch.from_numpy(weights)
 

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.blocks import taken
 from gsparc.data.schema import Kind, Measurements
 
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
@@ -16,12 +17,12 @@ TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Targets of `rows` in stored type and units; unmeasured entries get the mean over the other rows.
 
-    Rows where nothing was heard (`data.censored`) keep their level.
+    Many large ones of a file stay on disk. Rows where nothing was heard (`data.censored`) keep their level.
 
     Returns:
         (n, ...) like `data.target`; an entry measured in no row is 0.
     """
-    target = data.target[rows]
+    target = taken(data.target, rows)
     if data.mask is None or data.mask[rows].all():
         return target
     measured = data.mask[rows]

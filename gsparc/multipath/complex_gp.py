@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.blocks import taken
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.covering import covering
@@ -107,10 +108,7 @@ class ComplexGP(PredictsVariance):
     def _fit_many(self, data: Measurements, known: np.ndarray) -> tuple[str, ...]:
         """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours."""
         assert self.site is not None and self.site.wavelength is not None
-        self.targets = np.empty((len(known), int(np.prod(self.shape))), np.complex64)
-        for start in range(0, len(known), MOST_ROWS):  # a block at a time: they may be on disk
-            part = known[start : start + MOST_ROWS]
-            self.targets[start : start + MOST_ROWS] = data.target[part].reshape(len(part), -1)
+        self.targets = taken(data.target, known).reshape(len(known), -1)
         near = self.near = Neighbourhood.of(self.places.numpy(), 0)
         row = covering(near.places, TRIED_ON, 0)
         others, _ = near.nearest(near.places[row], row, NEAREST)

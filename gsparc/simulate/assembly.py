@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.data.blocks import blocks, empty
 from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.engine import Engine
-from gsparc.simulate.paths import ARRAYS, Paths, join
+from gsparc.simulate.paths import ARRAYS, Paths, starts
 from gsparc.simulate.settings import Campaign
-from gsparc.simulate.shards import Shards
+from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import spectra
 from gsparc.simulate.survey import Survey
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
-ROWS = "rows"  # and which rows of the survey it holds
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,8 @@ def assemble(
 ) -> Assembled:
     """Put the shards, all of them there, together, write the file, drop the shards.
 
+    One shard is in memory at a time; what is large is put together on disk.
+
     Args:
         campaign, survey, effects, choice, convergence: what the file is of.
         seconds: spent on anything but the shards, which know their own; both are the file's `simulate_s` [s].
@@ -83,12 +85,8 @@ def assemble(
     Raises:
         ValueError: nothing reaches any receiver.
     """
-    parts = [shards.get(n) for n in shards.numbers()]
-    seconds += sum(float(p.pop(SECONDS)) for p in parts)
-    at = np.argsort(np.concatenate([p.pop(ROWS) for p in parts]))
-    paths = join([Paths(*(p.pop(name) for name in ("offsets", *ARRAYS))) for p in parts]).take(at)
-    whole = {name: np.concatenate([p[name] for p in parts])[at] for name in parts[0]}
-    del parts
+    seconds += sum(float(shards.get(n, SECONDS)[SECONDS]) for n in shards.numbers())
+    whole, paths = _together(shards, len(survey))
     engine = survey.engine
     power = whole["received_power"]
     reached = power > 0
@@ -122,13 +120,34 @@ def assemble(
 Arrays = Mapping[str, np.ndarray]
 
 
+def _together(shards: Shards, rows: int) -> tuple[dict[str, np.ndarray], Paths]:
+    """What the shards hold of all rows, in their order."""
+    counts = np.zeros(rows, dtype=np.int64)
+    for number in shards.numbers():
+        part = shards.get(number, ROWS, "offsets")
+        counts[part[ROWS]] = np.diff(part["offsets"])
+    offsets = starts(counts)
+    whole: dict[str, np.ndarray] = {}
+    for number in shards.numbers():
+        part = shards.get(number)
+        own, mine, _ = part.pop(ROWS), part.pop("offsets"), part.pop(SECONDS)
+        place = np.repeat(offsets[own] - mine[:-1], np.diff(mine)) + np.arange(mine[-1])  # of its paths
+        for name, values in part.items():
+            at, length = (place, offsets[-1]) if name in ARRAYS else (own, rows)
+            if name not in whole:
+                whole[name] = empty((int(length), *values.shape[1:]), values.dtype)
+            whole[name][at] = values
+    return whole, Paths(offsets, *(whole.pop(name) for name in ARRAYS))
+
+
 def _arrays(
     campaign: Campaign, survey: Survey, effects: Effects, whole: Arrays, paths: Paths
 ) -> dict[str, np.ndarray]:
     scene, wavelength = campaign.scene, survey.engine.wavelength
     spectrum, peak, csi = whole["spectrum"], whole["spectrum_peak"], whole["csi"]
     if campaign.spectrum.normalisation == "none":
-        spectrum = np.round(spectrum * (peak / peak.max())[:, None, None]).astype(np.uint8)
+        for part in blocks(spectrum):
+            spectrum[part] = np.round(spectrum[part] * (peak[part] / peak.max())[:, None, None])
     order = np.random.default_rng(scene.seed).permutation(len(survey.places))
     tests = max(1, round(scene.test_share * len(order)))
     each = np.arange(len(survey.engines))[:, None] * len(order)  # a place is held out with all transmitters
@@ -146,11 +165,16 @@ def _arrays(
         "split_test": np.sort((order[:tests] + each).ravel()),
     }
     if effects.noise_snr_db is not None:
-        variance = float(np.mean(np.abs(csi) ** 2) / 10 ** (effects.noise_snr_db / 10))
+        power = sum(float((np.abs(csi[part]) ** 2).sum()) for part in blocks(csi)) / csi.size
+        variance = power / 10 ** (effects.noise_snr_db / 10)
         rng = np.random.default_rng(scene.seed + 1)
-        csi = csi + np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))
+        for component in (csi.real, csi.imag):  # all of the one, then all of the other
+            for part in blocks(csi):
+                component[part] += np.sqrt(variance / 2) * rng.normal(size=csi[part].shape)
         arrays["csi_noise_variance"] = np.array(variance)
-    arrays["csi"] = csi.astype(np.complex64)
+    arrays["csi"] = empty(csi.shape, np.complex64)
+    for part in blocks(csi):
+        arrays["csi"][part] = csi[part]
     if campaign.spectrum.kind == "bartlett":
         arrays["spectrum_array_position"] = campaign.spectrum.elements(wavelength)
     if csi.shape[1] > 1:

@@ -12,14 +12,14 @@ import numpy as np
 
 from gsparc.data.claims import each_once
 from gsparc.simulate import deciding
-from gsparc.simulate.assembly import ROWS, SECONDS, Assembled, assemble, shard_arrays
+from gsparc.simulate.assembly import SECONDS, Assembled, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings, Choice
 from gsparc.simulate.convergence import Convergence, compare
 from gsparc.simulate.deciding import Changed, Decision
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.scenes.build import build
 from gsparc.simulate.settings import Campaign
-from gsparc.simulate.shards import Shards, written_by
+from gsparc.simulate.shards import ROWS, Shards, written_by
 from gsparc.simulate.survey import Survey
 
 log = logging.getLogger(__name__)
@@ -114,6 +114,7 @@ def _choose(campaign: Campaign, settings: AutoSettings, survey: Survey, shards: 
     mine: list[Decision] = []
 
     def work(note: str) -> None:
+        shards.drop(0)  # of a process that was killed before it noted by which decision it was made
         decision = deciding.decide(campaign, settings, survey)
         if decision.rows is not None and decision.paths is not None:
             made = shard_arrays(decision.paths, campaign, survey.engine.wavelength)
@@ -171,9 +172,5 @@ def _converge(campaign: Campaign, survey: Survey, effects: Effects, shards: Shar
         return None
     rows = np.sort(survey.spread(count, campaign.scene.seed + 1))
     again = survey.trace(rows, effects, campaign.check_seed)
-    parts = [shards.get(n, ROWS, "csi", "spectrum", "spectrum_peak") for n in shards.numbers()]
-    at = np.argsort(np.concatenate([part[ROWS] for part in parts]))[rows]
-    csi, images, peak = (
-        np.concatenate([part[name] for part in parts])[at] for name in ("csi", "spectrum", "spectrum_peak")
-    )
+    csi, images, peak = shards.of_rows(rows, "csi", "spectrum", "spectrum_peak")
     return compare(csi, images, peak, again, campaign, survey.engine.wavelength)

@@ -20,6 +20,8 @@ import numpy as np
 
 from gsparc.data.files import whole_file
 
+ROWS = "rows"  # of a shard: which rows of the dataset it holds
+
 
 class Shards:
     """The folder `FILE.parts` beside a dataset that is being made.
@@ -89,6 +91,24 @@ class Shards:
         """The arrays of a finished shard; `names` alone where given."""
         with np.load(self.path(number), allow_pickle=False) as file:
             return {name: file[name] for name in names or file.files}
+
+    def drop(self, number: int) -> None:
+        """Remove a shard, if it is there."""
+        self.path(number).unlink(missing_ok=True)
+
+    def of_rows(self, rows: np.ndarray, *names: str) -> list[np.ndarray]:
+        """Arrays of `names` (n, ...) at rows (n,), all of them in finished shards; no others are kept."""
+        parts = []
+        for number in self.numbers():
+            held = self.get(number, ROWS)[ROWS]
+            mine = np.flatnonzero(np.isin(held, rows))
+            if len(mine):
+                shard = self.get(number, *names)
+                parts.append((held[mine], *(shard[name][mine] for name in names)))
+        held, *found = (np.concatenate(one) for one in zip(*parts, strict=True))
+        at = np.argsort(held)
+        at = at[np.searchsorted(held[at], rows)]
+        return [one[at] for one in found]
 
     def remove(self) -> None:
         """After the dataset is written."""

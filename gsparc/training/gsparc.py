@@ -54,6 +54,7 @@ FEW_SHARE = 0.2  # of the seconds that are left, for a search with few sources
 STEPS_SHARE = 0.1  # of the budget, kept for gradient steps
 VALIDATE_EVERY = 5  # gradient steps of a conditional field: each factors a matrix
 LEAST_HELD = 4  # rows, for weights to mean anything
+MOST_HELD = 1_000  # validation rows that a process beside rendered Gaussians is weighed on: memory
 OPEN_ENDED = ("sources", "bearings", "scene")  # initialisers that take what seconds they are given
 SEARCHES = ("sources", "bearings")  # of them, those that also give an answer of few sources
 
@@ -155,8 +156,9 @@ class Gsparc(LearnedField):
             self._beside = process, 1.0
             return
         held = []
-        if len(fold.val):
-            batch = data.batch(fold.val)
+        val = fold.val[:: -(-len(fold.val) // MOST_HELD)] if len(fold.val) else fold.val
+        if len(val):
+            batch = data.batch(val)
             target = _comparable(batch.target, data.site)
             own, plain = (
                 _comparable(found.mean, data.site)
@@ -169,10 +171,10 @@ class Gsparc(LearnedField):
             rows += [] if left is None else [_left_out(left, self._apart)]
             theirs = weighing.share_of_second(rows)
         else:
-            theirs = weighing.weights(list(held[0][:2]), held[0][2], np.arange(len(fold.val)))[1]
+            theirs = weighing.weights(list(held[0][:2]), held[0][2], np.arange(len(val)))[1]
         log.info(
             "held out, %d rows and %d of training without their neighbours: a Gaussian process weighs %.2f",
-            len(fold.val), 0 if left is None else len(left.centres), theirs,
+            len(val), 0 if left is None else len(left.centres), theirs,
         )  # fmt: skip
         self._beside = (process, theirs) if theirs > 0 else None
 

@@ -37,3 +37,9 @@ def test_the_command_line_names_folders_by_it(more, monkeypatch):
     unnamed = ["dataset.file"]
     assert config.hydra.sweep.subdir == f"3_{job_name(config.hydra.overrides.task, unnamed)}"
     assert "x.npz" not in config.hydra.sweep.subdir
+
+
+def test_a_path_makes_no_folders_within_the_folder():
+    """Jobs of `init.file=walls/a.yaml` lay a level deeper, where no report of the sweep looked for them."""
+    assert job_name(["init.file=walls/a.yaml", "seed=0"]) == "init.file-walls+a.yaml_seed-0"
+    assert "/" not in job_name([f"init.file={'walls/' * 60}a.yaml"])

@@ -1,17 +1,23 @@
-"""Channels too large for memory: read from where they are, block by block, and the same as in memory."""
+"""Measurements too large for memory: read from where they are, block by block, and the same as in memory."""
 
 from __future__ import annotations
 
 import hashlib
+import multiprocessing
+import pickle
 
 import h5py
 import numpy as np
 import pytest
+from opened import say
+from releases import write_release
 
 from gsparc.data import blocks
 from gsparc.data.assemble import content_hash
+from gsparc.data.campaigns.rfid import load_rfid
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own, write_own
+from gsparc.methods.target_rows import training_targets
 
 
 def arrays(rows: int = 40) -> dict[str, np.ndarray]:
@@ -74,3 +80,57 @@ def test_blocks_are_all_rows_in_their_order(small):
     values = np.arange(700.0).reshape(70, 10)
     assert np.array_equal(np.concatenate([values[part] for part in blocks.blocks(values)]), values)
     assert len(list(blocks.blocks(np.zeros((0, 3))))) == 1
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.float32, np.float64])
+def test_spectra_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch, kind):
+    """Those of floating point were three copies in memory, of a byte a mask as large as they are."""
+    rng, path = np.random.default_rng(0), tmp_path / "own.h5"
+    spectrum = rng.uniform(0, 3, (20, 12, 16)) if kind is not np.uint8 else rng.integers(0, 256, (20, 12, 16))
+    given = {"rx_position": rng.uniform(0, 5, (20, 3)), "tx_position": np.array([9.0, 0, 2])}
+    write_own(path, {**given, "spectrum": spectrum.astype(kind)})
+    there = load_own(path)
+    with monkeypatch.context() as patch:
+        patch.setattr(blocks, "BIG", 2**28)
+        here = load_own(path)
+    assert isinstance(there.target, np.memmap) and not isinstance(here.target, np.memmap)
+    assert there.target.dtype == here.target.dtype and np.array_equal(there.target, here.target)
+    assert there.site.sha256 == here.site.sha256 and there.site.target_scale == here.site.target_scale
+    if kind is not np.uint8:
+        spectrum[13, 2, 5] = -1
+        with h5py.File(path, "w") as file:
+            for name, one in {**given, "spectrum": spectrum.astype(kind)}.items():
+                file[name] = one
+        with pytest.raises(DataError, match=r"spectrum.*row 13.*at least 0"):
+            load_own(path)
+
+
+def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(tmp_path, small, monkeypatch):
+    """50,000 pictures were 1.6 GB in memory, and as much again for each method that copied its rows."""
+    root = write_release(tmp_path / "release")
+    there = load_rfid(root)
+    with monkeypatch.context() as patch:
+        patch.setattr(blocks, "BIG", 2**28)
+        here = load_rfid(root)
+    assert isinstance(there.target, np.memmap) and not isinstance(here.target, np.memmap)
+    assert np.array_equal(there.target, here.target) and there.site.sha256 == here.site.sha256
+    rows = np.array([5, 0, 3])
+    learned = training_targets(there, rows)
+    assert isinstance(learned, np.memmap) and np.array_equal(learned, here.target[rows])
+
+
+def test_a_process_that_is_started_opens_the_file_itself(tmp_path):
+    """It got a copy of the targets through a pipe: of 100,000 channels 0.8 GB a process."""
+    nameless = blocks.scratch((3, 2), np.int16)
+    nameless[:] = np.arange(6).reshape(3, 2)
+    with h5py.File(tmp_path / "own.h5", "w") as file:
+        file["csi"] = np.arange(5.0)
+        named = blocks.on_disk(file["csi"])
+    spawn = multiprocessing.get_context("spawn")
+    arrays = (nameless, named, named[1:3])
+    process = spawn.Process(target=say, args=(tmp_path / "said", *arrays))
+    process.start()
+    process.join(60)
+    said = (tmp_path / "said").read_text().splitlines()
+    assert said == [f"{own} {one.tolist()}" for own, one in zip((True, True, False), arrays, strict=True)]
+    assert np.array_equal(pickle.loads(pickle.dumps(nameless)), nameless)  # elsewhere a copy, as ever

@@ -6,6 +6,7 @@ import os
 import shutil
 import signal
 import time
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,18 +15,20 @@ import numpy as np
 import pytest
 
 from gsparc.commands.check import main as check
-from gsparc.data import claims
+from gsparc.data import blocks, claims
 from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
 from gsparc.simulate import campaign as campaigns
+from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.pictures import effect_shares, floor_plan
 from gsparc.simulate.report import choice_table, figures, verdict
-from gsparc.simulate.scenes.build import SceneSettings
+from gsparc.simulate.scenes.build import SceneSettings, build
 from gsparc.simulate.settings import Campaign, CsiSettings
+from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.shoebox import Room, trace
 from gsparc.simulate.shoebox_engine import ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -291,6 +294,67 @@ def test_where_few_are_left_everything_is_kept(tmp_path):
     asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
     outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
     assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
+
+
+def test_a_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path, monkeypatch):
+    """The shard of a decision nobody had noted stayed, beside rows of the decision taken instead of it."""
+    asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
+
+    def dies(*unused):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Shards, "write_note", dies)
+        simulate(plan(effects=asked), tmp_path / "cut.h5")
+    assert (tmp_path / "cut.h5.parts" / "shard_0000.npz").exists()  # everything, at depth 4
+    outcome = simulate(plan(effects=asked), tmp_path / "cut.h5")
+    assert outcome.choice.reused and outcome.effects.depth < 4
+    simulate(plan(effects=outcome.effects), tmp_path / "whole.h5")
+    (one, _), (two, _) = (arrays(tmp_path / f"{name}.h5") for name in ("whole", "cut"))
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
+
+
+def put_together(out: Path, receivers: int) -> int:
+    """Write a file from shards whose rows are those of 20 traced places, again and again; peak memory [B]."""
+    asked = plan(
+        scene=replace(SCENE, num_receivers=receivers), effects=replace(MIRROR, noise_snr_db=20.0),
+        spectrum=replace(SMALL, height=45, width=90, normalisation="none"),
+        csi=CsiSettings(rows=4, columns=4), weakest_db=6.0,
+    )  # fmt: skip
+    survey, shards = build(asked.scene, asked.sampling), Shards(out, {"receivers": receivers})
+    wavelength = survey.engine.wavelength
+    made = shard_arrays(survey.trace(np.arange(20), MIRROR), asked, wavelength)
+    turned = np.random.default_rng(0).permutation(receivers).reshape(-1, 20)
+    for number, rows in enumerate(turned, 1):
+        shards.put(number, {**made, ROWS: rows, SECONDS: np.array(0.0)})
+    tracemalloc.start()
+    try:
+        assemble(asked, survey, asked.effects, None, None, 0.0, shards)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
+    """They were all held at once: at 100,000 receivers tens of gigabytes."""
+    monkeypatch.setattr(blocks, "BIG", 2**16)
+    monkeypatch.setattr(blocks, "BLOCK", 2**16)
+    few, many = (put_together(tmp_path / f"{n}.h5", n) for n in (200, 2000))
+    stored, _ = arrays(tmp_path / "2000.h5")
+    row = stored["spectrum"][0].nbytes + stored["csi"][0].nbytes
+    assert row > 4000 and many - few < 0.25 * 1800 * row
+    np.testing.assert_array_equal(np.diff(stored["path_offsets"]).reshape(-1, 20).shape, (100, 20))
+
+
+def test_what_is_put_together_on_disk_is_the_same(tmp_path, monkeypatch):
+    noisy = plan(effects=replace(MIRROR, noise_snr_db=20.0))
+    simulate(noisy, tmp_path / "memory.h5")
+    monkeypatch.setattr(blocks, "BIG", 1024)
+    simulate(noisy, tmp_path / "disk.h5")
+    (one, _), (two, _) = (arrays(tmp_path / f"{name}.h5") for name in ("memory", "disk"))
+    for name in one:
+        np.testing.assert_array_equal(one[name], two[name], err_msg=name)
 
 
 @pytest.mark.parametrize("changes, words", [

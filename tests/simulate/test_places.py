@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from gsparc.data.links.georeference import Georeference
+from gsparc.simulate.scenes.placement import place
 from gsparc.simulate.scenes.receivers import Layout, receivers
 from gsparc.simulate.scenes.transmitters import stations
 
@@ -140,3 +141,11 @@ def test_receivers_that_cannot_be_are_refused(settings, words):
     with pytest.raises(ValueError, match=words) as raised:
         laid(**settings)
     assert "\n" not in str(raised.value)
+
+
+def test_many_places_fit_where_few_are_allowed():
+    """Draws were 204,800 whatever was asked for: 100,000 did not fit where half is built on."""
+    found = place(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
+    assert len(found) == 2_500 and (found[:, 0] < 0.2).all()
+    with pytest.raises(ValueError, match="0 of 20 receivers"):
+        place(20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0)

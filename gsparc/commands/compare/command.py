@@ -57,9 +57,9 @@ def task(config: DictConfig) -> list[table.Row]:
     ]
     limit_s = None if settings["max_hours"] is None else float(settings["max_hours"]) * 3600
     several = HydraConfig.get().mode == RunMode.MULTIRUN
-    failed = run_dir.parent / "failed" if several else None
+    failed = Failed(run_dir.parent) if several else None
     filled = fill_all(prepared, bool(settings["train"]), limit_s, failed)
-    if several and settings["worker"]:
+    if settings["worker"]:
         log.info("every cell is filled or has failed; the report is worker 0's")
         return []
     if not filled:
@@ -118,8 +118,34 @@ def _may_match(pattern: str, dataset: str, split: str) -> bool:
     return True
 
 
+class Failed:
+    """Cells that processes of one multirun could not fill; those of an earlier multirun are tried again.
+
+    Args:
+        sweep: the multirun's folder.
+    """
+
+    def __init__(self, sweep: Path) -> None:
+        self.folder, self.start = sweep / "failed", sweep / "multirun.yaml"  # which Hydra writes at the start
+
+    def has(self, name: str) -> bool:
+        """Whether a cell failed since the start."""
+        file = self.folder / name
+        if not file.exists():
+            return False
+        return not self.start.exists() or file.stat().st_mtime_ns >= self.start.stat().st_mtime_ns
+
+    def add(self, name: str, why: str) -> None:
+        """Say that a cell failed."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        (self.folder / name).write_text(why + "\n", encoding="utf-8")
+
+
 def fill_all(
-    prepared: Sequence[Prepared], train: bool = True, limit_s: float | None = None, failed: Path | None = None
+    prepared: Sequence[Prepared],
+    train: bool = True,
+    limit_s: float | None = None,
+    failed: Failed | None = None,
 ) -> list[Filled]:
     """Find or fill one cell after another, saying how far it is and how long it will take.
 
@@ -130,7 +156,7 @@ def fill_all(
         prepared: the most wanted first.
         train: whether missing cells are filled.
         limit_s: no cell is started that would end later [s].
-        failed: folder in which processes tell each other of cells that cannot be filled.
+        failed: where processes tell each other of cells that cannot be filled.
     """
     missing = [one for one in prepared if one.found() is None]
     log.info("%d cells, %d of them are there", len(prepared), len(prepared) - len(missing))
@@ -138,7 +164,7 @@ def fill_all(
     broken, late = set[str](), set[str]()  # cells
 
     def cannot(one: Prepared) -> bool:
-        return str(one.cell) in broken or (failed is not None and (failed / one.folder.name).exists())
+        return str(one.cell) in broken or (failed is not None and failed.has(one.folder.name))
 
     def done(one: Prepared) -> bool:
         return one.found() is not None or str(one.cell) in late or cannot(one)
@@ -160,8 +186,7 @@ def fill_all(
             log.warning("%s cannot be filled: %s", one.cell, one_line(error))
             broken.add(str(one.cell))
             if failed is not None:
-                failed.mkdir(parents=True, exist_ok=True)
-                (failed / one.folder.name).write_text(one_line(error) + "\n", encoding="utf-8")
+                failed.add(one.folder.name, one_line(error))
 
     if train:
         here = [one for one in missing if one.problem.data is not None]

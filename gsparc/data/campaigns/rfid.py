@@ -18,6 +18,7 @@ import numpy as np
 from PIL import Image
 
 from gsparc.data.assemble import assemble, check_positions
+from gsparc.data.blocks import empty
 from gsparc.data.errors import DataError, Problems
 from gsparc.data.files import read_yaml
 from gsparc.data.rotation import quaternion_to_matrix
@@ -162,7 +163,7 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
 
 
 def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.ndarray | None:
-    """Images (S, 90, 360) uint8, in the order of their numbers."""
+    """Images (S, 90, 360) uint8, in the order of their numbers; on disk where they are many."""
     if not folder.is_dir():
         return problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
     files = {path.name for path in folder.glob("*.png")}
@@ -177,7 +178,7 @@ def _read_spectra(folder: Path, count: int | None, problems: Problems) -> np.nda
     problems.add_rows(folder, extra, f"no row for it in tx_pos.csv, which has {count} rows")
     if missing:
         return None
-    spectra = np.empty((count, HEIGHT, WIDTH), dtype=np.uint8)
+    spectra = empty((count, HEIGHT, WIDTH), np.uint8)
     for i, name in enumerate(expected):
         fault = _read_image(folder / name, spectra[i])
         if fault:

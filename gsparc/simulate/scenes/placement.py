@@ -9,7 +9,8 @@ from scipy.spatial import cKDTree
 
 from gsparc.simulate.scenes.solid import Solid
 
-TRIES = 200
+TRIES = 200  # draws for each place, of which one is to be allowed
+DRAWN = 1024  # at a time
 
 
 def place(
@@ -36,8 +37,8 @@ def place(
         raise ValueError(f"scene.area_m, scene.height_m: expected lower below upper, got {low} and {high}")
     rng = np.random.default_rng(seed)
     found = np.empty((0, 3))
-    for _ in range(TRIES):
-        drawn = rng.uniform(low, high, size=(1024, 3))
+    for _ in range(TRIES * -(-count // DRAWN)):
+        drawn = rng.uniform(low, high, size=(DRAWN, 3))
         found = np.concatenate([found, drawn[allowed(drawn)]])
         if len(found) >= count:
             return found[:count]

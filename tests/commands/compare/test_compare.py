@@ -122,6 +122,9 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     again = compare(tmp_path, only, "latency=false")
     assert "3 cells, 3 of them are there" in again.stdout
     assert json.loads((tmp_path / "run" / "summary.json").read_text()) == summary
+    other = compare(tmp_path, only, "worker=1", f"hydra.run.dir={tmp_path / 'other'}")
+    assert other.returncode == 0 and "the report is worker 0's" in other.stdout
+    assert not (tmp_path / "other" / "compare.md").exists()  # every worker started by hand wrote one
     absent = compare(tmp_path, only, "datasets.own.file=null", "train=false")
     assert absent.returncode == 0 and "here as far as results were kept" in absent.stdout + absent.stderr
     assert "3 cells, 3 of them are there" in absent.stdout

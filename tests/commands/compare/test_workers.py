@@ -42,7 +42,7 @@ def worker(folder: Path, killed_at: int | None = None) -> None:
         return Filled(one.cell, one.folder, facts)
 
     command.fill, claims.POLL_S = fill, 0.02
-    filled = command.fill_all(prepared, failed=folder / "failed")
+    filled = command.fill_all(prepared, failed=command.Failed(folder))
     assert [one.cell.method for one in filled] == [f"m{n}" for n in range(COUNT) if n != BROKEN]
 
 
@@ -59,3 +59,16 @@ def test_every_cell_is_filled_once(tmp_path, killed_at):
     begun = sorted(map(int, (tmp_path / "begun").read_text().split()))
     assert begun == sorted([*range(COUNT), *([] if killed_at is None else [killed_at])])
     assert "does not serve" in (tmp_path / "failed" / f"toy-random-m{BROKEN}-k").read_text()
+
+
+def test_what_failed_in_an_earlier_multirun_is_tried_again(tmp_path):
+    """Its folder was never emptied: said again, the command left out what it had been mended for."""
+    failed = command.Failed(tmp_path)
+    failed.add("cell", "no room")
+    assert failed.has("cell") and not failed.has("other")
+    written = (tmp_path / "failed" / "cell").stat().st_mtime_ns
+    start = tmp_path / "multirun.yaml"
+    start.write_text("")
+    for earlier, known in ((1, True), (-1, False)):
+        os.utime(start, ns=(written - earlier, written - earlier))
+        assert failed.has("cell") is known

@@ -1,0 +1,32 @@
+"""A job that is killed once, named in a configuration by jobs that a launcher starts."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as L
+
+
+class KillOnce(L.Callback):
+    """Writes down every step that begins; the first process to begin a certain one is killed there.
+
+    Args:
+        step: that one.
+        folder: where all jobs write.
+    """
+
+    def __init__(self, step: int, folder: str) -> None:
+        self.step, self.folder = step, Path(folder)
+
+    def on_train_batch_start(self, trainer: L.Trainer, *unused: Any) -> None:
+        with (self.folder / "steps").open("a") as file:
+            file.write(f"{trainer.global_step} {trainer.default_root_dir}\n")
+        if trainer.global_step == self.step:
+            try:
+                os.close(os.open(self.folder / "killed", os.O_CREAT | os.O_EXCL))
+            except FileExistsError:
+                return
+            os.kill(os.getpid(), signal.SIGKILL)
