@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gsparc.methods.timing import ClockSettings, interleaved
 from gsparc.ops import Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops.geometry import Gaussians
 from gsparc.ops.networks import networks, products
 from gsparc.ops.operators import composite_backward_op, view_of
 from gsparc.training.losses import _Kernel, _written_out, ssim
@@ -216,9 +217,9 @@ def backward_of(plan: Any, model: Model, features: Tensor) -> Callable[[], Any]:
     """The backward operator alone, for an upstream gradient of noise."""
     raster = composite(plan, *model, features)
     upstream = torch.randn_like(raster.image)
-    inputs = (upstream, None, raster.image, raster.transmittance, *model, None, features)
+    inputs = (upstream, None, raster.image, raster.transmittance, Gaussians(*model, None), features)
     view = view_of(plan)
-    return lambda: composite_backward_op(*inputs, *view)
+    return lambda: composite_backward_op.of(*inputs, *view)
 
 
 def by_kernel(function: Callable[[], Any]) -> dict[str, float]:

@@ -209,6 +209,7 @@ def test_measured_ceiling_in_squares():
     assert own < 0.55 * nmse(plain.answer(batch).mean.numpy(), batch.target.numpy())
 
 
+@pytest.mark.slow
 def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
     """Rows of a later station carry its number, of which a site of one end knew nothing."""
     data = _ceiling(ends=2, count=30)

@@ -18,8 +18,8 @@ class Common:
     """Gains of the direct wave and of images in shared planes (J,), and the level of ends.
 
     Attributes:
-        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle, the smaller the less
-            sure it is: small where phases are unrelated.
+        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle; of images the smaller
+            the less sure it is: small where phases are unrelated.
         told: (J,) [m^2] what knowing it takes from the power.
         level: [m^2] power that covariances are in units of.
     """
@@ -40,8 +40,12 @@ class Common:
         count, gain = len(each), each.mean(0)
         whole, mean = each.abs().square().mean(0), gain.abs().square()
         steady = ((count * mean - whole) / max(count - 1, 1)).clamp_min(0)
-        sure = steady / (steady + (whole - steady) / count).clamp_min(1e-300)
-        return Common(gain * sure, steady * sure, sum(levels) / count)
+        spread = (whole - steady) / count
+        sure = steady / (steady + spread).clamp_min(1e-300)
+        told = steady * sure
+        # The direct wave stays: unsure as its gain may be, its shape is right.
+        sure[:1], told[:1] = 1.0, steady[:1] - spread[:1]
+        return Common(gain * sure, told, sum(levels) / count)
 
     def at(self, shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean (n,) complex128 of a slot's entries, their variance (n,), and that before learning."""
