@@ -18,10 +18,6 @@ PANELS = {
         FIT, QUERY, ("peak_gb", "peak memory, data included [GB]"),
         ("rmse", "rmse [dB], bars of two standard errors"),
     ),
-    "spectra": (
-        FIT, QUERY, ("private_gb", "peak private memory [GB]"),
-        ("rmse", "rmse of a pixel, bars of two standard errors"),
-    ),
 }  # fmt: skip
 AXES = {  # what the seconds are of, and the amount
     "antennas": ("a fit", "antennas (16 tones)"), "tones": ("a fit", "tones (4 antennas)"),
