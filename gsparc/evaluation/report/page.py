@@ -31,14 +31,14 @@ class Study:
         title: dataset and split.
         remarks: what a reader must know first.
         tables: in reading order.
-        plots: titles and SVG texts.
+        plots: titles, whether they take a whole line, and SVG texts.
         pictures: captions and PNG data in base64.
     """
 
     title: str
     remarks: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    plots: list[tuple[str, str]] = field(default_factory=list)
+    plots: list[tuple[str, bool, str]] = field(default_factory=list)
     pictures: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -68,7 +68,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
     )  # fmt: skip
     study.plots = [
-        (figure.get_label(), _unique_ids(plots.svg(figure), i))
+        (figure.get_label(), figure.get_figwidth() > plots.WIDE, _unique_ids(plots.svg(figure), i))
         for i, figure in enumerate(drawn)
         if figure is not None
     ]

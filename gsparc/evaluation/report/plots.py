@@ -25,6 +25,7 @@ from gsparc.evaluation.report.tables import BASELINES, grouped
 from gsparc.methods.pareto import front
 
 WIDE, TALL = 7.0, 3.8
+MOST_CONFIDENCES = 8
 BAND = 0.95
 CDFS: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
@@ -58,7 +59,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
                 label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, found.value))
-    for base in BASELINES:
+    for base in _beside(runs):
         value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
         if value is not None and ms is not None:
             axes.plot([ms], [value], **look(base).marked, ms=4)
@@ -91,7 +92,7 @@ def accuracy_cdf(runs: Sequence[Run]) -> Figure:
         if values:
             pooled = np.concatenate(values)
             _cdf(axes, pooled[np.isfinite(pooled)], setting, style, samples=len(values[0]))
-    rival = runs[0].samples.get(f"baseline/gp/{name}")
+    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in _beside(runs) else None
     if rival is not None:
         share = np.arange(1, len(rival) + 1) / len(rival)
         axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
@@ -219,7 +220,7 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     series: dict[str, dict[int, list[float]]] = {}
     for run in runs:
         found = {str(run.facts.get("model/name")): run.figure_of(name)}
-        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in BASELINES}
+        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in _beside(runs)}
         for method, value in found.items():
             if value is not None:
                 series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
@@ -241,13 +242,14 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     if not sure:
         return None
     figure, ((points, kept),) = panels(WIDE, TALL, 1, 2)
-    for number, run in enumerate(sure[:8]):
+    shown = [(run, style) for (_, group), style in _styled(sure) for run in group]
+    for run, style in shown[:MOST_CONFIDENCES]:
         value, stated = sizes(run, name), run.samples["confidence"]
         known = np.isfinite(value) & np.isfinite(stated)
         stated, value = stated[known], value[known]
         if len(stated) < 3 or np.ptp(stated) == 0:
             continue
-        rank, style = spearmanr(stated, value).statistic, numbered(number)
+        rank = spearmanr(stated, value).statistic
         order, count = np.argsort(-stated, kind="stable"), np.arange(1, len(stated) + 1)
         share, mean = count / len(count), np.cumsum(value[order]) / count
         error = value.std(ddof=1) / np.sqrt(count)
@@ -261,6 +263,11 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     figure.set_label("Error against confidence")
     _legend(points)
     return figure
+
+
+def _beside(runs: Sequence[Run]) -> list[str]:
+    """Baselines that no run is of."""
+    return [base for base in BASELINES if base not in {run.facts.get("model/name") for run in runs}]
 
 
 def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:

@@ -8,9 +8,11 @@ from xml.etree import ElementTree
 import pytest
 from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
+from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
+from gsparc.evaluation.drawing import look
 from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import html, studies, warnings
 from gsparc.evaluation.report.readme import BEGIN, END, refresh
@@ -67,6 +69,19 @@ def test_every_plot_is_a_whole_drawing(three):
         title = figure.get_label()
         assert title and title not in plots.svg(figure)
     assert plots.latency_cdf(runs) is None and plots.measurements(runs[:2]) is None
+
+
+def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
+    """And in the plot of confidences it had the colour of another method."""
+    for name in ("gsparc", "gp"):
+        run_dir(tmp_path / name, name=name)
+    runs = find_runs([tmp_path])
+    axes = plots.accuracy_cdf(runs).axes[0]
+    assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
+    points = plots.confidence(runs).axes[0].collections
+    assert {to_hex(one.get_facecolor()[0]).upper() for one in points} == {
+        look(name).colour for name in ("gsparc", "gp")
+    }
 
 
 def test_the_figure_that_ends_a_sweep(three, tmp_path):
