@@ -50,7 +50,7 @@ docs: setup $(VENV)/.docs named ## run the tutorials and build the documentation
 
 # The older the C library it is built against, the more systems it runs on: releases are built in an image of manylinux_2_28.
 wheel: setup ## a wheel that needs no compiler, into dist/, marked for the oldest Linux it runs on
-	rm -rf build/wheel && $(RUN) -m pip wheel --quiet --no-deps --no-build-isolation $(WHEEL) -w build/wheel .
+	rm -rf build/wheel $(DIST)/gsparc-*.whl && $(RUN) -m pip wheel --quiet --no-deps --no-build-isolation $(WHEEL) -w build/wheel .
 	PATH="$(abspath $(VENV)/bin):$$PATH" $(RUN) -m auditwheel repair --wheel-dir $(DIST) build/wheel/*.whl
 
 $(VENV)/.sionna: $(VENV)/.installed

@@ -217,5 +217,5 @@ def test_the_wheel_is_marked_for_other_linux_systems(tmp_path):
     from gsparc.ops import _native
 
     needed = set(auditwheel.elf_read_dt_needed(Path(_native.__file__)))
-    allowed = {"libc.so.6", "libm.so.6", "libstdc++.so.6", "libgcc_s.so.1", "libpthread.so.0"}
+    allowed = {"libc.so.6", "libm.so.6", "libstdc++.so.6", "libgcc_s.so.1", "libpthread.so.0", "libdl.so.2"}
     assert not {name for name in needed if not name.startswith("ld-linux")} - allowed
