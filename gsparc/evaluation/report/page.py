@@ -68,7 +68,7 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
     )  # fmt: skip
     study.plots = [
-        (figure.get_label(), figure.get_figwidth() > plots.WIDE, _unique_ids(plots.svg(figure), i))
+        (str(figure.get_label()), figure.get_figwidth() > plots.WIDE, _unique_ids(plots.svg(figure), i))
         for i, figure in enumerate(drawn)
         if figure is not None
     ]
