@@ -14,6 +14,8 @@ MODULES := $(VENV)/.modules-$(shell find gsparc ops callbacks conf -name '*.py' 
 .DEFAULT_GOAL := help
 RFID ?= ../shared/data/rfid-s23-160
 DIST ?= dist
+# Its own objects, made anew: those of another compiler would be taken as they are.
+WHEEL ?= -Cbuild-dir=build/wheel/objects
 .PHONY: browser results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
