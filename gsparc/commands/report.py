@@ -16,7 +16,7 @@ from gsparc.evaluation.report.page import studies, write
 from gsparc.evaluation.report.readme import refresh
 from gsparc.evaluation.report.runs import columns, find_runs
 from gsparc.evaluation.report.timing import retime
-from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.summary import program, provenance, write_summary
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -28,7 +28,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     out = run_directory()
     shown = studies(runs, _fronts(paths))
     origin = provenance()
-    made = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by gsparc at commit {str(origin['git'])[:8]}"
+    made = f"{len(runs)} run{'s' if len(runs) > 1 else ''}; made by {program(origin)}"
     write(out, config.title, made, shown)
     facts: dict[str, Any] = {"report/runs": len(runs), "report/studies": len(shown), **origin}
     for run in runs:

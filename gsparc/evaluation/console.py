@@ -14,6 +14,7 @@ from rich.console import Console
 
 from gsparc.data.instantiate import suggest
 from gsparc.data.limits import SettingError
+from gsparc.data.plugins import GROUPS, plugins
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
@@ -70,9 +71,10 @@ def one_line(error: BaseException) -> str:
 
 
 def _choices(group: str) -> list[str]:
-    """Every choice of a config group, those in its folders as `folder/choice`."""
+    """Every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
     folder = Path(import_module(CONFIGS.removeprefix("pkg://")).__path__[0]) / group
-    return sorted(str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml"))
+    own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
+    return sorted(own.union(plugins(group) if group in GROUPS else ()))
 
 
 def _argument(text: str) -> str | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -15,10 +15,13 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from gsparc.data.files import whole_file
 
-# Colours that are told apart with any colour vision (Okabe and Ito 2008), the yellow made readable on white.
-PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#8C6D1F", "#000000")
-GREY = "#7F7F7F"
-MARKS = "osD^vPX<>ph"
+# Colours that are told apart with any colour vision (Okabe and Ito 2008, the yellow darker; Tol 2021).
+PALETTE = (
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
+    "#56B4E9", "#4B5320", "#000000", "#882255", "#332288",
+)  # fmt: skip
+STROKES = ("-", "--", ":", "-.")  # where there are more lines than colours
+GREY = "#6E6E6E"
 STYLE: dict[Any, Any] = {
     "axes.prop_cycle": cycler(color=PALETTE),
     "axes.spines.top": False,
@@ -30,34 +33,72 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.3,
 }
-# The same method looks the same everywhere; others get one by their name.
-METHODS: dict[str, tuple[str, str]] = {
-    "gsparc": ("#D55E00", "*"),
-    "gp": ("#0072B2", "s"),
-    "kriging": ("#56B4E9", "s"),
-    "complex_gp": ("#0072B2", "D"),
-    "idw": ("#009E73", "o"),
-    "nearest": ("#009E73", "^"),
-    "distance_law": ("#8C6D1F", "v"),
-    "mean": (GREY, "o"),
-    "zero": (GREY, "X"),
-    "auto": ("#D55E00", "D"),
-    "blind": ("#D55E00", "P"),
-    "splat": ("#E69F00", "o"),
-    "paper": ("#E69F00", "s"),
-    "swiftwrf": ("#CC79A7", "o"),
-    "wrfgs": ("#CC79A7", "s"),
-    "gsrf": ("#CC79A7", "D"),
-    "nerf2": ("#000000", "o"),
-    "ngrf": ("#000000", "s"),
-    "newrf": ("#000000", "D"),
+
+
+class Look(NamedTuple):
+    """How a method is drawn: colour, mark, whether it is the second of its colour (open, dashed)."""
+
+    colour: str
+    mark: str
+    second: bool = False
+
+    @property
+    def marked(self) -> dict[str, Any]:
+        """For points joined by a line."""
+        return {"marker": self.mark, "markerfacecolor": "w" if self.second else self.colour, **self.line}
+
+    @property
+    def line(self) -> dict[str, Any]:
+        """For a line without points."""
+        return {"color": self.colour, "linestyle": "--" if self.second else "-"}
+
+
+# The same method looks the same everywhere; of two drawn together in one colour one is the second.
+METHODS = {
+    "gsparc": Look("#D55E00", "*"),
+    "blind": Look("#D55E00", "P", True),
+    "gp": Look("#0072B2", "s"),
+    "complex_gp": Look("#0072B2", "D", True),
+    "idw": Look("#009E73", "o"),
+    "calibrated_raytracer": Look("#009E73", "v", True),
+    "swiftwrf": Look("#CC79A7", "X"),
+    "distance_law": Look("#CC79A7", "v"),
+    "newrf": Look("#CC79A7", "^", True),
+    "paper": Look("#E69F00", "s"),
+    "gaussians": Look("#E69F00", "o", True),
+    "kriging": Look("#56B4E9", "p"),
+    "residual": Look("#56B4E9", "h", True),
+    "wrfgs": Look("#4B5320", "D"),
+    "array": Look("#4B5320", "X", True),
+    "nerf2": Look("#000000", "o"),
+    "nerf2_published": Look("#000000", "^", True),
+    "image_source_gp": Look("#000000", "v"),
+    "nearest": Look("#332288", "^"),
+    "auto": Look("#332288", "d", True),
+    "gsrf": Look("#882255", "P"),
+    "ngrf": Look("#882255", "s", True),
+    "mean": Look(GREY, "o"),
+    "zero": Look(GREY, "X", True),
 }
+OTHERS = "<>8H"  # marks of methods without an entry
+TOGETHER = "_together"  # ends the name of a method that serves all stations at once
 
 
-def look(method: str) -> tuple[str, str]:
-    """Colour and mark of a method."""
+def look(method: str) -> Look:
+    """How a method is drawn; one without an entry by its name."""
+    if method.endswith(TOGETHER):
+        return look(method.removesuffix(TOGETHER))._replace(second=True)
     number = zlib.crc32(method.encode())
-    return METHODS.get(method, (PALETTE[number % len(PALETTE)], MARKS[number // 8 % len(MARKS)]))
+    mark = OTHERS[number // len(PALETTE) % len(OTHERS)]
+    return METHODS.get(method, Look(PALETTE[number % len(PALETTE)], mark, True))
+
+
+def numbered(number: int) -> dict[str, Any]:
+    """Colour and line style of the setting with this number, where settings are drawn and not methods."""
+    return {
+        "color": PALETTE[number % len(PALETTE)],
+        "linestyle": STROKES[number // len(PALETTE) % len(STROKES)],
+    }
 
 
 def panels(

@@ -55,6 +55,12 @@ def provenance() -> dict[str, str | None]:
     return {"git": _git(), "versions": _versions()}
 
 
+def program(origin: Mapping[str, str | None]) -> str:
+    """`gsparc 0.1.0`, and the commit of `provenance()` where there is a source tree."""
+    commit = origin["git"]
+    return f"gsparc {version('gsparc')}" + (f" at commit {commit[:8]}" if commit else "")
+
+
 def results_table(facts: Mapping[str, Any], method: str, title: str, prefix: str = "test") -> Table:
     """`result_rows` as a table for a terminal; the last row is `method`'s."""
     heads, rows = result_rows(facts, method, prefix)
@@ -80,7 +86,7 @@ def result_rows(
     for name, figures, times in [*((n, *[f"baseline/{n}"] * 2) for n in names), (method, prefix, "time")]:
         cells = [shown(facts.get(f"{figures}/{figure}"), form) for figure, form in wanted]
         cells += [shown(facts.get(f"{times}/{key}"), ".3g") for key in ("train_s", "render_ms_p50")]
-        rows.append([name, *cells])
+        rows.append([f"{name} (baseline)" if name == method and times != "time" else name, *cells])
     return ["method", *(name for name, _ in wanted), "train s", "query ms p50"], rows
 
 
@@ -147,7 +153,7 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
     best = max(known, key=lambda name: known[name], default=None)
     if best is None or own is None or known[best] <= score_of(figure, own):
         return []
-    return [f"{best} has the better {figure} here: for this data and split it is the better choice"]
+    return [f"the baseline {best} has the better {figure} here: the better choice for this data and split"]
 
 
 def _value(key: str, value: Any) -> int | float | str | None:

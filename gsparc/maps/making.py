@@ -118,7 +118,7 @@ def map_of(
         )
     return FieldMap(
         grid, tuple(names), power, lower, upper, error, best, ratio, outage, share, calibration is not None,
-        threshold_db, _path_layers(predictor, grid, best, names),
+        threshold_db, _path_layers(predictor, grid, best),
         np.zeros((0, 2)) if promise is None else _measured_places(promise, site), _still(site, names),
         tuple(notes),
     )  # fmt: skip
@@ -296,9 +296,7 @@ def _over_stations(
     return best.reshape(shape), ratio.reshape(shape), outage.reshape(shape)
 
 
-def _path_layers(
-    predictor: Predictor, grid: Grid, best: np.ndarray, names: Sequence[str]
-) -> dict[str, np.ndarray]:
+def _path_layers(predictor: Predictor, grid: Grid, best: np.ndarray) -> dict[str, np.ndarray]:
     """Delay spread [ns] and azimuth [deg] of the strongest path (ny, nx), of models with paths."""
     if not isinstance(predictor.method, HasPaths) or predictor.site.stations is not None:
         return {}

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import Prediction, PredictsVariance
+from gsparc.methods.method import Prediction
 from gsparc.methods.target_rows import entry_variance, to_real
 from gsparc.ops import Pose
 
@@ -227,7 +227,7 @@ def law_of(rows: Rows, site: Site) -> tuple[Law, tuple[str, ...]]:
     return fit_law(rows, place), (f"the {end}'s place is not given; estimated from powers at ({where}) m",)
 
 
-class DistanceLaw(Interpolator, PredictsVariance):
+class DistanceLaw(Interpolator):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"

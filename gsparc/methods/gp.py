@@ -21,7 +21,7 @@ from gsparc.methods.coarse_grid import Filled
 from gsparc.methods.covering import covering
 from gsparc.methods.distance_law import Rows
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import Method, Prediction, PredictsVariance
+from gsparc.methods.method import Method, Prediction
 from gsparc.methods.nearest_targets import NearestTargets, learned, projected
 from gsparc.methods.neighbourhood import NEIGHBOURS
 from gsparc.methods.pareto import Settings
@@ -162,7 +162,7 @@ def choose_kernel(positions: np.ndarray, scores: np.ndarray, entries: int) -> Ke
     return Kernel(length, noise, leave_one_out(Kernel(length, noise).gram(positions), scores, entries)[1])
 
 
-class GaussianProcess(Interpolator, PredictsVariance):
+class GaussianProcess(Interpolator):
     """Matern-3/2, isotropic, over the moving end's position; the mean target is subtracted.
 
     Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows

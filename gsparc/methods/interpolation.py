@@ -38,7 +38,7 @@ class Interpolator(Method):
     seen = 0
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit on train and val rows; `ValueError` when there are none."""
+        """Fit on train and val rows; `ValueError` when there are none, or what it learned is not stored."""
         known = np.concatenate([fold.train, fold.val])
         rows = known if self.uses_censored else heard(data, known)
         if not len(rows):
@@ -46,10 +46,17 @@ class Interpolator(Method):
         start = time.perf_counter()
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
         places, targets, unheard = data.moving[rows], training_targets(data, rows), silent(data, rows)
+        before = set(vars(self))
         if unheard.any():
             notes = self._learn_censored(places, targets, unheard)
         else:
             notes = (*self._learn(places, targets), *left_out_note(data, known))
+        lost = sorted(set(vars(self)) - before - set(self.stored))
+        if lost and type(self)._relearn is Interpolator._relearn:
+            raise ValueError(
+                f"{self.name}: its checkpoint loses {', '.join(lost)}: name it in `stored` (tensor, number, "
+                "string) or make it again in `_relearn(state)`"
+            )
         return FitReport(time.perf_counter() - start, (*notes, *_runs_note(data, known)))
 
     def predict(self, tx: Tensor, rx: Pose) -> Prediction:
@@ -103,5 +110,6 @@ class Interpolator(Method):
         return {name: getattr(self, name) for name in self.stored}
 
     def _relearn(self, state: dict[str, Any]) -> None:
+        """Inverse of what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
             setattr(self, name, state[name])

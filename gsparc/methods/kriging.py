@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist, pdist
 
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import Prediction, PredictsVariance
+from gsparc.methods.method import Prediction
 from gsparc.methods.target_rows import entry_variance, to_real
 
 FLOOR_DB = -30.0  # of a pixel, relative to the brightest possible
@@ -89,7 +89,7 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     return Variogram(*(float(v) for v in found))
 
 
-class Kriging(Interpolator, PredictsVariance):
+class Kriging(Interpolator):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"

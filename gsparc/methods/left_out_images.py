@@ -45,10 +45,6 @@ class LeftOut:
         """From `state()`; None from None."""
         return None if state is None else cls(**{key: value.numpy() for key, value in state.items()})
 
-    def mismatch_db(self, predicted: np.ndarray) -> float:
-        """Minus the PSNR [dB] of predictions (g, c, P), averaged over samples and gaps."""
-        return 10 / np.log(10) * mean_log_error(((predicted - self.images[self.centres]) ** 2).mean(-1))
-
     def by_process(self) -> np.ndarray:
         """The same samples (g, c, P) as a Gaussian process on images predicts them from what is left."""
         mean = self.images.mean(0)

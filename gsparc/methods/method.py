@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args, runtime_checkable
@@ -62,7 +62,7 @@ class FitContext:
     """What a run brings along to a fit.
 
     Attributes:
-        run_dir: where the fit may write.
+        run_dir: where the fit may write; empty: nowhere.
         seed: of whatever is random and has no seed of its own.
         budget_s: seconds of training; None: as the method is configured.
         budget_clock: whether these are of the clock on the `wall` or of the `processor`.
@@ -109,6 +109,10 @@ class FitContext:
             raise ValueError(
                 f"dataset.batch_size={self.batch_size!r}: a whole number of at least 1 is needed"
             )
+
+    def within(self, folder: str, **changes: Any) -> FitContext:
+        """The context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
 
     def time_budget(self, seconds: float | None = None, before: Spent = NOTHING) -> TimeBudget:
         """So many seconds of this context's clock (None: `budget_s`, or no end), some spent before."""
@@ -257,29 +261,6 @@ class Reducible(Protocol):
 
     def reduced(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """A method that answers with these settings; this one is left as it is."""
-
-
-class PredictsVariance(Method):
-    """Methods whose predictions have a variance; makes them `HasVariance`."""
-
-    def variance_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """See `HasVariance`."""
-        variance = self.predict(tx, rx).variance
-        if variance is None:
-            raise ValueError(f"{self.name}: has no variance of {self.site.kind if self.site else 'anything'}")
-        return variance
-
-
-@runtime_checkable
-class HasVariance(Protocol):
-    """Knows the expected squared error of its predictions."""
-
-    def variance_at(self, tx: Tensor, rx: Pose) -> Tensor:
-        """(B,) float32, expected squared error per entry, stored units.
-
-        Raises:
-            ValueError: what was fitted here has none.
-        """
 
 
 @runtime_checkable

@@ -126,8 +126,10 @@ class PerStation(Method):
             rows = np.arange(len(data)) if number == UNHEARD else np.flatnonzero(data.station == number)
             copy, part = self._make(), data.subset(rows, self._site_of(data.site, number))
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
-            where = context.run_dir / f"station{number}" if number != UNHEARD else context.run_dir / "unheard"
-            report = copy.fit(part, inner, replace(context, budget_s=share, run_dir=where, datamodule=None))
+            own = context.within(
+                f"station{number}" if number != UNHEARD else "unheard", budget_s=share, datamodule=None
+            )
+            report = copy.fit(part, inner, own)
             self._copies[number] = copy
             seconds, limited = seconds + report.seconds, less_repeatable(limited, report.limited_by)
             all_or_new = "all stations" if together else "stations never heard"

@@ -34,7 +34,7 @@ def interpolated(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -
             f"{tones_hz.min() / 1e6:.3f} to {tones_hz.max() / 1e6:.3f} MHz: take fewer blocks"
         )
     window = min(WINDOW_S, 0.8 / step)
-    turn = _mean_turn(channel, step) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
+    turn = _mean_turn(channel) if len(tones_hz) > 2 else torch.zeros(channel.shape[:-1])
     middle = float(tones_hz.mean())
     straight = channel * torch.polar(
         torch.ones(()), -turn[..., None] * torch.from_numpy((tones_hz - middle) / step).float()
@@ -48,7 +48,7 @@ def interpolated(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -
     return (straight @ matrix) * back
 
 
-def _mean_turn(channel: Tensor, step: float) -> Tensor:
+def _mean_turn(channel: Tensor) -> Tensor:
     """Phase per tone of the mean delay (...)."""
     return torch.angle((channel[..., 1:] * channel[..., :-1].conj()).sum(-1))
 

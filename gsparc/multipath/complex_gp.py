@@ -21,7 +21,7 @@ from gsparc.data.blocks import taken
 from gsparc.data.schema import Batch, Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.methods.covering import covering
-from gsparc.methods.method import FitContext, FitReport, LeftOut, Prediction, PredictsVariance
+from gsparc.methods.method import FitContext, FitReport, LeftOut, Method, Prediction
 from gsparc.methods.neighbourhood import Neighbourhood
 from gsparc.methods.vecchia import solved
 from gsparc.multipath.ridge import cholesky
@@ -51,7 +51,7 @@ class _Solved:
     aligning: Tensor
 
 
-class ComplexGP(PredictsVariance):
+class ComplexGP(Method):
     """`sinc(2 d / wavelength) * Matern-3/2(d / length)`; length and noise by likelihood on a grid."""
 
     name = "complex_gp"

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements, Site
-from gsparc.methods.method import LeftOut, Prediction, PredictsVariance
+from gsparc.methods.method import LeftOut, Method, Prediction
 from gsparc.multipath.rows import Rows, query_elements, static_array
 from gsparc.ops import Pose
 from gsparc.physics.waves import LIGHT
@@ -39,7 +39,7 @@ class Frame:
         return replace(rows, position=rows.position - self.middle, target=flat)
 
 
-class FramedMethod(PredictsVariance):
+class FramedMethod(Method):
     """A process on channels that is fitted in a frame.
 
     Attributes:

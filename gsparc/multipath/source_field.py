@@ -29,28 +29,56 @@ from gsparc.multipath.rows import Rows, gather
 from gsparc.ops import Pose
 
 
-class SourceField(ConditionalField):
-    """The scenes of an ensemble of searches.
+class MethodField(ConditionalField):
+    """What a fitted method found.
 
     Args:
         method: fitted.
     """
 
+    def __init__(self, method: ImageSourceGP | DirectionalGP) -> None:
+        super().__init__()
+        self.method = method
+
+    @property
+    def count(self) -> int:
+        """Sources, of the largest search."""
+        return self.method.size()
+
+    @torch.no_grad()
+    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
+        """See `ConditionalField`."""
+        found = self.method.predict(tx, rx)
+        assert found.variance is not None and found.confidence is not None
+        return Posterior(found.mean, found.variance, found.mean, 1 - found.confidence)
+
+    def left_out(self) -> LeftOutRows:
+        """See `ConditionalField`; of one channel per receiver."""
+        method, left = self.method, self.method.leave_one_out()
+        rows = method.members[0].rows if isinstance(method, ImageSourceGP) else method.rows
+        scale = (method.frame.carrier_hz / rows.frequency).float()[:, None] * method.frame.scale
+        mean = (rows.target * scale - left.residual)[:, :, None]
+        return LeftOutRows(left.rows, mean, torch.full((len(left.rows),), float("nan")))
+
+    def state(self) -> dict[str, Any]:
+        """The method's."""
+        return {"method": self.method.state()}
+
+
+class SourceField(MethodField):
+    """The scenes of an ensemble of searches."""
+
     kind = "sources"
+    method: ImageSourceGP
     rates: ClassVar[dict[str, float]] = {"planes": 1e-4}  # [m] of a plane's offset, and of its unit normal
 
     def __init__(self, method: ImageSourceGP) -> None:
-        super().__init__()
-        self.method, self.held = method, method.held
+        super().__init__(method)
+        self.held = method.held
         fixed = method.offsets != "none"  # those of every snapshot were estimated against these sources
         scenes = [] if fixed else [member.scene for member in method.members]
         self.planes = nn.ParameterList([scene.planes.clone() for scene in scenes])
         self.log_amplitudes = nn.ParameterList([scene.log_amplitude.clone() for scene in scenes])
-
-    @property
-    def count(self) -> int:
-        """Sources of the largest search."""
-        return self.method.size()
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -107,37 +135,12 @@ class SourceField(ConditionalField):
         method.members = [PhasedPosterior(held, scene, method.noise_floor) for scene in scenes]
         method.query = Query(method.members)
 
-    @torch.no_grad()
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`."""
-        return _posterior(self.method, tx, rx)
 
-    def left_out(self) -> LeftOutRows:
-        """See `ConditionalField`."""
-        return _left_out(self.method)
-
-    def state(self) -> dict[str, Any]:
-        """The method's."""
-        return {"method": self.method.state()}
-
-
-class RayField(ConditionalField):
-    """Sources where measured directions of arrival meet.
-
-    Args:
-        method: fitted.
-    """
+class RayField(MethodField):
+    """Sources where measured directions of arrival meet."""
 
     kind = "rays"
-
-    def __init__(self, method: DirectionalGP) -> None:
-        super().__init__()
-        self.method = method
-
-    @property
-    def count(self) -> int:
-        """Sources."""
-        return self.method.size()
+    method: DirectionalGP
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -152,19 +155,6 @@ class RayField(ConditionalField):
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ConditionalField`; places are triangulated anew, which is quick."""
         self.method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext())
-
-    @torch.no_grad()
-    def forward(self, tx: Tensor, rx: Pose) -> Posterior:
-        """See `ConditionalField`."""
-        return _posterior(self.method, tx, rx)
-
-    def left_out(self) -> LeftOutRows:
-        """See `ConditionalField`."""
-        return _left_out(self.method)
-
-    def state(self) -> dict[str, Any]:
-        """The method's."""
-        return {"method": self.method.state()}
 
 
 def restored_sources(site: Site, state: dict[str, Any]) -> SourceField:
@@ -201,18 +191,3 @@ def rows_of(method: ImageSourceGP, batch: Batch) -> Rows:
 
 def _detached(scene: Any) -> Any:
     return replace(scene, planes=scene.planes.detach().clone(), log_amplitude=scene.log_amplitude.detach())
-
-
-def _posterior(method: ImageSourceGP | DirectionalGP, tx: Tensor, rx: Pose) -> Posterior:
-    found = method.predict(tx, rx)
-    assert found.variance is not None and found.confidence is not None
-    return Posterior(found.mean, found.variance, found.mean, 1 - found.confidence)
-
-
-def _left_out(method: ImageSourceGP | DirectionalGP) -> LeftOutRows:
-    """Of one channel per receiver."""
-    left = method.leave_one_out()
-    rows = method.members[0].rows if isinstance(method, ImageSourceGP) else method.rows
-    scale = (method.frame.carrier_hz / rows.frequency).float()[:, None] * method.frame.scale
-    mean = (rows.target * scale - left.residual)[:, :, None]
-    return LeftOutRows(left.rows, mean, torch.full((len(left.rows),), float("nan")))

@@ -339,12 +339,11 @@ class Gsparc(LearnedField):
                 "gradient steps: none, %s", "no seconds are left" if learns(field) else "nothing to move"
             )
             return 0, field.count > 0
-        folder = context.run_dir / "steps"
+        inner = context.within("steps", resume=None)
         steps = self._most_steps(context)
         pace = Pace(steps, budget.seconds - budget.spent)
-        module = GaussianModule(field, self.loss, self.rates, steps, folder, pace)
+        module = GaussianModule(field, self.loss, self.rates, steps, inner.run_dir, pace)
         files = GsparcCheckpointIO(self, context.config_yaml, {"stage": "steps"})
-        inner = replace(context, run_dir=folder, resume=None)
         budget.pause()
         ran = run_stage(module, data, fold, inner, files, budget, [KeepBest(SHORT)], VALIDATE_EVERY)
         budget.go()

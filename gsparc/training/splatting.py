@@ -153,7 +153,7 @@ class LearnedField(Method):
         if self.refit and len(fold.val):
             every = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             resume = context.resume if stage == "refit" else None
-            again = replace(context, run_dir=context.run_dir / "refit", resume=resume)
+            again = context.within("refit", resume=resume)
             confidence = self.fitted().confidence
             seconds += self._stage("refit", origin, data, every, again, budget, seconds, confidence)
         self.frozen = None

@@ -18,6 +18,7 @@ NOT_THESE = ("test_operators",)  # registration
 NOT_HERE = {
     "test_absent_backends_say_why": "test_library.py has more of them",
     "test_every_instruction_set": "of the CPU",
+    "test_kernels_of_another_compiler_were_the_slowest_ones": "of the CPU",
     "test_networks_channels_and_similarity_have_forward_mode": "networks on a GPU take float32 alone",
     "test_thousands_are_ordered_alike_by_any_threads": "of the CPU",
 }

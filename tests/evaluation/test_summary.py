@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -14,7 +15,15 @@ import torch
 from rich.console import Console
 
 import gsparc.evaluation.summary
-from gsparc.evaluation.summary import provenance, remarks, results_table, write_samples, write_summary
+from gsparc.evaluation.summary import (
+    program,
+    provenance,
+    remarks,
+    result_rows,
+    results_table,
+    write_samples,
+    write_summary,
+)
 
 
 def test_numbers_strings_and_null(tmp_path):
@@ -92,3 +101,14 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     quiet["baseline/gp/psnr_db"] = 29.0
     assert remarks(quiet) == []
     assert "gp" in remarks({**quiet, "baseline/gp/psnr_db": 31.0})[0]
+
+
+def test_a_report_of_an_installed_wheel_was_made_at_commit_none():
+    assert re.fullmatch(r"gsparc \d+\.\d+\.\d+", program({"git": None}))
+    assert program({"git": "c0ffee00" * 5}).endswith(" at commit c0ffee00")
+
+
+def test_a_run_of_a_baseline_had_two_rows_of_one_name():
+    facts = {"dataset/kind": "csi", "test/nmse": 0.2, "baseline/gp/nmse": 0.1, "baseline/idw/nmse": 0.3}
+    assert [row[0] for row in result_rows(facts, "gp")[1]] == ["idw", "gp (baseline)", "gp"]
+    assert "the baseline gp has the better nmse" in remarks(facts)[-1]

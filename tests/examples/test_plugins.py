@@ -7,9 +7,13 @@ import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
 from campaigns import compose, spectra
 from hydra.core.config_store import ConfigStore
+from hydra.errors import MissingConfigException
+from invented import invent
+from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.commands.compare.cells import code_version, plugged
@@ -17,6 +21,9 @@ from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.plugins import offer
 from gsparc.commands.train import train
 from gsparc.data.load import datamodule
+from gsparc.data.splits import Fold
+from gsparc.evaluation.console import one_line
+from gsparc.methods.method import FitContext
 from gsparc.methods.registry import build, method_class
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -68,6 +75,29 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     assert plugged()["nearest_k"].overrides(None) == ["model=nearest_k"]
     again, *_ = evaluate_files([objects.checkpoints[0]])
     assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
+
+
+def test_a_plugin_was_no_nearest_name(installed):
+    """`model=nearest_kk` was answered with `nearest` beside an installed `nearest_k`."""
+    installed(EXAMPLES / "own-method")
+    with pytest.raises(MissingConfigException) as error:
+        compose("model=nearest_kk")
+    assert one_line(error.value) == "model=nearest_kk: no such choice; did you mean 'nearest_k'?"
+
+
+def test_a_method_that_could_not_answer_once_stored_was_trained(installed):
+    """Its table was shown; then `gsparc.load`, `evaluate` and `compare` failed on its checkpoint."""
+    installed(EXAMPLES / "own-method")
+
+    class Tree(method_class("nearest_k")):
+        def _learn(self, positions, targets):
+            self._tree = cKDTree(positions)
+            return super()._learn(positions, targets)
+
+    rows = np.arange(12)
+    fold = Fold(rows, rows[:0], rows[:0])
+    with pytest.raises(ValueError, match="nearest_k: its checkpoint loses _tree: name it in `stored`"):
+        Tree().fit(invent("rssi", 12), fold, FitContext())
 
 
 def test_without_the_plugin_its_checkpoint_is_refused(installed, tmp_path):

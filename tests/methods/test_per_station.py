@@ -227,3 +227,17 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
 def test_seconds_of_stations_were_said_to_be_unused(town):
     assert for_links(method_class("gsparc"), town).takes_budget
     assert not for_links(method_class("idw"), town).takes_budget
+
+
+def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
+    """A search keeps what it finds in `run_dir`; without one that of station 0 became ./station0."""
+    folders = []
+
+    class Writes(method_class("mean")):
+        def fit(self, data, fold, context):
+            folders.append(context.run_dir)
+            return super().fit(data, fold, context)
+
+    for context in (FitContext(), FitContext(tmp_path)):
+        for_links(Writes, town).fit(town, fold, context)
+    assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders

@@ -18,7 +18,7 @@ from gsparc.auto.auto_method import Auto
 from gsparc.data.splits import Fold
 from gsparc.methods import method as protocols
 from gsparc.methods.checkpoint import Stored, load
-from gsparc.methods.method import Differentiable, FitContext, HasVariance, Method, Reducible
+from gsparc.methods.method import Differentiable, FitContext, Method, Reducible
 from gsparc.methods.registry import METHODS
 from gsparc.methods.stored_front import kept
 from gsparc.multipath import complex_gp
@@ -31,20 +31,22 @@ FILES = {  # of methods whose name has changed since
     "gsparc": "gsparc_field", "array": "traded_array_field",
 }  # fmt: skip
 DECLARED = {
-    **dict.fromkeys(("zero", "mean", "nearest", "idw", "ridge", "fire", "uplink"), ""),
+    **dict.fromkeys(("zero", "mean", "nearest", "idw", "kriging", "ridge", "fire", "uplink", "auto"), ""),
     **dict.fromkeys(("gsrf", "wrfgs", "swiftwrf", "nerf2", "ngrf", "newrf"), ""),
     "calibrated_raytracer": "",
-    "kriging": "HasVariance",
-    "auto": "HasVariance",
-    "distance_law": "HasVariance Differentiable",
-    "gp": "HasVariance Differentiable Reducible",
-    "complex_gp": "HasVariance Differentiable LeaveOneOut",
-    "directional_gp": "HasVariance Differentiable LeaveOneOut HasPaths",
-    "image_source_gp": "HasVariance LeaveOneOut HasPaths Reducible",
-    "array": "HasVariance Differentiable Reducible",
-    "moving_array": "HasVariance Reducible",
+    "distance_law": "Differentiable",
+    "gp": "Differentiable Reducible",
+    "complex_gp": "Differentiable LeaveOneOut",
+    "directional_gp": "Differentiable LeaveOneOut HasPaths",
+    "image_source_gp": "LeaveOneOut HasPaths Reducible",
+    "array": "Differentiable Reducible",
+    "moving_array": "Reducible",
     "gsparc": "Differentiable HasPaths Reducible",
 }
+VARIANCE = (
+    "kriging", "auto", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
+    "moving_array",
+)  # fmt: skip
 PROTOCOLS = sorted({word for words in DECLARED.values() for word in words.split()})
 SMOOTH = {
     "gsparc": ["gsparc_field"],
@@ -103,21 +105,12 @@ def test_a_method_is_what_the_table_says(name):
     assert fitted(name).resumable == (name in ("image_source_gp", "gsparc"))
 
 
-@pytest.mark.parametrize("name", having("HasVariance"))
-def test_variance_is_that_of_a_prediction(name):
+@pytest.mark.parametrize("name", VARIANCE)
+def test_predictions_have_a_variance(name):
     method = fitted(name)
-    assert isinstance(method, HasVariance)
-    query = ends(method, places(method).float())
-    variance = method.variance_at(*query)
-    assert variance.shape == (5,) and variance.dtype == torch.float32 and (variance > 0).all()
-    assert torch.equal(variance, method.predict(*query).variance)
-
-
-def test_no_variance_is_said_where_there_is_none():
-    spectra = read("kriging_spectra")[0]
-    assert isinstance(spectra, HasVariance)
-    with pytest.raises(ValueError, match="kriging: has no variance of spectrum"):
-        spectra.variance_at(*ends(spectra, places(spectra).float()))
+    variance = method.predict(*ends(method, places(method).float())).variance
+    assert variance is not None and variance.shape == (5,)
+    assert variance.dtype == torch.float32 and (variance > 0).all()
 
 
 @pytest.mark.parametrize(

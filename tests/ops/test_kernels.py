@@ -1,6 +1,8 @@
 """The kernels against the float64 reference, forward and backward, on random fields."""
 
 import math
+import re
+from pathlib import Path
 
 import pytest
 import torch
@@ -109,6 +111,18 @@ def test_any_number_of_channels_and_samples(channels, samples):
     got = render(scene, poses(0), GRIDS["sphere"])
     assert got["image"].shape == (samples, channels, 24, 48)
     assert_close(got, want, 1e-9)
+
+
+def test_kernels_of_another_compiler_were_the_slowest_ones():
+    """The runtime library of zig's clang says of every instruction set that the processor lacks it."""
+    told = Path("/proc/cpuinfo")
+    flags = re.search(r"^flags\s*:(.*)", told.read_text() if told.exists() else "", re.MULTILINE)
+    if flags is None:
+        pytest.skip("no /proc/cpuinfo of an x86 processor")
+    has = set(flags[1].split())
+    wide = {"avx512f", "avx512dq", "avx512vl", "avx512bw", "bmi2", "avx2", "fma"}
+    best = "avx512" if wide <= has else "avx2" if {"avx2", "fma"} <= has else "baseline"
+    assert _native.instruction_set() == best
 
 
 @pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])

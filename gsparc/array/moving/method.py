@@ -31,7 +31,7 @@ from gsparc.field.conditional import LeftOutRows, Posterior
 from gsparc.methods.censored import heard
 from gsparc.methods.gp import Kernel
 from gsparc.methods.interpolation import Interpolator
-from gsparc.methods.method import FitContext, FitReport, Prediction, PredictsVariance
+from gsparc.methods.method import FitContext, FitReport, Prediction
 from gsparc.methods.target_rows import to_real, training_targets
 from gsparc.methods.time_budget import TimeBudget
 from gsparc.ops import Pose
@@ -70,7 +70,7 @@ class Spectra:
         return Spectra(self.places[rows], self.lags[rows], self.values[rows])
 
 
-class MovingArrayField(Interpolator, PredictsVariance):
+class MovingArrayField(Interpolator):
     """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
 
     With `trainer.budget_s` it searches until the budget is spent or the leave-one-out error stops falling.

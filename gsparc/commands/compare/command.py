@@ -182,7 +182,7 @@ def fill_all(
         except KeyboardInterrupt:
             kept = "interrupted; finished cells are kept: the same command goes on with the others"
             raise KeyboardInterrupt(kept) from None
-        except (ValueError, RuntimeError) as error:
+        except Exception as error:  # any error of a plugin: the other methods' table comes nevertheless
             log.warning("%s cannot be filled: %s", one.cell, one_line(error))
             broken.add(str(one.cell))
             if failed is not None:

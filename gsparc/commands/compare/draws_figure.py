@@ -38,7 +38,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 number,
                 row.value,
                 xerr=row.value_error or 0.0,
-                color=look(name)[0],
+                color=look(name).colour,
                 alpha=1.0 if row is best else 0.45,
                 capsize=2.5,
             )

@@ -59,7 +59,6 @@ def _panel(axis: Any, rows: Sequence[Row], horizontal: str, ours: str) -> None:
         known = [(getattr(r, horizontal), r.score_db, r.spread_db or 0.0) for r in own]
         points = [(max(x, LEAST_S), *rest) for x, *rest in known if x is not None]
         if points:
-            colour, mark = look(name)
-            style = {"color": colour, "marker": mark, "markersize": 11 if name == ours else 6, "capsize": 2}
+            style = look(name).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
             axis.errorbar(*zip(*points, strict=True), label=name, **style)
     logarithmic(axis, fine=False)

@@ -9,21 +9,21 @@ import numpy as np
 
 from gsparc.commands.link.adaptation import Rates
 from gsparc.commands.link.study import Curve
-from gsparc.evaluation.drawing import panels, save
+from gsparc.evaluation.drawing import GREY, PALETTE, panels, save
 from gsparc.methods.risk_threshold import binomial_interval
 
 STYLES = {
     "perfect@accepted": ("perfect, accepted", "black", "-"),
-    "ls@accepted": ("LS pilots, accepted", "tab:grey", "-"),
-    "lmmse@accepted": ("LMMSE pilots, accepted", "tab:green", "-"),
-    "predicted@accepted": ("predicted, accepted", "tab:blue", "-"),
-    "predicted_variance@accepted": ("predicted with its variance, accepted", "tab:purple", "-"),
-    "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", "tab:brown", "-"),
+    "ls@accepted": ("LS pilots, accepted", GREY, "-"),
+    "lmmse@accepted": ("LMMSE pilots, accepted", PALETTE[2], "-"),
+    "predicted@accepted": ("predicted, accepted", PALETTE[0], "-"),
+    "predicted_variance@accepted": ("predicted with its variance, accepted", PALETTE[3], "-"),
+    "predicted_pilots@accepted": ("prediction corrected by pilots, accepted", PALETTE[6], "-"),
     "perfect": ("perfect, all", "black", ":"),
-    "lmmse": ("LMMSE pilots, all", "tab:green", ":"),
-    "predicted": ("predicted, all", "tab:red", ":"),
-    "predicted_pilots": ("prediction corrected by pilots, all", "tab:brown", ":"),
-    "fallback": ("predicted, else LMMSE pilots, all", "tab:orange", "--"),
+    "lmmse": ("LMMSE pilots, all", PALETTE[2], ":"),
+    "predicted": ("predicted, all", PALETTE[1], ":"),
+    "predicted_pilots": ("prediction corrected by pilots, all", PALETTE[6], ":"),
+    "fallback": ("predicted, else LMMSE pilots, all", PALETTE[4], "--"),
 }
 SHORT = {
     "perfect": ("k-o", "perfect"), "lmmse": ("g-o", "lmmse"), "predicted": ("b-o", "predicted"),

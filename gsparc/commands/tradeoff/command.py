@@ -20,6 +20,7 @@ from gsparc.commands.tradeoff.sweep import Candidate, sweep
 from gsparc.data.files import platform_cache
 from gsparc.data.splits import Split
 from gsparc.evaluation.baseline_cache import baseline
+from gsparc.evaluation.drawing import save
 from gsparc.evaluation.figures import DECIDING, score_of
 from gsparc.evaluation.open_runs import Opened, open_files, trained_on
 from gsparc.evaluation.scores import rows_of, score
@@ -67,7 +68,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "tradeoff.csv", _columns(points, shown, chosen, copy_ms))
     best = [points[i] for i in shown]
     title = f"{data.site.name}, split {run.split.name}, {config.eval_on}: {method.name}"
-    draw(points, shown, beside, figure, title, run_dir / "tradeoff.png")
+    save(draw(points, shown, beside, figure, method.name, title), run_dir / "tradeoff.png")
     facts = {
         **_facts(points, best, figure, beside, copy_ms),
         **machine_facts(), **peak_memory(), **provenance(), **run.facts(),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-from gsparc.evaluation.drawing import logarithmic, panels, save
+from matplotlib.figure import Figure
+
+from gsparc.evaluation.drawing import logarithmic, look, panels
 from gsparc.evaluation.figures import lower_is_better, score_of
 from gsparc.methods.pareto import Point
 
@@ -37,34 +38,36 @@ def draw(
     on_front: Sequence[int],
     others: Mapping[str, Other],
     figure_name: str,
+    method: str,
     title: str,
-    path: Path,
-) -> None:
-    """Save the picture.
+) -> Figure:
+    """The picture.
 
     Args:
         points: all of them.
         on_front: indices of the front, fastest first.
         others: baselines and peers by name.
         figure_name: key of the accuracy.
+        method: whose points they are.
         title: what was measured.
-        path: PNG file.
     """
-    figure, ((axes, legend),) = panels(11, 5.2, 1, 2, grid=False, width_ratios=(1.5, 1))
+    lines = 0.16 * (len(on_front) + 1)  # inches of the legend
+    figure, ((axes,), (legend,)) = panels(7.5, 4.2 + lines, 2, 1, grid=False, height_ratios=(4.2, lines))
     value = [p.value(figure_name) for p in points]
     inside = [i for i in range(len(points)) if i not in on_front]
     axes.scatter([points[i].p50 for i in inside], [value[i] for i in inside], s=9, c="0.75", label="beaten")
 
     x, y = [points[i].p50 for i in on_front], [value[i] for i in on_front]
     reach = [[0.0] * len(x), [points[i].p95 - points[i].p50 for i in on_front]]
-    label = "not beaten (to 95th percentile)"
-    axes.errorbar(x, y, xerr=reach, fmt="o-", color="C0", capsize=2, lw=1, label=label)
-    near = {"textcoords": "offset points"}
+    own, label = look(method).colour, "not beaten (to 95th percentile)"
+    axes.errorbar(x, y, xerr=reach, fmt="o-", color=own, capsize=2, lw=1, ms=4, label=label)
     for number, place in enumerate(zip(x, y, strict=True), 1):
-        axes.annotate(str(number), place, xytext=(-3, 6), color="C0", **near)
+        above = (-9, 5 if number % 2 else -13)  # or below: near points would cover each other's numbers
+        axes.annotate(str(number), place, above, textcoords="offset points", color=own, fontsize=9)
     for name, other in others.items():
-        axes.scatter([other.p50], [other.value], marker="s", c="C1", s=28)
-        axes.annotate(name, (other.p50, other.value), xytext=(6, -4), color="C1", **near)
+        axes.plot([other.p50], [other.value], ms=6, **look(name).marked)
+        place = other.p50, other.value
+        axes.annotate(name, place, (6, -4), textcoords="offset points", color=look(name).colour)
     logarithmic(axes)
     worst, best = min(y), max(y)  # far-off others would flatten the front
     if lower_is_better(figure_name):
@@ -74,19 +77,18 @@ def draw(
         axes.set_ylim(worst - 0.4 * (best - worst) - 0.5, best + 0.15 * (best - worst) + 0.1)
         below = [name for name, other in others.items() if other.value < axes.get_ylim()[0]]
         if below:
-            said = f"below: {', '.join(below)}"
-            axes.text(0.01, 0.01, said, transform=axes.transAxes, color="C1", fontsize=8)
+            axes.text(0.01, 0.01, f"below: {', '.join(below)}", transform=axes.transAxes, fontsize=8)
     axes.set(xlabel="one query end to end, median [ms]", ylabel=NAMES.get(figure_name, figure_name))
-    axes.grid(alpha=0.3, which="both")
+    axes.grid(alpha=0.3)
     axes.legend(loc="lower right", fontsize=8)
     axes.set_title(title, fontsize=10)
     winner = {i: beaten_by(points[i], others, figure_name) for i in on_front}
-    lines = [
+    told = [
         f"{number:2d}  {points[i].p50:7.3g} ms  {value[i]:7.4g}  {points[i].label}"
         + (f" ({winner[i]} is better)" if winner[i] else "")
         for number, i in enumerate(on_front, 1)
     ]
     legend.axis("off")
-    text = "\n".join(["       median  accuracy  settings", *lines])
+    text = "\n".join(["       median  accuracy  settings", *told])
     legend.text(0, 1, text, va="top", family="monospace", fontsize=7.5)
-    save(figure, path)
+    return figure

@@ -31,14 +31,14 @@ class Study:
         title: dataset and split.
         remarks: what a reader must know first.
         tables: in reading order.
-        plots: SVG texts.
+        plots: titles, whether they take a whole line, and SVG texts.
         pictures: captions and PNG data in base64.
     """
 
     title: str
     remarks: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    plots: list[str] = field(default_factory=list)
+    plots: list[tuple[str, bool, str]] = field(default_factory=list)
     pictures: list[tuple[str, str]] = field(default_factory=list)
 
 
@@ -67,7 +67,11 @@ def _study(title: str, group: Sequence[Run], fronts: Sequence[dict[str, np.ndarr
         plots.pareto(runs, fronts), plots.accuracy_cdf(runs), plots.latency_cdf(runs), plots.learning(runs),
         plots.costs(runs), plots.measurements(runs), plots.confidence(runs),
     )  # fmt: skip
-    study.plots = [_unique_ids(plots.svg(figure), i) for i, figure in enumerate(drawn) if figure is not None]
+    study.plots = [
+        (str(figure.get_label()), figure.get_figwidth() > plots.WIDE, _unique_ids(plots.svg(figure), i))
+        for i, figure in enumerate(drawn)
+        if figure is not None
+    ]
     firsts = [group[0] for group in tables.grouped(runs).values()]
     study.pictures = [
         (run.setting, _png(run.folder / "test.png"))

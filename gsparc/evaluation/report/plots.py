@@ -1,4 +1,4 @@
-"""Plots of runs, each an SVG text."""
+"""Plots of runs, each an SVG text; a figure's label is its title, which the page sets as text."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from matplotlib.ticker import NullFormatter
 from scipy.stats import spearmanr
 
 from gsparc.data.schema import Kind
-from gsparc.evaluation.drawing import PALETTE, logarithmic, look, panels, save
+from gsparc.evaluation.drawing import logarithmic, look, numbered, panels, save
 from gsparc.evaluation.figures import PER_SAMPLE, heading_of, lower_is_better, score_of
 from gsparc.evaluation.report.intervals import interval, over_seeds
 from gsparc.evaluation.report.learning import curve, validation_figure
@@ -25,6 +25,7 @@ from gsparc.evaluation.report.tables import BASELINES, grouped
 from gsparc.methods.pareto import front
 
 WIDE, TALL = 7.0, 3.8
+MOST_CONFIDENCES = 8
 BAND = 0.95
 CDFS: dict[Kind, tuple[str, ...]] = {
     "spectrum": ("ssim_gauss", "psnr_db", "mse"), "csi": ("snr_db", "error_power"), "rssi": ("error_db",)
@@ -44,7 +45,7 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
     """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
     name, axes = runs[0].figure, _axes()
     points: list[tuple[float, float]] = []
-    for (setting, group), color in _coloured(runs):
+    for (setting, group), style in _styled(runs):
         for run in group:
             p50, p95 = run.latency
             found = interval(run, name)
@@ -54,22 +55,17 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
             axes.errorbar(
                 [p50], [found.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
                 yerr=[[max(found.value - low, 0.0)], [max(high - found.value, 0.0)]],
-                fmt="o", ms=4, lw=0.7, color=color,
+                fmt="o", ms=4, lw=0.7, color=style["color"],
                 label=setting if run is group[0] else None,
             )  # fmt: skip
             points.append((p50, found.value))
-    for base in BASELINES:
+    for base in _beside(runs):
         value, ms = (runs[0].facts.get(f"baseline/{base}/{key}") for key in (name, "render_ms_p50"))
         if value is not None and ms is not None:
-            colour, mark = look(base)
-            axes.scatter([ms], [value], marker=mark, s=16, color=colour)
-            how: dict[str, Any] = {
-                "xytext": (4, -3),
-                "textcoords": "offset points",
-                "fontsize": 7,
-                "color": colour,
-            }
-            axes.annotate(base, (ms, value), **how)
+            axes.plot([ms], [value], **look(base).marked, ms=4)
+            axes.annotate(
+                base, (ms, value), (4, -3), textcoords="offset points", fontsize=7, color=look(base).colour
+            )
             points.append((float(ms), float(value)))
     for columns in fronts:
         if name in columns:
@@ -91,16 +87,15 @@ def pareto(runs: Sequence[Run], fronts: Sequence[dict[str, np.ndarray]] = ()) ->
 def accuracy_cdf(runs: Sequence[Run]) -> Figure:
     """Share of test samples that are at most so good, per setting, with 95 % bands."""
     name, axes = PER_SAMPLE[runs[0].kind], _axes()
-    for (setting, group), color in _coloured(runs):
+    for (setting, group), style in _styled(runs):
         values = [sizes(run, name) for run in group if name in run.samples]
         if values:
             pooled = np.concatenate(values)
-            _cdf(axes, pooled[np.isfinite(pooled)], setting, color, samples=len(values[0]))
-    rival = runs[0].samples.get(f"baseline/gp/{name}")
+            _cdf(axes, pooled[np.isfinite(pooled)], setting, style, samples=len(values[0]))
+    rival = runs[0].samples.get(f"baseline/gp/{name}") if "gp" in _beside(runs) else None
     if rival is not None:
-        axes.step(
-            np.sort(rival), np.arange(1, len(rival) + 1) / len(rival), c=look("gp")[0], lw=0.8, label="gp"
-        )
+        share = np.arange(1, len(rival) + 1) / len(rival)
+        axes.step(np.sort(rival), share, lw=0.8, label="gp", **look("gp").line)
     axes.set_ylabel("share of samples")
     title = "How the accuracy is distributed (95 % bands)"
     return _finished(axes, title, f"{heading_of(name)} of a test sample")
@@ -114,17 +109,17 @@ def distributions(runs: Sequence[Run], title: str, path: Path) -> None:
     names = [name for name in CDFS[runs[0].kind] if name in runs[0].samples]
     timed = any(len(run.render_ms) for run in runs)
     figure, ((*line,),) = panels(4.2 * (len(names) + timed), 3.9, 1, len(names) + timed)
-    for (setting, group), color in _coloured(runs):
+    for (setting, group), style in _styled(runs):
         seconds = np.mean([float(run.facts["time/train_s"]) for run in group])
         ms = [p50 for p50, _ in (run.latency for run in group) if p50 is not None]
         label = f"{short(setting, 40)}: {seconds:.3g} s, {np.mean(ms):.3g} ms"
         for axes, name in zip(line, names, strict=False):
             values = np.abs(np.concatenate([run.samples[name] for run in group]))
-            _cdf(axes, values[np.isfinite(values)], label, color, samples=len(group[0].samples[name]))
+            _cdf(axes, values[np.isfinite(values)], label, style, samples=len(group[0].samples[name]))
             axes.set_xlabel(heading_of(name))
         if timed:
             every = [run.render_ms for run in group if len(run.render_ms)]
-            _cdf(line[-1], np.concatenate(every), label, color)
+            _cdf(line[-1], np.concatenate(every), label, style)
             line[-1].set_xlabel("one query, alone [ms]")
             logarithmic(line[-1], fine=True)
     for axes, name in zip(line, names, strict=False):
@@ -144,36 +139,40 @@ def latency_cdf(runs: Sequence[Run]) -> Figure | None:
     if not timed:
         return None
     axes = _axes()
-    for (setting, group), color in _coloured(timed):
-        _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, color)
+    for (setting, group), style in _styled(timed):
+        _cdf(axes, np.concatenate([run.render_ms for run in group]), setting, style)
     logarithmic(axes)
     axes.set_ylabel("share of queries")
     title = "Render times, measured after the sweep, alone and in turns (95 % bands)"
     return _finished(axes, title, "one query, end to end [ms]")
 
 
-def _cdf(axes: Axes, values: np.ndarray, label: str, color: str, samples: int | None = None) -> None:
+def _cdf(
+    axes: Axes, values: np.ndarray, label: str, style: dict[str, Any], samples: int | None = None
+) -> None:
     """With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and Wolfowitz 1956; Massart)."""
     share = np.arange(1, len(values) + 1) / len(values)
     half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * (samples or len(values))))
-    axes.step(np.sort(values), share, where="post", color=color, lw=1.2, label=label)
+    axes.step(np.sort(values), share, where="post", lw=1.2, label=label, **style)
     low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
-    axes.fill_between(np.sort(values), low, high, step="post", color=color, alpha=0.08, lw=0)
+    axes.fill_between(np.sort(values), low, high, step="post", color=style["color"], alpha=0.08, lw=0)
 
 
 def learning(runs: Sequence[Run]) -> Figure:
     """Validation accuracy against seconds of learning; settings of several seeds as a band."""
     name, axes = validation_figure(runs[0]), _axes()
-    for (setting, group), color in _coloured(runs):
+    for (setting, group), style in _styled(runs):
         curves = [curve(run) for run in group]
         for run, (seconds, values) in zip(group, curves, strict=True):
             label = setting if run is group[0] else None
             axes.plot(
-                seconds, values, "o-" if len(seconds) > 1 else "D", ms=3, lw=1, color=color, label=label
+                seconds, values, marker="D" if len(seconds) == 1 else "o", ms=3, lw=1, label=label, **style
             )
         if len(group) > 1 and len({len(seconds) for seconds, _ in curves}) == 1:
             when, every = (np.stack(parts) for parts in zip(*curves, strict=True))
-            axes.fill_between(when.mean(0), every.min(0), every.max(0), color=color, alpha=0.15, lw=0)
+            axes.fill_between(
+                when.mean(0), every.min(0), every.max(0), color=style["color"], alpha=0.15, lw=0
+            )
     logarithmic(axes)
     _accuracy_axis(axes, name)
     what = "seconds of learning (diamond: trained in one piece, test rows)"
@@ -193,7 +192,7 @@ def costs(runs: Sequence[Run]) -> Figure:
         heading_of(name): lambda run: run.figure_of(name),
     }
     for panel, (title, value) in zip(line, columns.items(), strict=True):
-        for row, ((_, group), color) in enumerate(_coloured(runs)):
+        for row, ((_, group), style) in enumerate(_styled(runs)):
             known = [float(v) for v in map(value, group) if v is not None]
             if not known:
                 panel.text(0, row, " none", va="center", fontsize=7, color="0.5")
@@ -201,7 +200,7 @@ def costs(runs: Sequence[Run]) -> Figure:
             found = over_seeds(known)
             low, high = found.low or found.value, found.high or found.value
             reach = [[found.value - low], [high - found.value]]
-            panel.barh(row, found.value, color=color, alpha=0.8)
+            panel.barh(row, found.value, color=style["color"], alpha=0.8)
             panel.errorbar([found.value], [row], xerr=reach, c="k", lw=0.8)
             panel.text(found.value, row, f" {found.value:.3g}", va="center", fontsize=7)
         panel.set_title(title, fontsize=8)
@@ -209,7 +208,7 @@ def costs(runs: Sequence[Run]) -> Figure:
         panel.margins(x=0.3)
     line[0].set_yticks(range(len(groups)), [short(setting) for setting in groups])
     line[0].invert_yaxis()
-    figure.suptitle("Total costs (lines: spread over seeds)", fontsize=9)
+    figure.set_label("Total costs (lines: spread over seeds)")
     return figure
 
 
@@ -221,15 +220,15 @@ def measurements(runs: Sequence[Run]) -> Figure | None:
     series: dict[str, dict[int, list[float]]] = {}
     for run in runs:
         found = {str(run.facts.get("model/name")): run.figure_of(name)}
-        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in BASELINES}
+        found |= {base: run.facts.get(f"baseline/{base}/{name}") for base in _beside(runs)}
         for method, value in found.items():
             if value is not None:
                 series.setdefault(method, {}).setdefault(run.measured, []).append(float(value))
     for method, by_count in series.items():
-        counts, color = sorted(by_count), look(method)[0]
+        counts, style = sorted(by_count), look(method)
         mean, low, high = ([float(of(by_count[n])) for n in counts] for of in (np.mean, min, max))
-        axes.plot(counts, mean, "o-", ms=3, lw=1, color=color, label=method)
-        axes.fill_between(counts, low, high, color=color, alpha=0.15, lw=0)
+        axes.plot(counts, mean, ms=4, lw=1, label=method, **style.marked)
+        axes.fill_between(counts, low, high, color=style.colour, alpha=0.15, lw=0)
     logarithmic(axes)
     _accuracy_axis(axes, name)
     title = "Accuracy against the number of measurements (band: seeds)"
@@ -243,33 +242,41 @@ def confidence(runs: Sequence[Run]) -> Figure | None:
     if not sure:
         return None
     figure, ((points, kept),) = panels(WIDE, TALL, 1, 2)
-    for number, run in enumerate(sure[:8]):
+    shown = [(run, style) for (_, group), style in _styled(sure) for run in group]
+    for run, style in shown[:MOST_CONFIDENCES]:
         value, stated = sizes(run, name), run.samples["confidence"]
         known = np.isfinite(value) & np.isfinite(stated)
         stated, value = stated[known], value[known]
         if len(stated) < 3 or np.ptp(stated) == 0:
             continue
-        rank, color = spearmanr(stated, value).statistic, PALETTE[number]
+        rank = spearmanr(stated, value).statistic
         order, count = np.argsort(-stated, kind="stable"), np.arange(1, len(stated) + 1)
         share, mean = count / len(count), np.cumsum(value[order]) / count
         error = value.std(ddof=1) / np.sqrt(count)
+        color = style["color"]
         points.scatter(stated, value, s=8, color=color, label=f"{short(run.setting)}: rank {rank:+.2f}")
-        kept.plot(share, mean, color=color, lw=1)
+        kept.plot(share, mean, lw=1, **style)
         kept.fill_between(share, mean - 1.96 * error, mean + 1.96 * error, color=color, alpha=0.1, lw=0)
     points.set(xlabel="confidence", ylabel=heading_of(name))
     kept.set_xlabel("share of answers used, most confident first")
     kept.set_title("mean over the answers used (95 % band)", fontsize=8)
+    figure.set_label("Error against confidence")
     _legend(points)
     return figure
 
 
-def _coloured(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], str]]:
-    """Settings with their runs and a colour: a method's own where each has one setting, else one by one."""
+def _beside(runs: Sequence[Run]) -> list[str]:
+    """Baselines that no run is of."""
+    return [base for base in BASELINES if base not in {run.facts.get("model/name") for run in runs}]
+
+
+def _styled(runs: Sequence[Run]) -> list[tuple[tuple[str, list[Run]], dict[str, Any]]]:
+    """Settings, their runs, colour and line: a method's own where each has one setting, else one by one."""
     groups = grouped(runs)
     names = [str(group[0].facts.get("model/name")) for group in groups.values()]
     alone = len(set(names)) == len(names)
-    colours = [look(name)[0] if alone else PALETTE[i % len(PALETTE)] for i, name in enumerate(names)]
-    return list(zip(groups.items(), colours, strict=True))
+    styles = [look(name).line if alone else numbered(i) for i, name in enumerate(names)]
+    return list(zip(groups.items(), styles, strict=True))
 
 
 def _axes() -> Axes:
@@ -278,7 +285,7 @@ def _axes() -> Axes:
 
 def _finished(axes: Axes, title: str, horizontal: str) -> Figure:
     axes.set_xlabel(horizontal)
-    axes.set_title(title, fontsize=9)
+    axes.figure.set_label(title)
     _legend(axes)
     return axes.figure  # type: ignore[return-value]
 

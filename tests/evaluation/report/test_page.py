@@ -8,9 +8,11 @@ from xml.etree import ElementTree
 import pytest
 from campaigns import compose
 from hydra.core.hydra_config import HydraConfig
+from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
+from gsparc.evaluation.drawing import look
 from gsparc.evaluation.report import plots
 from gsparc.evaluation.report.page import html, studies, warnings
 from gsparc.evaluation.report.readme import BEGIN, END, refresh
@@ -64,7 +66,22 @@ def test_every_plot_is_a_whole_drawing(three):
     for figure in drawn:
         assert figure is not None
         assert ElementTree.fromstring(plots.svg(figure)).tag.endswith("svg")
+        title = figure.get_label()
+        assert title and title not in plots.svg(figure)
     assert plots.latency_cdf(runs) is None and plots.measurements(runs[:2]) is None
+
+
+def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
+    """And in the plot of confidences it had the colour of another method."""
+    for name in ("gsparc", "gp"):
+        run_dir(tmp_path / name, name=name)
+    runs = find_runs([tmp_path])
+    axes = plots.accuracy_cdf(runs).axes[0]
+    assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
+    points = plots.confidence(runs).axes[0].collections
+    assert {to_hex(one.get_facecolor()[0]).upper() for one in points} == {
+        look(name).colour for name in ("gsparc", "gp")
+    }
 
 
 def test_the_figure_that_ends_a_sweep(three, tmp_path):
@@ -101,10 +118,15 @@ def test_the_table_of_a_document_is_replaced_between_its_marks(three, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 360])
 def test_a_real_browser_opens_sorts_and_fits(written, width, browser):
-    browser.set_window_size(width, 900)
+    screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)  # a window is never so narrow
     browser.get((written[1] / "report.html").as_uri())
     assert browser.get_log("browser") == []  # no error, nothing that could not be fetched
     assert browser.execute_script("return performance.getEntriesByType('resource').length") == 0
+    captions = browser.execute_script(
+        "return [...document.querySelectorAll('figcaption')].map(c => c.getBoundingClientRect().right)"
+    )
+    assert captions and max(captions) <= width  # titles of plots were cut on a phone until scrolled
     page = browser.execute_script("return document.documentElement.scrollWidth")
     assert page <= browser.execute_script("return window.innerWidth")  # tables scroll, the page does not
     table = browser.execute_script("return [...document.querySelectorAll('table')][1]")
