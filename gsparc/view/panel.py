@@ -9,7 +9,8 @@ import numpy as np
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import panels
 from gsparc.ops import SphereGrid
-from gsparc.view.answer import Answer, Usual
+from gsparc.view.answer import Answer
+from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")

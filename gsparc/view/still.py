@@ -64,7 +64,7 @@ def draw_still(view: SiteView, path: Path) -> None:
         bar = figure.colorbar(scale, ax=axis, shrink=0.7, pad=0.01, location="bottom", aspect=40)
         bar.set_label(legend.label, fontsize="small")
         bar.ax.tick_params(labelsize="small")
-    draw_answer(axes[0, 1], answer, viewed.site, one.usual, view.unit)
+    draw_answer(axes[0, 1], answer, viewed.site, one.about.usual, view.unit)
     axes[0, 1].set_title("\n".join(headline(answer, view.unit).rsplit(", ", 1)), fontsize="small")
     figure.suptitle(one.scene.title)
     save(figure, path, DPI)

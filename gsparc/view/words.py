@@ -5,6 +5,8 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from gsparc.view.answer import Answer
 from gsparc.view.scene import Legend
 
@@ -27,7 +29,8 @@ def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str
     """An answer and why, for a panel."""
     lines = [f"**{headline(answer, unit)}**", ""]
     lines += [
-        f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in answer.ends[end])} m" for end in moving
+        f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"
+        for end in moving  # + 0.0: no minus before nought
     ]
     lines += [f"- {reason}" for reason in reasons]
     return "\n".join(lines)

@@ -99,7 +99,7 @@ def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
     view = SiteView(power_view.viewed, grid=power_view.grid, layers=tuple((found.grid, one) for one in made))
     session = visit(view)
     settle(session)
-    session.chosen.value = "outage"
+    session.chosen.value = "map: outage"
     session.want_plane()
     settle(session)
     assert session.nodes["plane"].image.shape[:2] == found.grid.shape
@@ -124,7 +124,10 @@ def test_operating_points_are_steps_with_their_accuracy_and_live_milliseconds(vi
     settle(session)
     assert re.search(r"stride 2, psnr_db 20: query \*\*[\d.]+ ms\*\*", session.speed.content)
     assert (session.picture.image != full).any()
-    assert [list(part) for part in session._front()] == [[0.5, 2.0], [20.0, 25.0]]
+    took, reached, chosen = session._front()
+    assert (list(took), list(reached)) == ([0.5, 2.0], [20.0, 25.0])
+    np.testing.assert_array_equal(chosen, [20.0, np.nan])  # what is shown was not marked among the others
+    np.testing.assert_array_equal(session.front.data[2], chosen)
 
 
 def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):

@@ -70,13 +70,13 @@ def _sheet(api: Any, frame: Frame, part: Sheet, visible: bool) -> Any:
     )  # fmt: skip
 
 
-def floor(api: Any, scene: Scene, box: np.ndarray) -> float:
-    """A grid beneath the box (2, 3) [m]; returns the side of its cells [m]."""
+def floor(api: Any, scene: Scene) -> float:
+    """A grid beneath the scene; returns the side of its cells [m]."""
     frame = scene.frame
     wide = EXTENT / frame.scale
     side = 10.0 ** np.floor(np.log10(wide / 5))
     side *= next(n for n in (5, 2, 1) if n * side <= wide / 5)
-    middle = np.array([*frame.middle[:2], box[0, 2] - 1e-3 * wide])
+    middle = np.array([*frame.middle[:2], scene.ground])
     api.add_grid(
         "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale,
         section_size=5 * side * frame.scale, position=frame.drawn(middle), shadow_opacity=0.0,

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import viser
 
-from gsparc.view.answer import Answer, Usual, ask
+from gsparc.view.answer import Answer, ask
 from gsparc.view.building import SPHERE, rays_of
 from gsparc.view.panel import panel_image
 from gsparc.view.plane import refining, sheet
+from gsparc.view.reasons import Usual
 from gsparc.view.scene import EXTENT, Legend, Points, Sheet
 from gsparc.view.server.draw import draw, first_view, floor
 from gsparc.view.site_view import SiteView, walk
@@ -54,14 +55,14 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     for part in scene.parts:
         if part.name not in scene.hidden:
             draw(api, scene.frame, part)
-    side = floor(api, scene, viewed.box())
+    side = floor(api, scene)
     legends = [legend for part, legend in scene.legends.items() if part not in scene.hidden]
     if view.grid is not None:
         *_, plane = refining(viewed.asked(name), view.grid, _other(view))
         assert plane is not None
         legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
-        draw(api, scene.frame, sheet("plane", view.grid, plane.level_db, legend))
+        draw(api, scene.frame, sheet("plane", view.grid, plane.level_db, legend, one.dot / 2))
     places = walk(view, name, steps)
     answers = [ask(viewed.asked(name), {**view.starts(name), moving: place}) for place in places]
     recorder = server.get_scene_serializer()
@@ -78,7 +79,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             draw(api, scene.frame, dots)
         for part in rays_of(answer, view.extent(name)) or ():
             draw(api, scene.frame, part)
-        draw(api, scene.frame, _upright(answer, view, one.usual, scene.frame.middle, view.extent(name)))
+        draw(api, scene.frame, _upright(answer, view, one.about.usual, scene.frame.middle, view.extent(name)))
         recorder.insert_sleep(PAUSE_S)
     said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=len(places), end=ENDS[moving])]
     return recorder.as_html(), _beside(scene.title, said, legends)

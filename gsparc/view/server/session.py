@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.view.answer import Answer, ask, reasons
+from gsparc.view.answer import Answer, ask
 from gsparc.view.building import (
     ERRORS,
     GAUSSIANS,
@@ -28,6 +28,7 @@ from gsparc.view.newest import Newest
 from gsparc.view.panel import degrees_of, response_db, response_db_of_antennas, spectrum_image, tones_mhz
 from gsparc.view.plane import Plane, lifted, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
+from gsparc.view.reasons import reasons
 from gsparc.view.scene import EXTENT, Legend, Points
 from gsparc.view.server.draw import draw, first_view, floor
 from gsparc.view.site_view import SiteView
@@ -36,10 +37,19 @@ from gsparc.view.words import ENDS, answer_markdown, legend_html
 PREDICTED, NOTHING = "predicted power", "nothing"
 FIRST_PLACE, WEAKEST = "first place", "weakest cell"
 PLANE = "plane"
+PADDING = (12, 8, 0, 0)  # of plots: else their highest number is cut [pixels]
 KEPT = 50  # times that a median is taken of
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-DOTS = tuple({"width": 0, "stroke": colour, "points": {"show": True, "size": 7}} for colour in COLOURS)
+DOTS = (
+    {"width": 0, "stroke": COLOURS[0], "points": {"show": True, "size": 7}},
+    {"width": 0, "stroke": COLOURS[1], "points": {"show": True, "size": 10, "fill": COLOURS[1]}},
+)
 LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
+
+
+def map_name(layer: str) -> str:
+    """Of a layer that `gsparc map` made, to choose it by."""
+    return f"map: {layer.replace('_', ' ')}"
 
 
 class Session:
@@ -90,7 +100,7 @@ class Session:
             for part in self.scene.parts
             if part.name not in self.scene.hidden
         }
-        self.cell = floor(api, self.scene, self.view.viewed.box())
+        self.cell = floor(api, self.scene)
         if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
             around, black = (
                 self.scene.frame.middle + self.sphere.offsets,
@@ -145,7 +155,8 @@ class Session:
                 self._on(self.way, self._way_changed)
             self.speed = gui.add_markdown("")
             if last:
-                self._plot(self._front(), f"{viewed.ways[0].figure} by ms of a query, as swept", DOTS)
+                title = f"{viewed.ways[0].figure} by ms of a query, as swept; filled: this one"
+                self.front = self._plot(self._front(), title, DOTS)
         with gui.add_folder("Notes", expand_by_default=False):
             gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
         self._legends()
@@ -165,17 +176,15 @@ class Session:
             self.chosen: Any = None
             if self.view.grid is not None or self.view.layers:
                 names = ((PREDICTED,) if self.view.grid is not None else ()) + tuple(
-                    layer.name for _, layer in self.view.layers
+                    map_name(layer.name) for _, layer in self.view.layers
                 )
                 self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
                 self._on(self.chosen, lambda value: self.want_plane())
                 self.progress = gui.add_markdown("")
             if self.view.grid is not None:
-                low, high = self.view.heights()
-                low, high = min(low, self.view.grid.height), max(high, self.view.grid.height)
-                self.height = gui.add_slider(
-                    "height [m]", low, high, round((high - low) / 100, 4), self.view.grid.height
-                )
+                low, high = self.view.viewed.heights()
+                first = round(self.view.grid.height, 2)
+                self.height = gui.add_slider("height [m]", min(low, first), max(high, first), 0.01, first)
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
@@ -256,12 +265,16 @@ class Session:
     def _way_changed(self, value: int) -> None:
         self.queries.clear()
         self.delays.clear()
+        self.front.data = self._front()
         self.wanted()
 
-    def _front(self) -> tuple[np.ndarray, np.ndarray]:
-        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first."""
-        swept = np.array(sorted(one.swept[::-1] for one in self.view.viewed.ways if one.swept is not None))
-        return swept[:, 0], swept[:, 1]
+    def _front(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first, and
+        that of the chosen one, NaN elsewhere."""
+        ways = self.view.viewed.ways
+        swept = sorted((*one.swept[::-1], k) for k, one in enumerate(ways) if one.swept is not None)
+        took, reached, number = np.array(swept).T
+        return took, reached, np.where(number == self.way.value, reached, np.nan)
 
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
@@ -327,7 +340,7 @@ class Session:
 
     def _show(self, answer: Answer) -> None:
         one = self.one
-        why = reasons(answer, self.view.viewed.moving[-1], one.usual, one.objects, self.site.origin)
+        why = reasons(answer, self.view.viewed.moving[-1], one.about)
         with self.client.atomic():
             self.said.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:
@@ -391,7 +404,7 @@ class Session:
         series = ({}, *looks[: len(data) - 1])
         return self.client.gui.add_uplot(
             data, series, title=title, scales={"x": {"time": False}}, legend={"show": False}, height=170,
-            order=order,
+            order=order, padding=PADDING,
         )  # fmt: skip
 
     def _after(self) -> float:
@@ -399,11 +412,19 @@ class Session:
 
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
-        made = next(((grid, layer) for grid, layer in self.view.layers if layer.name == name), None)
+        made = next(((grid, layer) for grid, layer in self.view.layers if map_name(layer.name) == name), None)
         self.power = None
         if made is not None:
             grid, layer = made
-            self._lay(sheet(PLANE, grid, layer.values, Legend(layer.label, *layer.range(), layer.colours)))
+            self._lay(
+                sheet(
+                    PLANE,
+                    grid,
+                    layer.values,
+                    Legend(layer.label, *layer.range(), layer.colours),
+                    self.one.dot / 2,
+                )
+            )
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
         elif name == PREDICTED and self.view.grid is not None:
             yield from self._predicted_plane()
@@ -426,7 +447,7 @@ class Session:
                 legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db),
             )
             self.plane, self.power = plane, legend
-            self._lay(sheet(PLANE, grid, plane.level_db, legend))
+            self._lay(sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2))
             if first:
                 self._legends()
             asked = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
@@ -446,6 +467,8 @@ class Session:
         shown += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
         shown += [
-            Legend(one.label, *one.range(), one.colours) for _, one in self.view.layers if one.name == name
+            Legend(one.label, *one.range(), one.colours)
+            for _, one in self.view.layers
+            if map_name(one.name) == name
         ]
         self.legend.content = legend_html(shown)
