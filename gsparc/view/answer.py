@@ -15,6 +15,8 @@ from gsparc.methods.method import HasPaths
 from gsparc.methods.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown
+SAME_NS = 0.25  # between delays of one path, as several searches find it
+SAME_COSINE = 0.998  # the same of its directions: 3.6 degrees
 
 
 @dataclass(frozen=True)
@@ -106,9 +108,34 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
         found: Paths = predictor.paths(**ends)
     except ValueError:  # what was fitted has none
         return None
-    power = (np.abs(found.gain[0]).astype(np.float64) ** 2).mean(axis=0)
-    order = np.argsort(power)[::-1]
-    order = order[power[order] > power.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
-    delay = np.asarray(found.delay_s[0], np.float64).mean(axis=0)[order] * 1e9
-    towards = None if found.direction is None else np.asarray(found.direction[0], np.float64)[order]
-    return Rays(10 * np.log10(power[order]), delay, towards)
+    delay = np.asarray(found.delay_s[0], np.float64).mean(axis=0) * 1e9
+    towards = None if found.direction is None else np.asarray(found.direction[0], np.float64)
+    return rays(found.gain[0], delay, towards)
+
+
+def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
+    """Paths as they are shown; those that several searches found alike are one, of their summed gain.
+
+    Args:
+        gain: (A, N) complex, with their phases.
+        delay_ns: (N,).
+        towards: (N, 3); None where not known.
+    """
+    gain = gain.astype(np.complex128)
+    left = np.argsort(-(np.abs(gain) ** 2).mean(axis=0))
+    kept, power = [], []
+    while len(left):
+        first = left[0]
+        alike = left == first
+        if towards is not None:
+            alike |= (np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS) & (
+                towards[left] @ towards[first] > SAME_COSINE
+            )
+        kept.append(first)
+        power.append(float((np.abs(gain[:, left[alike]].sum(axis=1)) ** 2).mean()))
+        left = left[~alike]
+    level = np.array(power)
+    order = np.argsort(-level)
+    order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
+    chosen = np.array(kept, np.int64)[order]
+    return Rays(10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen])

@@ -33,6 +33,8 @@ RADIUS = 0.08  # of a sphere of power, of the extent of the site
 SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
 BENEATH = 2e-3  # of the extent, that a floor plan lies beneath all else, and the grid beneath it
 REACH = 0.8  # of the extent, that rays are drawn to at most
+MIRROR, BOX, WALL = (205, 92, 92), (31, 119, 180), (120, 120, 120)
+SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes", WALL: "known walls"}
 PATHS = Legend(
     "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
 )
@@ -229,14 +231,14 @@ def _plane_faces(name: str, plane: np.ndarray, middle: np.ndarray, origin: np.nd
     two = np.cross(normal, one)
     half = reach / 2
     corners = foot + half * np.array([-one - two, one - two, one + two, two - one]) + origin
-    return Faces(name, corners, np.array([[0, 1, 2], [0, 2, 3]]), (205, 92, 92), 0.12)
+    return Faces(name, corners, np.array([[0, 1, 2], [0, 2, 3]]), MIRROR, 0.12)
 
 
 def _box_faces(name: str, box: np.ndarray) -> Faces:
     corner = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Faces(name, corner, triangles, (31, 119, 180), 0.35)
+    return Faces(name, corner, triangles, BOX, 0.35)
 
 
 def walls_faces(walls: SceneWalls) -> list[Part]:
@@ -248,7 +250,7 @@ def walls_faces(walls: SceneWalls) -> list[Part]:
         count += len(face)
     parts: list[Part] = []
     if triangles:
-        parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), (120, 120, 120), 0.4))
+        parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), WALL, 0.4))
     parts += [_box_faces(f"known box {number}", box) for number, box in enumerate(walls.boxes)]
     return parts
 

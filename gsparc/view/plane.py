@@ -12,12 +12,14 @@ from gsparc.maps.area import Grid
 from gsparc.maps.levels import predicted
 from gsparc.maps.making import ends_of
 from gsparc.methods.predictor import Predictor
+from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend, Sheet
 
 FIRST = 400  # cells of the first, coarsest picture, about
 STEP_S = 0.03  # of a step: what a drag waits for [s]
 LEAST = 16  # cells of a step
 OPACITY = 0.9
+APART = 0.1  # of a plane's width, between weak places that are visited
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,25 @@ def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: fl
     )  # fmt: skip
 
 
-def weakest(plane: Plane) -> np.ndarray | None:
-    """World place (3,) [m] of the cell of least power; None where none is known."""
-    if not np.isfinite(plane.level_db).any():
+def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
+    """World place (3,) [m] of the cell of least power; None where there is none.
+
+    Args:
+        seen: places (3,) that it is to be `APART` of the plane's width from.
+    """
+    level = np.where(plane.grid.inside, plane.level_db, np.nan)
+    left, right, low, high = plane.grid.extent
+    for x, y, _ in seen:
+        distance = np.hypot(plane.grid.x - x, plane.grid.y[:, None] - y)
+        level[distance < APART * max(right - left, high - low)] = np.nan
+    if not np.isfinite(level).any():
         return None
-    cell = int(np.nanargmin(np.where(plane.grid.inside, plane.level_db, np.nan)))
-    return plane.grid.places(np.array([cell]))[0]
+    return plane.grid.places(np.array([int(np.nanargmin(level))]))[0]
+
+
+def beyond_distance(plane: Plane, known: Usual, other: np.ndarray) -> Plane:
+    """What is more (negative: less) than the distance to the other end (3,) [m] explains [dB]."""
+    grid = plane.grid
+    cells = np.arange(plane.level_db.size)
+    distance = np.linalg.norm(grid.places(cells) - other, axis=1).reshape(grid.shape)
+    return replace(plane, level_db=plane.level_db - known.at(distance))

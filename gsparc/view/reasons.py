@@ -36,6 +36,10 @@ class Usual:
     distance_m: np.ndarray
     level_db: np.ndarray
 
+    def at(self, distance_m: np.ndarray | float) -> np.ndarray:
+        """Level [dB] at distances [m]."""
+        return np.asarray(self.at_one - self.slope * np.log10(np.maximum(distance_m, NEAREST_M)))
+
 
 def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
     """The distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or (n, 3);
@@ -104,7 +108,7 @@ def _between(answer: Answer, here: np.ndarray, there: np.ndarray, about: Surroun
     known, far = about.usual, float(np.linalg.norm(here - there))
     said, weak = [f"{far:.3g} m from the other end"], False
     if known is not None and answer.level_db is not None and np.isfinite(known.at_one):
-        plain = known.at_one - known.slope * np.log10(max(far, NEAREST_M))
+        plain = float(known.at(far))
         gap = answer.level_db - plain
         weak = gap < -known.spread_db
         how = "weaker" if weak else "stronger" if gap > known.spread_db else "as usual"

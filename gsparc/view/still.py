@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from gsparc.evaluation.drawing import panels, save
 from gsparc.view.answer import ask
-from gsparc.view.building import GAUSSIANS, RAYS, SOURCES, VALUES, rays_of
+from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer
 from gsparc.view.plane import refining, thinned
 from gsparc.view.scene import Faces, Legend, Lines, Mark, Points
@@ -22,7 +24,8 @@ from gsparc.view.words import ENDS, headline
 
 WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels
 MOST_DOTS = 3000
-CELLS = 60  # along the longer side of a plane
+CELLS = 120  # along the longer side of a plane
+LETTERS = 42  # of a line above the panel
 FLATTEST = 0.2  # of height to width, that a flat site is drawn with
 
 
@@ -44,28 +47,31 @@ def draw_still(view: SiteView, path: Path) -> None:
     if view.grid is not None:
         _plane(axis, view, name, one.power)
     marks = [part for part in one.scene.parts if isinstance(part, Mark)]
-    for part in (*one.scene.parts, *(rays_of(answer, view.extent(name)) or ())):
+    rays = rays_of(answer, view.extent(name)) or ()
+    for part in (*one.scene.parts, *rays):
         if isinstance(part, Points):
             _dots(axis, part, low, high)
         elif isinstance(part, Lines) and part.name == RAYS:
             _rays(axis, part, low, high)
         elif isinstance(part, Faces):
-            colour = (*(np.array(part.colour) / 255), part.opacity)
-            corners = np.clip(part.vertices, low, high)
-            axis.plot_trisurf(*corners.T, triangles=part.triangles, color=colour, linewidth=0, shade=False)
+            corners = np.clip(part.vertices, low, high)[part.triangles]
+            colour = np.array(part.colour) / 255
+            axis.add_collection3d(Poly3DCollection(corners, facecolor=(*colour, part.opacity), zorder=15))
     for mark in marks:
         _mark(axis, mark.place, mark.text, "k^", "bottom")
     for end in viewed.moving:
         _mark(axis, answer.ends[end], ENDS[end], "o", "top", color=RED)
     _look(axis, low, high)
     shown = [legend for key, legend in one.scene.legends.items() if key in (VALUES, GAUSSIANS)]
+    shown += [PATHS] if rays else []
     for legend in shown:
         scale = ScalarMappable(Normalize(legend.low, legend.high), legend.colours)
         bar = figure.colorbar(scale, ax=axis, shrink=0.7, pad=0.01, location="bottom", aspect=40)
         bar.set_label(legend.label, fontsize="small")
         bar.ax.tick_params(labelsize="small")
+        bar.locator = MaxNLocator(5)
     draw_answer(axes[0, 1], answer, viewed.site, one.about.usual, view.unit)
-    axes[0, 1].set_title("\n".join(headline(answer, view.unit).rsplit(", ", 1)), fontsize="small")
+    axes[0, 1].set_title(fill(headline(answer, view.unit), LETTERS), fontsize="small")
     figure.suptitle(one.scene.title)
     save(figure, path, DPI)
 

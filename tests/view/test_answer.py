@@ -10,7 +10,7 @@ import pytest
 
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
-from gsparc.view.answer import Answer, Rays, ask
+from gsparc.view.answer import Answer, Rays, ask, rays
 from gsparc.view.building import rays_of
 from gsparc.view.crossed import Obstacles, crossed_losses
 from gsparc.view.reasons import Surroundings, reasons, usual
@@ -101,6 +101,16 @@ def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
     power = ask(asked, at)
     assert power.level_db == pytest.approx(10 * np.log10(asked.rssi(**at)[0]), abs=1e-3)
     assert power.spread_db > 0 and power.spectrum is None
+
+
+def test_a_path_that_two_searches_found_is_one_path():
+    """Their direct paths were two, each 6 dB too weak, that "add up"."""
+    one, other = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+    gain = np.array([[0.05j, 0.01, 0.05j, 1e-9]])
+    found = rays(gain, np.array([5.0, 9.0, 5.1, 9.0]), np.array([one, other, [0.9999, 0.01, 0.01], one]))
+    np.testing.assert_allclose(found.gain_db, [-20, -40])
+    np.testing.assert_array_equal(found.delay_ns, [5.0, 9.0])
+    assert len(rays(gain, np.array([5.0, 9.0, 5.1, 9.0]), None).gain_db) == 3
 
 
 def test_rays_are_as_long_as_their_delays():

@@ -176,11 +176,22 @@ def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(v
     session._station_changed("east")
     settle(session)
     assert session.said.content != first and "east" in session.title.content
-    session._go("weakest cell")
+    session._go("next weak place")
     settle(session)
     level = session.plane.level_db
     said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])
     assert said == pytest.approx(np.nanmin(level), abs=0.1)
+    here = session.places["rx"]
+    session._go("next weak place")
+    settle(session)
+    assert np.linalg.norm(session.places["rx"] - here) > 5  # it stayed where it was, however often one asked
+    session.chosen.value = "power beyond distance"
+    session.want_plane()
+    settle(session)
+    assert "more than distance alone explains" in session.legend.content and not session.visited
+    law, still = session.one.about.usual, power_view.viewed.still("east")
+    far = np.linalg.norm(session.plane.grid.places() - still, axis=1).reshape(level.shape)
+    np.testing.assert_allclose(session.plane.level_db, level - law.at(far), atol=1e-6)
 
 
 def test_a_thousand_drags_leave_nothing_behind(visit, spectrum_view):

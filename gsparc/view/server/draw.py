@@ -84,9 +84,9 @@ def floor(api: Any, scene: Scene) -> float:
     return float(side)
 
 
-def first_view(camera: Any, aside: float = ASIDE) -> None:
-    """Look at the site from the south and above, `aside` widths past its middle."""
-    east = np.array([aside, 0.0, 0.0])
-    camera.position = tuple(EXTENT * (np.array(ABOVE) + east))
-    camera.look_at = tuple(EXTENT * east)
+def first_view(camera: Any, aside: float = ASIDE, up: float = 0.0) -> None:
+    """Look at the site from the south and above, `aside` widths past its middle and `up` above it."""
+    past = np.array([aside, 0.0, up])
+    camera.position = tuple(EXTENT * (np.array(ABOVE) + past))
+    camera.look_at = tuple(EXTENT * past)
     camera.up = (0.0, 0.0, 1.0)

@@ -11,17 +11,18 @@ import numpy as np
 import viser
 
 from gsparc.view.answer import Answer, ask
-from gsparc.view.building import SPHERE, rays_of
+from gsparc.view.building import PATHS, SPHERE, rays_of
 from gsparc.view.panel import panel_image
 from gsparc.view.plane import refining, sheet
 from gsparc.view.reasons import Usual
-from gsparc.view.scene import EXTENT, Legend, Points, Sheet
+from gsparc.view.scene import EXTENT, Legend, Points, Scene, Sheet
 from gsparc.view.server.draw import draw, first_view, floor
 from gsparc.view.site_view import SiteView, walk
 from gsparc.view.words import ENDS, headline, legend_html
 
 STEPS = 24  # places of the walk
 PAUSE_S = 0.6  # at each
+UP = 0.15  # widths that the camera looks above the middle, for the panel that stands behind
 LIMITS = (
     "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at the bottom "
     "plays {steps} recorded places of the {end}. To drag it anywhere, to change the operating point or to "
@@ -51,7 +52,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     one, viewed, api = view.station(name), view.viewed, server.scene
     scene, moving = one.scene, viewed.moving[-1]
     api.set_up_direction("+z")
-    first_view(server.initial_camera, 0.0)
+    first_view(server.initial_camera, 0.0, UP)
     for part in scene.parts:
         if part.name not in scene.hidden:
             draw(api, scene.frame, part)
@@ -77,12 +78,14 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
                 SPHERE, answer.ends["rx"] + sphere.offsets, sphere.colours(answer.spectrum), sphere.size
             )
             draw(api, scene.frame, dots)
-        for part in rays_of(answer, view.extent(name)) or ():
-            draw(api, scene.frame, part)
+        if (rays := rays_of(answer, view.extent(name))) is not None:
+            legends = [*legends, PATHS] if PATHS not in legends else legends
+            for part in rays:
+                draw(api, scene.frame, part)
         draw(api, scene.frame, _upright(answer, view, one.about.usual, scene.frame.middle, view.extent(name)))
         recorder.insert_sleep(PAUSE_S)
     said = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=len(places), end=ENDS[moving])]
-    return recorder.as_html(), _beside(scene.title, said, legends)
+    return recorder.as_html(), _beside(scene, said, legends)
 
 
 def _other(view: SiteView) -> list[float] | None:
@@ -94,17 +97,18 @@ def _other(view: SiteView) -> list[float] | None:
 def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.ndarray, extent: float) -> Sheet:
     """The panel of an answer, standing behind the site."""
     image = panel_image(answer, view.viewed.site, known, view.unit)
-    wide = 0.9 * extent
+    wide = 1.2 * extent
     tall = wide * image.shape[0] / image.shape[1]
-    corner = middle + np.array([-0.5 * wide, 0.75 * extent, 0.15 * extent + tall])
+    corner = middle + np.array([-0.5 * wide, 0.8 * extent, 0.2 * extent + tall])
     return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
-def _beside(title: str, said: list[str], legends: list[Legend]) -> str:
+def _beside(scene: Scene, said: list[str], legends: list[Legend]) -> str:
+    title = html.escape(scene.title)
     lines = "".join(f"<p style='margin:.3em .6em'>{html.escape(line)}</p>" for line in said)
     return (
         "<details open style='position:fixed;top:8px;left:8px;z-index:1000;width:250px;background:#fffe;"
         "border:1px solid #bbb;border-radius:6px;font:13px/1.35 system-ui,sans-serif;color:#222'>"
-        f"<summary style='margin:.4em .6em;font-weight:600;cursor:pointer'>{html.escape(title)}</summary>"
-        f"{legend_html(legends)}{lines}</details>"
+        f"<summary style='margin:.4em .6em;font-weight:600;cursor:pointer'>{title}</summary>"
+        f"{legend_html(legends, scene.parts)}{lines}</details>"
     )

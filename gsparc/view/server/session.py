@@ -26,7 +26,7 @@ from gsparc.view.building import (
 )
 from gsparc.view.newest import Newest
 from gsparc.view.panel import degrees_of, response_db, response_db_of_antennas, spectrum_image, tones_mhz
-from gsparc.view.plane import Plane, lifted, refining, sheet, weakest
+from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
 from gsparc.view.reasons import reasons
 from gsparc.view.scene import EXTENT, Legend, Points
@@ -34,8 +34,8 @@ from gsparc.view.server.draw import draw, first_view, floor
 from gsparc.view.site_view import SiteView
 from gsparc.view.words import ENDS, answer_markdown, legend_html
 
-PREDICTED, NOTHING = "predicted power", "nothing"
-FIRST_PLACE, WEAKEST = "first place", "weakest cell"
+PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
+FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
 PADDING = (12, 8, 0, 0)  # of plots: else their highest number is cut [pixels]
 KEPT = 50  # times that a median is taken of
@@ -72,6 +72,7 @@ class Session:
         self.queries: deque[float] = deque(maxlen=KEPT)
         self.answers = 0  # that were shown
         self.plane: Plane | None = None
+        self.visited: list[np.ndarray] = []  # weak places of it, one after another
         self.power: Legend | None = None  # of the plane, where it is predicted
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
@@ -175,7 +176,9 @@ class Session:
                 button.on_click(lambda _: self._download())
             self.chosen: Any = None
             if self.view.grid is not None or self.view.layers:
-                names = ((PREDICTED,) if self.view.grid is not None else ()) + tuple(
+                known = self.one.about.usual
+                far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
+                names = ((PREDICTED, *far) if self.view.grid is not None else ()) + tuple(
                     map_name(layer.name) for _, layer in self.view.layers
                 )
                 self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
@@ -238,11 +241,14 @@ class Session:
     def _go(self, where: str) -> None:
         moving = self.view.viewed.moving[-1]
         place = self.view.starts(self.station)[moving]
-        if where == WEAKEST:
-            found = None if self.plane is None else weakest(self.plane)
-            if found is None:
-                return
-            place = found
+        if where == WEAKEST and self.plane is not None:
+            found = weakest(self.plane, self.visited)
+            if found is None:  # all were visited
+                self.visited.clear()
+                found = weakest(self.plane)
+            if found is not None:
+                self.visited.append(found)
+                place = found
         self._move(moving, place)
 
     def _points_changed(self, value: str) -> None:
@@ -274,7 +280,8 @@ class Session:
         ways = self.view.viewed.ways
         swept = sorted((*one.swept[::-1], k) for k, one in enumerate(ways) if one.swept is not None)
         took, reached, number = np.array(swept).T
-        return took, reached, np.where(number == self.way.value, reached, np.nan)
+        chosen = len(ways) - 1 if self.way is None else self.way.value
+        return took, reached, np.where(number == chosen, reached, np.nan)
 
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
@@ -288,7 +295,8 @@ class Session:
     def _download(self) -> None:
         cloud = cloud_of(self.view.viewed, self.station, self.one.measured)
         if cloud is not None:
-            self.client.send_file_download("gaussians.ply", ply_bytes(cloud, cloud_colours(cloud)[1]))
+            content = ply_bytes(cloud, cloud_colours(cloud)[1])
+            self.client.send_file_download("gaussians.ply", content, save_immediately=True)
 
     # -- what the worker does ----------------------------------------------------------------------
 
@@ -426,22 +434,29 @@ class Session:
                 )
             )
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
-        elif name == PREDICTED and self.view.grid is not None:
-            yield from self._predicted_plane()
+        elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
+            yield from self._predicted_plane(name == BEYOND)
         elif PLANE in self.nodes:
             self.nodes.pop(PLANE).remove()
         self._legends()
         yield
 
-    def _predicted_plane(self) -> Iterator[None]:
+    def _predicted_plane(self, beyond: bool) -> Iterator[None]:
         grid = lifted(self.view.grid, float(self.height.value))  # type: ignore[arg-type]
         predictor = self.view.viewed.asked(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
-        legend, begin = self.one.power, time.perf_counter()
+        known, there = self.one.about.usual, self._still()
+        legend, begin = None if beyond else self.one.power, time.perf_counter()
+        self.visited.clear()
         for plane in refining(predictor, grid, None if other is None else other.tolist()):
             if plane is None:
                 yield
                 continue
+            if beyond and known is not None and there is not None:
+                plane = beyond_distance(plane, known, there)
+                most = max(3 * known.spread_db, 1.0)
+                label = "power more than distance alone explains [dB]"
+                legend = legend or Legend(label, -most, most, "PuOr")
             first, legend = (
                 self.power is None,
                 legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db),
@@ -457,6 +472,10 @@ class Session:
             )
             yield
 
+    def _still(self) -> np.ndarray | None:
+        """World place (3,) [m] of the other end than the plane's."""
+        return self.places["tx"] if self.site.static_end is None else self.view.viewed.still(self.station)
+
     def _lay(self, part: Any) -> None:
         self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
 
@@ -471,4 +490,4 @@ class Session:
             for _, one in self.view.layers
             if map_name(one.name) == name
         ]
-        self.legend.content = legend_html(shown)
+        self.legend.content = legend_html(shown, self.scene.parts)
