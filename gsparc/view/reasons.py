@@ -37,8 +37,12 @@ class Usual:
     level_db: np.ndarray
 
     def at(self, distance_m: np.ndarray | float) -> np.ndarray:
-        """Level [dB] at distances [m]."""
-        return np.asarray(self.at_one - self.slope * np.log10(np.maximum(distance_m, NEAREST_M)))
+        """Level [dB] at distances [m]: that of the line, at most the strongest that was measured.
+
+        A line through places behind walls is too high near the other end, by tens of decibels.
+        """
+        line = self.at_one - self.slope * np.log10(np.maximum(distance_m, NEAREST_M))
+        return np.minimum(line, self.level_db.max(initial=-np.inf))
 
 
 def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
