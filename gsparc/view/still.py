@@ -43,6 +43,7 @@ def draw_still(view: SiteView, path: Path) -> None:
     place = axes[0, 0].get_subplotspec()
     axes[0, 0].remove()
     axis: Any = figure.add_subplot(place, projection="3d")
+    axis.computed_zorder = False  # parts are sorted as wholes: a plane would hide the walls on it
     low, high = _limits(view, name)
     if view.grid is not None:
         _plane(axis, view, name, one.power)
@@ -56,7 +57,7 @@ def draw_still(view: SiteView, path: Path) -> None:
         elif isinstance(part, Faces):
             corners = np.clip(part.vertices, low, high)[part.triangles]
             colour = np.array(part.colour) / 255
-            axis.add_collection3d(Poly3DCollection(corners, facecolor=(*colour, part.opacity), zorder=15))
+            axis.add_collection3d(Poly3DCollection(corners, facecolor=(*colour, part.opacity), zorder=2))
     for mark in marks:
         _mark(axis, mark.place, mark.text, "k^", "bottom")
     for end in viewed.moving:
@@ -95,7 +96,9 @@ def _dots(axis: Any, part: Points, low: np.ndarray, high: np.ndarray) -> None:
         return
     few = inside[np.linspace(0, len(inside) - 1, min(len(inside), MOST_DOTS)).astype(int)]
     how = {"alpha": 0.4, "s": 9} if part.name == GAUSSIANS else {"alpha": 0.9, "s": 6}
-    axis.scatter(*part.places[few].T, c=part.colours[few] / 255, linewidths=0, depthshade=False, **how)
+    axis.scatter(
+        *part.places[few].T, c=part.colours[few] / 255, linewidths=0, depthshade=False, zorder=3, **how
+    )
 
 
 def _rays(axis: Any, part: Lines, low: np.ndarray, high: np.ndarray) -> None:
@@ -104,7 +107,7 @@ def _rays(axis: Any, part: Lines, low: np.ndarray, high: np.ndarray) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             edge = np.where(along == 0, np.inf, (np.where(along > 0, high, low) - start) / along)
         end = start + along * float(np.clip(edge.min(), 0, 1))
-        axis.plot(*np.stack([start, end]).T, color=colour, lw=1.0)
+        axis.plot(*np.stack([start, end]).T, color=colour, lw=1.0, zorder=4)
 
 
 def _mark(axis: Any, place: np.ndarray, text: str, mark: str, side: str, **how: Any) -> None:
@@ -127,7 +130,9 @@ def _plane(axis: Any, view: SiteView, name: str | None, legend: Legend | None) -
     colours = np.concatenate([legend.of(level) / 255, clear], axis=-1)
     x, y = np.meshgrid(coarse.x, coarse.y)
     height = np.full_like(x, coarse.height)
-    axis.plot_surface(x, y, height, facecolors=colours, shade=False, rstride=1, cstride=1, linewidth=0)
+    axis.plot_surface(
+        x, y, height, facecolors=colours, shade=False, rstride=1, cstride=1, linewidth=0, zorder=1
+    )
 
 
 def _look(axis: Any, low: np.ndarray, high: np.ndarray) -> None:

@@ -49,7 +49,7 @@ def test_the_distance_law_of_measurements_is_found_and_missing_ones_left_out():
 
 
 def test_near_the_other_end_nothing_is_called_weak_that_is_as_strong_as_any():
-    """A line through levels behind walls foretold 28 dB too much at 1.4 m, which made it the weakest place."""
+    """A line through levels behind walls foretold 28 dB too much at 1.4 m, the weakest place of all."""
     distance = np.linspace(2, 50, 200)
     level = -30 - 20 * np.log10(distance) - 40 * (distance > 20)
     law = usual(np.column_stack([distance, 0 * distance, 0 * distance]), level, np.zeros(3))

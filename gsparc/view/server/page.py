@@ -22,7 +22,7 @@ from gsparc.view.words import ENDS, headline, legend_html
 
 STEPS = 24  # places of the walk
 PAUSE_S = 0.6  # at each
-UP = 0.15  # widths that the camera looks above the middle, for the panel that stands behind
+UP = 0.17  # widths that the camera looks above the middle, for the panel that stands behind
 LIMITS = (
     "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at the bottom "
     "plays {steps} recorded places of the {end}. To drag it anywhere, to change the operating point or to "
@@ -97,9 +97,9 @@ def _other(view: SiteView) -> list[float] | None:
 def _upright(answer: Answer, view: SiteView, known: Usual | None, middle: np.ndarray, extent: float) -> Sheet:
     """The panel of an answer, standing behind the site."""
     image = panel_image(answer, view.viewed.site, known, view.unit)
-    wide = 1.2 * extent
+    wide = 1.05 * extent
     tall = wide * image.shape[0] / image.shape[1]
-    corner = middle + np.array([-0.5 * wide, 0.8 * extent, 0.2 * extent + tall])
+    corner = middle + np.array([-0.5 * wide, 0.8 * extent, 0.18 * extent + tall])
     return Sheet("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
 
 
