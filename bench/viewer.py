@@ -16,6 +16,7 @@ import socket
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -41,6 +42,7 @@ new MutationObserver(() => { if (window.since_ !== null) {
   requestAnimationFrame(() => requestAnimationFrame(() => window.delays_.push(performance.now() - since)));
 }}).observe(document.body, {subtree: true, childList: true, characterData: true});
 """
+COUNTED = "const n = window.frames_; window.frames_ = 0; return n"
 
 
 def resident_mb() -> float:
@@ -157,6 +159,16 @@ def steady(server: Server, hands: list[Hand], seconds: float, every: float) -> N
             told, clock, answers = now, time.process_time(), total
 
 
+def turn(session: Any, seconds: float, counted: Callable[[], int]) -> float:
+    """Frames per second while the camera goes around the site and nothing of ours changes."""
+    counted()
+    begin = time.perf_counter()
+    while (now := time.perf_counter() - begin) < seconds:
+        session.client.camera.position = 12 * np.array([np.sin(now), -np.cos(now), 0.7])
+        time.sleep(1 / RATE_HZ)
+    return counted() / (time.perf_counter() - begin)
+
+
 def browse(server: Server, seconds: float, wait: float, picture: Path | None) -> None:
     """Drag a handle before a browser; frames per second, and delay from the drag to the changed picture.
 
@@ -187,9 +199,8 @@ def browse(server: Server, seconds: float, wait: float, picture: Path | None) ->
         time.sleep(wait)
         browser.execute_script(WATCH)
         time.sleep(seconds / 4)
-        still = browser.execute_script("const n = window.frames_; window.frames_ = 0; return n") / (
-            seconds / 4
-        )
+        still = browser.execute_script(COUNTED) / (seconds / 4)
+        turning = turn(session, seconds / 4, lambda: browser.execute_script(COUNTED))
         begin, before, clock = time.perf_counter(), session.answers, time.process_time()
         while time.perf_counter() - begin < seconds:
             browser.execute_script("dispatchEvent(new PointerEvent('pointermove'))")
@@ -199,6 +210,7 @@ def browse(server: Server, seconds: float, wait: float, picture: Path | None) ->
         frames, delays = browser.execute_script("return [window.frames_, window.delays_]")
         say(
             "frames per s still",
+            "turning",
             "dragging",
             "answers per s",
             "query ms p50",
@@ -208,7 +220,7 @@ def browse(server: Server, seconds: float, wait: float, picture: Path | None) ->
         say("drag to picture ms p50", "p90", "n", "load")
         p50, p90 = np.percentile(delays, [50, 90]) if delays else (np.nan, np.nan)
         count = session.answers - before
-        rates = f"{still:.1f}", f"{frames / spent:.1f}", f"{count / spent:.1f}"
+        rates = f"{still:.1f}", f"{turning:.1f}", f"{frames / spent:.1f}", f"{count / spent:.1f}"
         costs = f"{np.median(session.queries):.2f}", f"{cpu / max(count, 1):.1f}"
         say(*rates, *costs, f"{p50:.0f}", f"{p90:.0f}", len(delays), f"{os.getloadavg()[0]:.1f}")
         if picture is not None:

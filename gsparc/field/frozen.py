@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from gsparc import ops
 from gsparc.field import edit
 from gsparc.field.encoding import unknown_share
 from gsparc.field.model import GaussianModel, Rendered
@@ -16,7 +17,6 @@ from gsparc.ops import FrozenPlan, Pose, StalePlan
 from gsparc.physics.bartlett import SpectrumRenderer
 
 IN_CACHE = 4  # spectra rendered at a time: they stay in the CPU cache
-BLOCK = 128  # Gaussians whose images are in memory at once
 
 
 @dataclass(frozen=True)
@@ -136,13 +136,21 @@ def _subset(rows: Tensor, model: GaussianModel) -> GaussianModel:
     return copy
 
 
-@torch.no_grad()
 def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
-    """A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission."""
-    plan, version, response = model.freeze(rx), int(model.gaussians.version), model.response
-    assert isinstance(response, ArrayResponse)
-    parts = []
-    for units in torch.eye(len(model.gaussians)).split(BLOCK, 1):
-        seen = plan.render(units, version)
-        parts.append(response.measured(torch.stack([seen, torch.zeros_like(seen)], 1)))
-    return torch.cat(parts)
+    """A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
+
+    Both are linear: what a unit of every Gaussian adds to one antenna is the gradient of that antenna by
+    emissions, so that the cost grows with footprints and antennas, not with the square of the Gaussians.
+    """
+    response, count = model.response, len(model.gaussians)
+    assert isinstance(response, ArrayResponse) and model.site.grid is not None
+    with torch.inference_mode(False), torch.enable_grad():
+        field = torch.zeros(1, 2, model.site.grid.height, model.site.grid.width, requires_grad=True)
+        parts = torch.view_as_real(response.measured(field)).flatten()
+        by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
+        geometry = [part.detach() for part in model.gaussians.geometry()]
+        emitted = torch.zeros(count, len(parts), requires_grad=True)
+        plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # may be made in inference mode
+        image = ops.composite(plan, *geometry, emitted).image
+        (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))
+    return torch.view_as_complex(seen.view(count, -1, 2))

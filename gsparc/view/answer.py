@@ -1,4 +1,4 @@
-"""What a model answers at one pair of places, and why, in numbers that a picture or a sentence needs."""
+"""What a model answers at one pair of places, in numbers that a picture or a sentence needs."""
 
 from __future__ import annotations
 
@@ -7,18 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsparc.data.schema import Site
-from gsparc.data.site_objects import SiteObjects
 from gsparc.maps.levels import predicted
 from gsparc.methods.export import Paths
 from gsparc.methods.method import HasPaths
 from gsparc.methods.predictor import Predictor
 
 SILENT_DB = 30.0  # below the strongest, where paths are not shown
-NEAREST_M = 0.1  # where a distance law ends
-PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
+SAME_NS = 0.25  # between delays of one path, as several searches find it
+SAME_COSINE = 0.998  # the same of its directions: 3.6 degrees
 
 
 @dataclass(frozen=True)
@@ -110,118 +108,34 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Rays | None:
         found: Paths = predictor.paths(**ends)
     except ValueError:  # what was fitted has none
         return None
-    power = (np.abs(found.gain[0]).astype(np.float64) ** 2).mean(axis=0)
-    order = np.argsort(power)[::-1]
-    order = order[power[order] > power.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
-    delay = np.asarray(found.delay_s[0], np.float64).mean(axis=0)[order] * 1e9
-    towards = None if found.direction is None else np.asarray(found.direction[0], np.float64)[order]
-    return Rays(10 * np.log10(power[order]), delay, towards)
+    delay = np.asarray(found.delay_s[0], np.float64).mean(axis=0) * 1e9
+    towards = None if found.direction is None else np.asarray(found.direction[0], np.float64)
+    return rays(found.gain[0], delay, towards)
 
 
-@dataclass(frozen=True)
-class Usual:
-    """What was measured at what distance: level = `at_one` - `slope` log10(distance).
-
-    Attributes:
-        at_one: [dB] at a metre.
-        slope: [dB per decade].
-        spread_db: of what was measured about it.
-        tree: of measured places, world.
-        distance_m: (n,) of what was measured; empty where the other end is unknown.
-        level_db: (n,) there.
-    """
-
-    at_one: float
-    slope: float
-    spread_db: float
-    tree: cKDTree
-    distance_m: np.ndarray
-    level_db: np.ndarray
-
-
-def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
-    """The distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or (n, 3);
-    NaN where that is unknown."""
-    known = np.isfinite(level_db)
-    tree = cKDTree(places)
-    level = level_db[known]
-    if other is None or len(level) < 3:
-        return Usual(np.nan, np.nan, np.nan, tree, np.zeros(0), level)
-    distance = np.maximum(np.linalg.norm((places - other)[known], axis=1), NEAREST_M)
-    far = np.log10(distance)
-    slope, at_one = np.polyfit(far, level, 1) if np.ptp(far) > 0 else (0.0, level.mean())
-    spread = float(np.std(level - at_one - slope * far))
-    return Usual(float(at_one), float(-slope), spread, tree, distance, level)
-
-
-def reasons(
-    answer: Answer, moving: str, known: Usual | None, objects: SiteObjects, origin: np.ndarray
-) -> list[str]:
-    """Why the level is what it is, one line each, of what is measured and what the model holds.
+def rays(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> Rays:
+    """Paths as they are shown; those that several searches found alike are one, of their summed gain.
 
     Args:
-        answer: at a place.
-        moving: the end that was dragged.
-        known: of what was measured.
-        objects: that the model found, local coordinates.
-        origin: (3,) of the local coordinates, world [m].
+        gain: (A, N) complex, with their phases.
+        delay_ns: (N,).
+        towards: (N, 3); None where not known.
     """
-    said = []
-    here, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
-    if there is not None:
-        far = float(np.linalg.norm(here - there))
-        said.append(f"{far:.3g} m from the other end")
-        if known is not None and answer.level_db is not None and np.isfinite(known.at_one):
-            plain = known.at_one - known.slope * np.log10(max(far, NEAREST_M))
-            gap = answer.level_db - plain
-            how = "as usual" if abs(gap) <= known.spread_db else "weaker" if gap < 0 else "stronger"
-            said.append(
-                f"distance alone: {plain:.1f} dB; here {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} "
-                f"({how}, measured levels spread {known.spread_db:.1f} dB)"
+    gain = gain.astype(np.complex128)
+    left = np.argsort(-(np.abs(gain) ** 2).mean(axis=0))
+    kept, power = [], []
+    while len(left):
+        first = left[0]
+        alike = left == first
+        if towards is not None:
+            alike |= (np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS) & (
+                towards[left] @ towards[first] > SAME_COSINE
             )
-        if len(objects.means):
-            crossed = crossed_losses(objects, here - origin, there - origin)
-            strong = crossed[np.abs(crossed) >= 0.5]
-            said.append(
-                f"the straight path crosses {len(strong)} Gaussians that take {crossed.sum():.1f} dB "
-                "by the model"
-            )
-    if known is not None:
-        apart = float(known.tree.query(here)[0])
-        said.append("measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away")
-    if answer.paths is not None and len(answer.paths.gain_db):
-        rays = answer.paths
-        more = ""
-        if rays.towards is not None:
-            more = " from azimuth {:.0f}°, elevation {:.0f}°".format(*azimuth_elevation(rays.towards[0]))
-        said.append(
-            f"{len(rays.gain_db)} paths within {SILENT_DB:g} dB; strongest {rays.gain_db[0]:.1f} dB at "
-            f"{rays.delay_ns[0]:.1f} ns{more}"
-        )
-        if answer.level_db is not None and len(rays.gain_db) > 1:
-            gap = answer.level_db - 10 * np.log10((10 ** (rays.gain_db / 10)).sum())
-            if abs(gap) >= PHASES_DB:
-                how = "cancel each other" if gap < 0 else "add up"
-                said.append(
-                    f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers"
-                )
-    return said
-
-
-def crossed_losses(objects: SiteObjects, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Losses (N,) [dB] of Gaussians on the straight line between two local places (3,) [m].
-
-    What a line through the middle loses, times exp(-d^2 / 2) of its least distance d in standard deviations.
-    """
-    cos, sin = np.cos(objects.turns), np.sin(objects.turns)
-
-    def own(vector: np.ndarray) -> np.ndarray:
-        x, y, z = vector.T
-        return np.column_stack([cos * x + sin * y, cos * y - sin * x, z]) / objects.scales
-
-    begin = own(start - objects.means)
-    along = own(np.broadcast_to(end - start, objects.means.shape))
-    square = np.maximum((along**2).sum(1), 1e-30)
-    share = np.clip(-(begin * along).sum(1) / square, 0, 1)
-    nearest = begin + share[:, None] * along
-    return np.asarray(objects.losses * np.exp(-0.5 * (nearest**2).sum(1)))
+        kept.append(first)
+        power.append(float((np.abs(gain[:, left[alike]].sum(axis=1)) ** 2).mean()))
+        left = left[~alike]
+    level = np.array(power)
+    order = np.argsort(-level)
+    order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
+    chosen = np.array(kept, np.int64)[order]
+    return Rays(10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen])

@@ -14,6 +14,7 @@ from gsparc.data.schema import Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.maps.floor_plan import FloorPlan
+from gsparc.maps.levels import MAPPED
 from gsparc.methods.method import HasGaussians
 from gsparc.ops import Pose
 from gsparc.view.answer import SILENT_DB, Answer
@@ -30,8 +31,13 @@ QUERIES = 16  # places at which Gaussians are asked what they emit
 RANGE_DB = 30.0  # of emissions that are told apart
 RADIUS = 0.08  # of a sphere of power, of the extent of the site
 SHADE = 0.4  # of Gaussians that are drawn: at their full opacity the nearest hide all others
+BENEATH = 2e-3  # of the extent, that a floor plan lies beneath all else, and the grid beneath it
 REACH = 0.8  # of the extent, that rays are drawn to at most
-PATHS = Legend("gain of a path [dB of the strongest]", -SILENT_DB, 0.0, "plasma")
+MIRROR, BOX, WALL = (205, 92, 92), (31, 119, 180), (120, 120, 120)
+SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes", WALL: "known walls"}
+PATHS = Legend(
+    "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
+)
 VALUES, ERRORS, GAUSSIANS, SPLATS, SPHERE, RAYS, SOURCES = (
     "measured", "errors", "gaussians", "splats", "sphere", "rays", "sources",
 )  # fmt: skip
@@ -73,8 +79,9 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
     notes = list(viewed.notes)
+    ground = ground_of(viewed, given)
     if given.plan is not None:
-        parts.append(plan_sheet(given.plan, float(viewed.box()[0, 2])))
+        parts.append(plan_sheet(given.plan, ground - BENEATH * extent))
     if given.walls is not None:
         parts += walls_faces(given.walls)
     if measured is not None:
@@ -97,10 +104,22 @@ def build(viewed: Viewed, given: Given, station: str | None, measured: Measured 
         title if station is None else f"{title}: {station}",
         frame,
         tuple(parts),
+        ground - 2 * BENEATH * extent,
         legends,
         hidden,
         tuple(notes),
     )
+
+
+def ground_of(viewed: Viewed, given: Given) -> float:
+    """Height beneath which nothing is shown [m]: of measured places, planes and known walls."""
+    low = [float(viewed.box()[0, 2])]
+    if viewed.site.kind in MAPPED:
+        low.append(viewed.heights()[0])
+    if given.walls is not None:
+        low += [float(face[:, 2].min()) for face in given.walls.faces]
+        low += [float(box[0, 2]) for box in given.walls.boxes]
+    return min(low)
 
 
 def _measured_parts(measured: Measured, legends: dict[str, Legend], extent: float) -> list[Part]:
@@ -212,14 +231,14 @@ def _plane_faces(name: str, plane: np.ndarray, middle: np.ndarray, origin: np.nd
     two = np.cross(normal, one)
     half = reach / 2
     corners = foot + half * np.array([-one - two, one - two, one + two, two - one]) + origin
-    return Faces(name, corners, np.array([[0, 1, 2], [0, 2, 3]]), (205, 92, 92), 0.12)
+    return Faces(name, corners, np.array([[0, 1, 2], [0, 2, 3]]), MIRROR, 0.12)
 
 
 def _box_faces(name: str, box: np.ndarray) -> Faces:
     corner = np.array([[box[i, 0], box[j, 1], box[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
-    return Faces(name, corner, triangles, (31, 119, 180), 0.35)
+    return Faces(name, corner, triangles, BOX, 0.35)
 
 
 def walls_faces(walls: SceneWalls) -> list[Part]:
@@ -231,7 +250,7 @@ def walls_faces(walls: SceneWalls) -> list[Part]:
         count += len(face)
     parts: list[Part] = []
     if triangles:
-        parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), (120, 120, 120), 0.25))
+        parts.append(Faces("walls", np.concatenate(vertices), np.array(triangles), WALL, 0.4))
     parts += [_box_faces(f"known box {number}", box) for number, box in enumerate(walls.boxes)]
     return parts
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from gsparc.data.schema import Site
-from gsparc.evaluation.drawing import panels
+from gsparc.evaluation.drawing import logarithmic, panels
 from gsparc.ops import SphereGrid
-from gsparc.view.answer import Answer, Usual
+from gsparc.view.answer import Answer
+from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
@@ -85,10 +86,11 @@ def _draw_level(axis: Any, answer: Answer, known: Usual | None, unit: str) -> No
         few = np.linspace(0, len(known.level_db) - 1, min(len(known.level_db), MOST_DOTS)).astype(int)
         axis.plot(known.distance_m[few], known.level_db[few], ".", ms=3, color="0.7", label="measured")
         far = np.geomspace(known.distance_m.min(), known.distance_m.max(), 50)
-        axis.plot(far, known.at_one - known.slope * np.log10(far), color="0.3", label="distance alone")
+        axis.plot(far, known.at(far), color="0.3", label="distance alone")
         here = float(np.linalg.norm(ends[0] - ends[1]))
         axis.errorbar([here], [answer.level_db], [answer.spread_db or 0.0], fmt="o", color=RED, label="here")
-        axis.set(xlabel="distance [m]", ylabel=label, xscale="log")
+        axis.set(xlabel="distance [m]", ylabel=label)
+        logarithmic(axis)
         axis.legend(loc="lower left")
     else:
         axis.hist(known.level_db, 40, color="0.75")
@@ -105,9 +107,9 @@ def response_db_of_antennas(response: np.ndarray) -> np.ndarray:
 
 def panel_image(answer: Answer, site: Site, known: Usual | None, unit: str = "dB") -> np.ndarray:
     """`draw_answer` as a picture (h, w, 3) uint8."""
-    figure, axes = panels(3.6, 2.2)
+    figure, axes = panels(2.9, 1.8)  # small, so that its letters are large
     draw_answer(axes[0, 0], answer, site, known, unit)
-    figure.set_dpi(110)
+    figure.set_dpi(200)
     canvas = figure.canvas
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]

@@ -7,18 +7,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from gsparc.maps.area import Grid
 from gsparc.maps.levels import predicted
 from gsparc.maps.making import ends_of
-from gsparc.methods.method import Prediction
 from gsparc.methods.predictor import Predictor
+from gsparc.view.reasons import Usual
 from gsparc.view.scene import Legend, Sheet
 
 FIRST = 400  # cells of the first, coarsest picture, about
 STEP_S = 0.03  # of a step: what a drag waits for [s]
 LEAST = 16  # cells of a step
+OPACITY = 0.9
+APART = 0.1  # of a plane's width, between weak places that are visited
 
 
 @dataclass(frozen=True)
@@ -80,11 +81,11 @@ def refining(
 
 
 def _levels(predictor: Predictor, places: np.ndarray, other: Sequence[float] | None) -> np.ndarray:
-    """Levels (n,) [dB] of the mean alone: deviations cost several times as much."""
+    """Levels (n,) [dB], expected, as answers and `gsparc map` give them."""
     site = predictor.site
     ends = ends_of(site, places, other)
-    mean = getattr(predictor, site.kind)(**{end: np.ascontiguousarray(place) for end, place in ends.items()})
-    return predicted(Prediction(torch.from_numpy(np.asarray(mean))), site.kind)[0]
+    said = predictor.predict(**{end: np.ascontiguousarray(place) for end, place in ends.items()})
+    return predicted(said, site.kind)[0]
 
 
 def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
@@ -95,20 +96,40 @@ def _spread(level: np.ndarray, stride: int, grid: Grid) -> np.ndarray:
     return np.where(grid.inside, np.where(np.isfinite(level), level, found), np.nan)
 
 
-def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, opacity: float = 0.9) -> Sheet:
-    """A picture of values (ny, nx) over the cells, clear where they are not finite."""
-    clear = np.where(np.isfinite(values), round(255 * opacity), 0)[..., None].astype(np.uint8)
+def sheet(name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0) -> Sheet:
+    """A picture of values (ny, nx) over the cells, clear where they are not finite.
+
+    Args:
+        beneath: [m] lower than it is: half a dot where dots of the same height are to be seen whole.
+    """
+    clear = np.where(np.isfinite(values), round(255 * OPACITY), 0)[..., None].astype(np.uint8)
     image = np.concatenate([legend.of(values), clear], axis=-1)
     left, right, low, high = grid.extent
     return Sheet(
-        name, np.array([left, high, grid.height]), np.array([right - left, 0.0, 0.0]),
+        name, np.array([left, high, grid.height - beneath]), np.array([right - left, 0.0, 0.0]),
         np.array([0.0, low - high, 0.0]), image[::-1],
     )  # fmt: skip
 
 
-def weakest(plane: Plane) -> np.ndarray | None:
-    """World place (3,) [m] of the cell of least power; None where none is known."""
-    if not np.isfinite(plane.level_db).any():
+def weakest(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:
+    """World place (3,) [m] of the cell of least power; None where there is none.
+
+    Args:
+        seen: places (3,) that it is to be `APART` of the plane's width from.
+    """
+    level = np.where(plane.grid.inside, plane.level_db, np.nan)
+    left, right, low, high = plane.grid.extent
+    for x, y, _ in seen:
+        distance = np.hypot(plane.grid.x - x, plane.grid.y[:, None] - y)
+        level[distance < APART * max(right - left, high - low)] = np.nan
+    if not np.isfinite(level).any():
         return None
-    cell = int(np.nanargmin(np.where(plane.grid.inside, plane.level_db, np.nan)))
-    return plane.grid.places(np.array([cell]))[0]
+    return plane.grid.places(np.array([int(np.nanargmin(level))]))[0]
+
+
+def beyond_distance(plane: Plane, known: Usual, other: np.ndarray) -> Plane:
+    """What is more (negative: less) than the distance to the other end (3,) [m] explains [dB]."""
+    grid = plane.grid
+    cells = np.arange(plane.level_db.size)
+    distance = np.linalg.norm(grid.places(cells) - other, axis=1).reshape(grid.shape)
+    return replace(plane, level_db=plane.level_db - known.at(distance))

@@ -144,6 +144,7 @@ class Scene:
         title: of pages and pictures.
         frame: of drawing.
         parts: what is drawn.
+        ground: height of a grid beneath all [m].
         legends: of parts, by their names.
         hidden: names of parts that are drawn when asked for.
         notes: what a reader must know, one line each.
@@ -152,6 +153,7 @@ class Scene:
     title: str
     frame: Frame
     parts: tuple[Part, ...]
+    ground: float
     legends: dict[str, Legend] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

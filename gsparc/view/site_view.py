@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.site_objects import SiteObjects
+from gsparc.data.walls import SceneWalls
 from gsparc.maps.area import Grid, grid_of
 from gsparc.maps.levels import MAPPED
 from gsparc.maps.pictures import Layer
-from gsparc.view.answer import Usual, usual
 from gsparc.view.building import VALUES, Given, Sphere, build, start_place
-from gsparc.view.scene import EXTENT, Legend, Scene
+from gsparc.view.crossed import Obstacles
+from gsparc.view.reasons import Surroundings, usual
+from gsparc.view.scene import EXTENT, Legend, Points, Scene
 from gsparc.view.viewed import Measured, Viewed
 
 
@@ -26,16 +27,20 @@ class StationView:
     Attributes:
         scene: what stands still.
         measured: of the station; None without data.
-        usual: what was measured at what distance; None without data.
-        objects: that the model found.
+        about: what is known of its places.
         power: colours of powers: as those of the measured points, where there are any.
     """
 
     scene: Scene
     measured: Measured | None
-    usual: Usual | None
-    objects: SiteObjects
+    about: Surroundings
     power: Legend | None
+
+    @property
+    def dot(self) -> float:
+        """Width of the dots of measured places [m]."""
+        part = self.scene.part(VALUES)
+        return part.size if isinstance(part, Points) else 0.0
 
 
 @dataclass
@@ -81,12 +86,20 @@ class SiteView:
         viewed = self.viewed
         measured = viewed.measured(name)
         scene = build(viewed, self.given, name, measured)
-        known = None
+        known, values = None, np.zeros(0)
         if measured is not None:
-            levels = measured.values if viewed.site.kind in MAPPED else np.full(len(measured.values), np.nan)
+            values = measured.values
+            levels = values if viewed.site.kind in MAPPED else np.full(len(values), np.nan)
             known = usual(measured.places, levels, viewed.others(name))
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        return StationView(scene, measured, known, viewed.asked(name).method.objects(), power)
+        objects, origin = viewed.asked(name).method.objects(), viewed.site.origin
+        faces = () if self.given.walls is None else self.given.walls.faces
+        boxes = objects.boxes + origin
+        if self.given.walls is not None:
+            boxes = np.concatenate([boxes, self.given.walls.boxes])
+        walls = Obstacles.of(SceneWalls(faces, boxes)) if len(faces) or len(boxes) else None
+        about = Surroundings(known, values, objects, origin, walls, self.unit)
+        return StationView(scene, measured, about, power)
 
     def extent(self, name: str | None) -> float:
         """Width of the site [m]."""
@@ -108,12 +121,6 @@ class SiteView:
                 other = viewed.data.tx[len(viewed.data) // 2] + viewed.site.origin
             found["tx"] = other if self.other is None else self.other
         return found
-
-    def heights(self) -> tuple[float, float]:
-        """Between which a plane can be lifted [m]."""
-        box = self.viewed.site.box + self.viewed.site.origin
-        low, high = float(box[0, 2]), float(box[1, 2])
-        return (low, high) if high - low > 0.5 else (low - 1.5, high + 1.5)
 
 
 def grid_for(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from gsparc.evaluation.drawing import panels, save
 from gsparc.view.answer import ask
-from gsparc.view.building import GAUSSIANS, RAYS, SOURCES, VALUES, rays_of
+from gsparc.view.building import GAUSSIANS, PATHS, RAYS, SOURCES, VALUES, rays_of
 from gsparc.view.panel import RED, draw_answer
 from gsparc.view.plane import refining, thinned
 from gsparc.view.scene import Faces, Legend, Lines, Mark, Points
@@ -22,7 +24,8 @@ from gsparc.view.words import ENDS, headline
 
 WIDTH, HEIGHT, DPI = 8.0, 4.4, 150  # readable at 600 pixels
 MOST_DOTS = 3000
-CELLS = 60  # along the longer side of a plane
+CELLS = 120  # along the longer side of a plane
+LETTERS = 42  # of a line above the panel
 FLATTEST = 0.2  # of height to width, that a flat site is drawn with
 
 
@@ -40,32 +43,36 @@ def draw_still(view: SiteView, path: Path) -> None:
     place = axes[0, 0].get_subplotspec()
     axes[0, 0].remove()
     axis: Any = figure.add_subplot(place, projection="3d")
+    axis.computed_zorder = False  # parts are sorted as wholes: a plane would hide the walls on it
     low, high = _limits(view, name)
     if view.grid is not None:
         _plane(axis, view, name, one.power)
     marks = [part for part in one.scene.parts if isinstance(part, Mark)]
-    for part in (*one.scene.parts, *(rays_of(answer, view.extent(name)) or ())):
+    rays = rays_of(answer, view.extent(name)) or ()
+    for part in (*one.scene.parts, *rays):
         if isinstance(part, Points):
             _dots(axis, part, low, high)
         elif isinstance(part, Lines) and part.name == RAYS:
             _rays(axis, part, low, high)
         elif isinstance(part, Faces):
-            colour = (*(np.array(part.colour) / 255), part.opacity)
-            corners = np.clip(part.vertices, low, high)
-            axis.plot_trisurf(*corners.T, triangles=part.triangles, color=colour, linewidth=0, shade=False)
+            corners = np.clip(part.vertices, low, high)[part.triangles]
+            colour = np.array(part.colour) / 255
+            axis.add_collection3d(Poly3DCollection(corners, facecolor=(*colour, part.opacity), zorder=2))
     for mark in marks:
         _mark(axis, mark.place, mark.text, "k^", "bottom")
     for end in viewed.moving:
         _mark(axis, answer.ends[end], ENDS[end], "o", "top", color=RED)
     _look(axis, low, high)
     shown = [legend for key, legend in one.scene.legends.items() if key in (VALUES, GAUSSIANS)]
+    shown += [PATHS] if rays else []
     for legend in shown:
         scale = ScalarMappable(Normalize(legend.low, legend.high), legend.colours)
         bar = figure.colorbar(scale, ax=axis, shrink=0.7, pad=0.01, location="bottom", aspect=40)
         bar.set_label(legend.label, fontsize="small")
         bar.ax.tick_params(labelsize="small")
-    draw_answer(axes[0, 1], answer, viewed.site, one.usual, view.unit)
-    axes[0, 1].set_title("\n".join(headline(answer, view.unit).rsplit(", ", 1)), fontsize="small")
+        bar.locator = MaxNLocator(5)
+    draw_answer(axes[0, 1], answer, viewed.site, one.about.usual, view.unit)
+    axes[0, 1].set_title(fill(headline(answer, view.unit), LETTERS), fontsize="small")
     figure.suptitle(one.scene.title)
     save(figure, path, DPI)
 
@@ -89,7 +96,9 @@ def _dots(axis: Any, part: Points, low: np.ndarray, high: np.ndarray) -> None:
         return
     few = inside[np.linspace(0, len(inside) - 1, min(len(inside), MOST_DOTS)).astype(int)]
     how = {"alpha": 0.4, "s": 9} if part.name == GAUSSIANS else {"alpha": 0.9, "s": 6}
-    axis.scatter(*part.places[few].T, c=part.colours[few] / 255, linewidths=0, depthshade=False, **how)
+    axis.scatter(
+        *part.places[few].T, c=part.colours[few] / 255, linewidths=0, depthshade=False, zorder=3, **how
+    )
 
 
 def _rays(axis: Any, part: Lines, low: np.ndarray, high: np.ndarray) -> None:
@@ -98,7 +107,7 @@ def _rays(axis: Any, part: Lines, low: np.ndarray, high: np.ndarray) -> None:
         with np.errstate(divide="ignore", invalid="ignore"):
             edge = np.where(along == 0, np.inf, (np.where(along > 0, high, low) - start) / along)
         end = start + along * float(np.clip(edge.min(), 0, 1))
-        axis.plot(*np.stack([start, end]).T, color=colour, lw=1.0)
+        axis.plot(*np.stack([start, end]).T, color=colour, lw=1.0, zorder=4)
 
 
 def _mark(axis: Any, place: np.ndarray, text: str, mark: str, side: str, **how: Any) -> None:
@@ -121,7 +130,9 @@ def _plane(axis: Any, view: SiteView, name: str | None, legend: Legend | None) -
     colours = np.concatenate([legend.of(level) / 255, clear], axis=-1)
     x, y = np.meshgrid(coarse.x, coarse.y)
     height = np.full_like(x, coarse.height)
-    axis.plot_surface(x, y, height, facecolors=colours, shade=False, rstride=1, cstride=1, linewidth=0)
+    axis.plot_surface(
+        x, y, height, facecolors=colours, shade=False, rstride=1, cstride=1, linewidth=0, zorder=1
+    )
 
 
 def _look(axis: Any, low: np.ndarray, high: np.ndarray) -> None:

@@ -25,6 +25,7 @@ from gsparc.methods.stored_front import kept
 log = logging.getLogger(__name__)
 
 MOST_ERRORS = 2000  # test rows that errors are drawn of
+LEAST_HEIGHT_M = 0.5  # of a site, between whose floor and ceiling planes are lifted
 CHUNK = 128  # rows of one call
 LEAST_RATIO = 1e-6  # of a mean square error, where PSNR ends
 
@@ -126,6 +127,13 @@ class Viewed:
         site = self.site
         box = site.box if site.moving_box is None else site.moving_box[:, -3:]
         return np.asarray(box + site.origin)
+
+    def heights(self) -> tuple[float, float]:
+        """Between which a plane can be lifted [m], to the centimetre."""
+        low, high = (float(z) for z in (self.site.box + self.site.origin)[:, 2])
+        if high - low <= LEAST_HEIGHT_M:
+            low, high = low - 1.5, high + 1.5
+        return float(np.floor(100 * low) / 100), float(np.ceil(100 * high) / 100)
 
     def rows(self, station: str | None) -> np.ndarray:
         """Rows of a station."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
 from gsparc.view.answer import Answer
-from gsparc.view.scene import Legend
+from gsparc.view.building import SURFACES
+from gsparc.view.scene import Faces, Legend, Part
 
 ENDS = {"tx": "transmitter", "rx": "receiver"}
 
@@ -27,15 +30,19 @@ def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str
     """An answer and why, for a panel."""
     lines = [f"**{headline(answer, unit)}**", ""]
     lines += [
-        f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in answer.ends[end])} m" for end in moving
+        f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"
+        for end in moving  # + 0.0: no minus before nought
     ]
     lines += [f"- {reason}" for reason in reasons]
     return "\n".join(lines)
 
 
-def legend_html(legends: Iterable[Legend]) -> str:
-    """Colour bars with their ends and labels."""
+def legend_html(legends: Iterable[Legend], surfaces: Iterable[Part] = ()) -> str:
+    """Colour bars with their ends and labels, and what surfaces are by their colours."""
     rows = []
+    for colour in dict.fromkeys(part.colour for part in surfaces if isinstance(part, Faces)):
+        swatch = f'<span style="background:rgb{colour};opacity:.6">&emsp;</span>'
+        rows.append(f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>')
     for legend in dict.fromkeys(legends):
         stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in legend.strip(16))
         rows.append(

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from campaigns import channels, compose
 
-from gsparc.view.plane import lifted, refining, sheet, thinned, weakest
+from gsparc.commands.train import train
+from gsparc.view.answer import ask
+from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, thinned, weakest
+from gsparc.view.reasons import usual
 from gsparc.view.scene import Legend
+from gsparc.view.site_view import grid_for
+from gsparc.view.viewed import open_viewed
 
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
@@ -16,7 +23,23 @@ def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     assert all(np.isfinite(plane.level_db).all() for plane in planes)
     direct = 10 * np.log10(asked.rssi(rx=grid.places())).reshape(grid.shape)
     np.testing.assert_allclose(planes[-1].level_db, direct, atol=1e-4)
-    np.testing.assert_array_equal(weakest(planes[-1]), grid.places()[direct.argmin()])
+    first = weakest(planes[-1])
+    np.testing.assert_array_equal(first, grid.places()[direct.argmin()])
+    second = weakest(planes[-1], [first])
+    assert np.linalg.norm(second - first) >= 0.1 * max(grid.shape) * grid.step
+    assert weakest(planes[-1], grid.places()) is None
+
+
+def test_what_distance_explains_is_taken_off_a_plane(power_view):
+    grid, still = power_view.grid, power_view.viewed.still("west")
+    law = usual(np.array([[1.0, 0, 0], [10, 0, 0], [100, 0, 0]]), np.array([-30.0, -50, -70]), np.zeros(3))
+    level = law.at(np.linalg.norm(grid.places() - still, axis=1)).reshape(grid.shape)
+    level[3, 4] -= 12
+    found = beyond_distance(Plane(grid, level, 1), law, still).level_db
+    assert (
+        found[3, 4] == pytest.approx(-12)
+        and np.abs(np.delete(found.reshape(-1), 3 * grid.shape[1] + 4)).max() < 1e-9
+    )
 
 
 def test_a_lifted_plane_is_asked_at_its_height(power_view):
@@ -37,3 +60,20 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
     left, _, _, high = grid.extent
     np.testing.assert_allclose(made.corner, [left, high, grid.height])
     assert made.right[0] > 0 and made.down[1] < 0
+
+
+def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):
+    """It was of the mean alone: up to 24 dB below the answer where the mean fades and the error does not."""
+    file = channels(tmp_path / "room.npz", shape="S")
+    train(compose("dataset=own", f"dataset.file={file}", "model=gp", "baselines=[]", "logger=none"), tmp_path)
+    viewed = open_viewed(tmp_path / "model.ckpt")
+    *_, plane = refining(viewed.asked(None), grid_for(viewed, {"step_m": 0.5}))
+    said = [ask(viewed.asked(None), {"rx": place}) for place in plane.grid.places()]
+    assert any(one.response is not None and one.spread_db > 2 for one in said)
+    np.testing.assert_allclose(plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3)
+
+
+def test_a_plane_lies_half_a_dot_lower_so_that_dots_are_seen_whole(power_view):
+    grid, one = power_view.grid, power_view.station("west")
+    made = sheet("plane", grid, np.zeros(grid.shape), Legend("", 0.0, 1.0), one.dot / 2)
+    assert one.dot > 0 and made.corner[2] == grid.height - one.dot / 2

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import gc
 import re
+import socket
 import threading
 import time
 from dataclasses import replace
@@ -21,6 +24,10 @@ from gsparc.view.site_view import SiteView, grid_for
 from gsparc.view.viewed import Way, open_viewed
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
+
+import msgspec  # noqa: E402
+from websockets.exceptions import ConnectionClosed  # noqa: E402
+from websockets.sync.client import connect  # noqa: E402
 
 from gsparc.view.newest import Newest  # noqa: E402
 from gsparc.view.server.page import page  # noqa: E402
@@ -50,6 +57,51 @@ def settle(session, seconds=20.0):
     while len(session.work) and time.monotonic() < end:
         time.sleep(0.01)
     assert not len(session.work), "work is left"
+
+
+def objects():
+    """That are alive."""
+    gc.collect()
+    return len(gc.get_objects())
+
+
+class Visitor:
+    """A client over a socket of its own, that says where its camera is and reads what comes."""
+
+    def __init__(self, server):
+        there = set(server.sessions)
+        self.socket = connect(
+            server.address.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None, compression=None,
+        )  # fmt: skip
+        camera = {"position": (0.0, -9, 8), "fov": 1.3, "near": 0.01, "far": 1e3, "look_at": (0.0, 0, 0)}
+        camera |= {"image_height": 700, "image_width": 1100, "up_direction": (0.0, 0, 1)}
+        self.say("ViewerCameraMessage", wxyz=(1.0, 0, 0, 0), **camera)
+        threading.Thread(target=self.read, daemon=True).start()
+        assert wait(lambda: set(server.sessions) - there)
+        (self.number,) = set(server.sessions) - there
+        self.session = server.sessions[self.number]
+
+    def say(self, kind, **fields):
+        self.socket.send(msgspec.msgpack.encode({"type": kind, **fields}))
+
+    def read(self):
+        with contextlib.suppress(ConnectionClosed):
+            for _ in self.socket:
+                pass
+
+    def drag(self, place):
+        at = tuple(float(value) for value in self.session.scene.frame.drawn(np.asarray(place)))
+        fields = {"name": "/rx", "wxyz": (1.0, 0, 0, 0), "position": at, "owner": str(self.number)}
+        self.say("TransformControlsUpdateMessage", **fields)
+
+
+def wait(until, seconds=20.0):
+    """Whether something came true in time."""
+    end = time.monotonic() + seconds
+    while not until() and time.monotonic() < end:
+        time.sleep(0.01)
+    return until()
 
 
 def drag(session, end, place):
@@ -99,7 +151,7 @@ def test_layers_of_a_map_that_was_made_are_laid(visit, power_view):
     view = SiteView(power_view.viewed, grid=power_view.grid, layers=tuple((found.grid, one) for one in made))
     session = visit(view)
     settle(session)
-    session.chosen.value = "outage"
+    session.chosen.value = "map: outage"
     session.want_plane()
     settle(session)
     assert session.nodes["plane"].image.shape[:2] == found.grid.shape
@@ -124,7 +176,10 @@ def test_operating_points_are_steps_with_their_accuracy_and_live_milliseconds(vi
     settle(session)
     assert re.search(r"stride 2, psnr_db 20: query \*\*[\d.]+ ms\*\*", session.speed.content)
     assert (session.picture.image != full).any()
-    assert [list(part) for part in session._front()] == [[0.5, 2.0], [20.0, 25.0]]
+    took, reached, chosen = session._front()
+    assert (list(took), list(reached)) == ([0.5, 2.0], [20.0, 25.0])
+    np.testing.assert_array_equal(chosen, [20.0, np.nan])  # what is shown was not marked among the others
+    np.testing.assert_array_equal(session.front.data[2], chosen)
 
 
 def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
@@ -173,11 +228,22 @@ def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(v
     session._station_changed("east")
     settle(session)
     assert session.said.content != first and "east" in session.title.content
-    session._go("weakest cell")
+    session._go("next weak place")
     settle(session)
     level = session.plane.level_db
     said = float(re.match(r"\*\*(-?[\d.]+)", session.said.content)[1])
     assert said == pytest.approx(np.nanmin(level), abs=0.1)
+    here = session.places["rx"]
+    session._go("next weak place")
+    settle(session)
+    assert np.linalg.norm(session.places["rx"] - here) > 5  # it stayed where it was, however often one asked
+    session.chosen.value = "power beyond distance"
+    session.want_plane()
+    settle(session)
+    assert "more than distance alone explains" in session.legend.content and not session.visited
+    law, still = session.one.about.usual, power_view.viewed.still("east")
+    far = np.linalg.norm(session.plane.grid.places() - still, axis=1).reshape(level.shape)
+    np.testing.assert_allclose(session.plane.level_db, level - law.at(far), atol=1e-6)
 
 
 def test_a_thousand_drags_leave_nothing_behind(visit, spectrum_view):
@@ -185,9 +251,14 @@ def test_a_thousand_drags_leave_nothing_behind(visit, spectrum_view):
     settle(session)
     nodes = len(session.client.scene._handle_from_node_name)
     low, high = spectrum_view.viewed.box()
-    for share in np.linspace(0, 1, 1000):
+    held = 0
+    for count, share in enumerate(np.linspace(0, 1, 1000)):
         drag(session, "tx", low + share * (high - low))
-    settle(session)
+        if count % 10 == 9:
+            settle(session)  # so that each tenth is answered
+        if count == 199:
+            held = objects()
+    assert session.answers >= 100 and objects() < held + 40  # half a one of each answer since
     assert len(session.client.scene._handle_from_node_name) == nodes
     assert len(session.delays) <= session.delays.maxlen
 
@@ -208,6 +279,22 @@ def test_a_client_that_vanishes_is_forgotten(power_view):
             time.sleep(0.01)
         assert not len(server.work)
         assert server.address.startswith("http://127.0.0.1:")
+    finally:
+        server.stop()
+
+
+def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
+    server = Server(power_view, port=0)
+    try:
+        one, two = Visitor(server), Visitor(server)
+        assert wait(lambda: one.session.answers and two.session.answers)
+        two.drag([20.0, 30.0, 1.5])
+        assert wait(lambda: "receiver at 20.00, 30.00" in two.session.said.content)
+        assert "receiver at 20.00, 30.00" not in one.session.said.content
+        two.socket.socket.shutdown(socket.SHUT_RDWR)  # without a word
+        assert wait(lambda: set(server.sessions) == {one.number})
+        one.drag([40.0, 10.0, 1.5])
+        assert wait(lambda: "receiver at 40.00, 10.00" in one.session.said.content)
     finally:
         server.stop()
 

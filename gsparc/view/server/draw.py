@@ -70,13 +70,13 @@ def _sheet(api: Any, frame: Frame, part: Sheet, visible: bool) -> Any:
     )  # fmt: skip
 
 
-def floor(api: Any, scene: Scene, box: np.ndarray) -> float:
-    """A grid beneath the box (2, 3) [m]; returns the side of its cells [m]."""
+def floor(api: Any, scene: Scene) -> float:
+    """A grid beneath the scene; returns the side of its cells [m]."""
     frame = scene.frame
     wide = EXTENT / frame.scale
     side = 10.0 ** np.floor(np.log10(wide / 5))
     side *= next(n for n in (5, 2, 1) if n * side <= wide / 5)
-    middle = np.array([*frame.middle[:2], box[0, 2] - 1e-3 * wide])
+    middle = np.array([*frame.middle[:2], scene.ground])
     api.add_grid(
         "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale,
         section_size=5 * side * frame.scale, position=frame.drawn(middle), shadow_opacity=0.0,
@@ -84,9 +84,9 @@ def floor(api: Any, scene: Scene, box: np.ndarray) -> float:
     return float(side)
 
 
-def first_view(camera: Any, aside: float = ASIDE) -> None:
-    """Look at the site from the south and above, `aside` widths past its middle."""
-    east = np.array([aside, 0.0, 0.0])
-    camera.position = tuple(EXTENT * (np.array(ABOVE) + east))
-    camera.look_at = tuple(EXTENT * east)
+def first_view(camera: Any, aside: float = ASIDE, up: float = 0.0) -> None:
+    """Look at the site from the south and above, `aside` widths past its middle and `up` above it."""
+    past = np.array([aside, 0.0, up])
+    camera.position = tuple(EXTENT * (np.array(ABOVE) + past))
+    camera.look_at = tuple(EXTENT * past)
     camera.up = (0.0, 0.0, 1.0)

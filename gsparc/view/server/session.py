@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.view.answer import Answer, ask, reasons
+from gsparc.view.answer import Answer, ask
 from gsparc.view.building import (
     ERRORS,
     GAUSSIANS,
@@ -26,20 +26,30 @@ from gsparc.view.building import (
 )
 from gsparc.view.newest import Newest
 from gsparc.view.panel import degrees_of, response_db, response_db_of_antennas, spectrum_image, tones_mhz
-from gsparc.view.plane import Plane, lifted, refining, sheet, weakest
+from gsparc.view.plane import Plane, beyond_distance, lifted, refining, sheet, weakest
 from gsparc.view.ply import ply_bytes
+from gsparc.view.reasons import reasons
 from gsparc.view.scene import EXTENT, Legend, Points
 from gsparc.view.server.draw import draw, first_view, floor
 from gsparc.view.site_view import SiteView
 from gsparc.view.words import ENDS, answer_markdown, legend_html
 
-PREDICTED, NOTHING = "predicted power", "nothing"
-FIRST_PLACE, WEAKEST = "first place", "weakest cell"
+PREDICTED, BEYOND, NOTHING = "predicted power", "power beyond distance", "nothing"
+FIRST_PLACE, WEAKEST = "first place", "next weak place"
 PLANE = "plane"
+PADDING = (12, 8, 0, 0)  # of plots: else their highest number is cut [pixels]
 KEPT = 50  # times that a median is taken of
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
-DOTS = tuple({"width": 0, "stroke": colour, "points": {"show": True, "size": 7}} for colour in COLOURS)
+DOTS = (
+    {"width": 0, "stroke": COLOURS[0], "points": {"show": True, "size": 7}},
+    {"width": 0, "stroke": COLOURS[1], "points": {"show": True, "size": 10, "fill": COLOURS[1]}},
+)
 LINES = tuple({"width": 2, "stroke": colour} for colour in COLOURS)
+
+
+def map_name(layer: str) -> str:
+    """Of a layer that `gsparc map` made, to choose it by."""
+    return f"map: {layer.replace('_', ' ')}"
 
 
 class Session:
@@ -62,6 +72,7 @@ class Session:
         self.queries: deque[float] = deque(maxlen=KEPT)
         self.answers = 0  # that were shown
         self.plane: Plane | None = None
+        self.visited: list[np.ndarray] = []  # weak places of it, one after another
         self.power: Legend | None = None  # of the plane, where it is predicted
         self.nodes: dict[str, Any] = {}
         self.gizmos: dict[str, Any] = {}
@@ -90,7 +101,7 @@ class Session:
             for part in self.scene.parts
             if part.name not in self.scene.hidden
         }
-        self.cell = floor(api, self.scene, self.view.viewed.box())
+        self.cell = floor(api, self.scene)
         if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
             around, black = (
                 self.scene.frame.middle + self.sphere.offsets,
@@ -145,7 +156,8 @@ class Session:
                 self._on(self.way, self._way_changed)
             self.speed = gui.add_markdown("")
             if last:
-                self._plot(self._front(), f"{viewed.ways[0].figure} by ms of a query, as swept", DOTS)
+                title = f"{viewed.ways[0].figure} by ms of a query, as swept; filled: this one"
+                self.front = self._plot(self._front(), title, DOTS)
         with gui.add_folder("Notes", expand_by_default=False):
             gui.add_markdown("\n".join(f"- {note}" for note in self._notes()))
         self._legends()
@@ -164,18 +176,18 @@ class Session:
                 button.on_click(lambda _: self._download())
             self.chosen: Any = None
             if self.view.grid is not None or self.view.layers:
-                names = ((PREDICTED,) if self.view.grid is not None else ()) + tuple(
-                    layer.name for _, layer in self.view.layers
+                known = self.one.about.usual
+                far = (BEYOND,) if known is not None and np.isfinite(known.at_one) else ()
+                names = ((PREDICTED, *far) if self.view.grid is not None else ()) + tuple(
+                    map_name(layer.name) for _, layer in self.view.layers
                 )
                 self.chosen = gui.add_dropdown("plane", (*names, NOTHING), initial_value=names[0])
                 self._on(self.chosen, lambda value: self.want_plane())
                 self.progress = gui.add_markdown("")
             if self.view.grid is not None:
-                low, high = self.view.heights()
-                low, high = min(low, self.view.grid.height), max(high, self.view.grid.height)
-                self.height = gui.add_slider(
-                    "height [m]", low, high, round((high - low) / 100, 4), self.view.grid.height
-                )
+                low, high = self.view.viewed.heights()
+                first = round(self.view.grid.height, 2)
+                self.height = gui.add_slider("height [m]", min(low, first), max(high, first), 0.01, first)
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
@@ -229,11 +241,14 @@ class Session:
     def _go(self, where: str) -> None:
         moving = self.view.viewed.moving[-1]
         place = self.view.starts(self.station)[moving]
-        if where == WEAKEST:
-            found = None if self.plane is None else weakest(self.plane)
-            if found is None:
-                return
-            place = found
+        if where == WEAKEST and self.plane is not None:
+            found = weakest(self.plane, self.visited)
+            if found is None:  # all were visited
+                self.visited.clear()
+                found = weakest(self.plane)
+            if found is not None:
+                self.visited.append(found)
+                place = found
         self._move(moving, place)
 
     def _points_changed(self, value: str) -> None:
@@ -256,12 +271,17 @@ class Session:
     def _way_changed(self, value: int) -> None:
         self.queries.clear()
         self.delays.clear()
+        self.front.data = self._front()
         self.wanted()
 
-    def _front(self) -> tuple[np.ndarray, np.ndarray]:
-        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first."""
-        swept = np.array(sorted(one.swept[::-1] for one in self.view.viewed.ways if one.swept is not None))
-        return swept[:, 0], swept[:, 1]
+    def _front(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Milliseconds and accuracies (n,) of the operating points that were swept, the fastest first, and
+        that of the chosen one, NaN elsewhere."""
+        ways = self.view.viewed.ways
+        swept = sorted((*one.swept[::-1], k) for k, one in enumerate(ways) if one.swept is not None)
+        took, reached, number = np.array(swept).T
+        chosen = len(ways) - 1 if self.way is None else self.way.value
+        return took, reached, np.where(number == chosen, reached, np.nan)
 
     def _station_changed(self, value: str) -> None:
         """Called in a thread of its own: a station that nobody saw yet takes seconds to make."""
@@ -275,7 +295,8 @@ class Session:
     def _download(self) -> None:
         cloud = cloud_of(self.view.viewed, self.station, self.one.measured)
         if cloud is not None:
-            self.client.send_file_download("gaussians.ply", ply_bytes(cloud, cloud_colours(cloud)[1]))
+            content = ply_bytes(cloud, cloud_colours(cloud)[1])
+            self.client.send_file_download("gaussians.ply", content, save_immediately=True)
 
     # -- what the worker does ----------------------------------------------------------------------
 
@@ -327,7 +348,7 @@ class Session:
 
     def _show(self, answer: Answer) -> None:
         one = self.one
-        why = reasons(answer, self.view.viewed.moving[-1], one.usual, one.objects, self.site.origin)
+        why = reasons(answer, self.view.viewed.moving[-1], one.about)
         with self.client.atomic():
             self.said.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
             for end in self.vectors:
@@ -391,7 +412,7 @@ class Session:
         series = ({}, *looks[: len(data) - 1])
         return self.client.gui.add_uplot(
             data, series, title=title, scales={"x": {"time": False}}, legend={"show": False}, height=170,
-            order=order,
+            order=order, padding=PADDING,
         )  # fmt: skip
 
     def _after(self) -> float:
@@ -399,34 +420,49 @@ class Session:
 
     def _planes(self) -> Iterator[None]:
         name = NOTHING if self.chosen is None else self.chosen.value
-        made = next(((grid, layer) for grid, layer in self.view.layers if layer.name == name), None)
+        made = next(((grid, layer) for grid, layer in self.view.layers if map_name(layer.name) == name), None)
         self.power = None
         if made is not None:
             grid, layer = made
-            self._lay(sheet(PLANE, grid, layer.values, Legend(layer.label, *layer.range(), layer.colours)))
+            self._lay(
+                sheet(
+                    PLANE,
+                    grid,
+                    layer.values,
+                    Legend(layer.label, *layer.range(), layer.colours),
+                    self.one.dot / 2,
+                )
+            )
             self.progress.content = f"as `gsparc map` made it, at a height of {grid.height:g} m"
-        elif name == PREDICTED and self.view.grid is not None:
-            yield from self._predicted_plane()
+        elif name in (PREDICTED, BEYOND) and self.view.grid is not None:
+            yield from self._predicted_plane(name == BEYOND)
         elif PLANE in self.nodes:
             self.nodes.pop(PLANE).remove()
         self._legends()
         yield
 
-    def _predicted_plane(self) -> Iterator[None]:
+    def _predicted_plane(self, beyond: bool) -> Iterator[None]:
         grid = lifted(self.view.grid, float(self.height.value))  # type: ignore[arg-type]
         predictor = self.view.viewed.asked(self.station)
         other = self.places["tx"] if self.site.static_end is None else None
-        legend, begin = self.one.power, time.perf_counter()
+        known, there = self.one.about.usual, self._still()
+        legend, begin = None if beyond else self.one.power, time.perf_counter()
+        self.visited.clear()
         for plane in refining(predictor, grid, None if other is None else other.tolist()):
             if plane is None:
                 yield
                 continue
+            if beyond and known is not None and there is not None:
+                plane = beyond_distance(plane, known, there)
+                most = max(3 * known.spread_db, 1.0)
+                label = "power more than distance alone explains [dB]"
+                legend = legend or Legend(label, -most, most, "PuOr")
             first, legend = (
                 self.power is None,
                 legend or Legend.over(f"{PREDICTED} [{self.view.unit}]", plane.level_db),
             )
             self.plane, self.power = plane, legend
-            self._lay(sheet(PLANE, grid, plane.level_db, legend))
+            self._lay(sheet(PLANE, grid, plane.level_db, legend, self.one.dot / 2))
             if first:
                 self._legends()
             asked = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
@@ -435,6 +471,10 @@ class Session:
                 f"{time.perf_counter() - begin:.1f} s"
             )
             yield
+
+    def _still(self) -> np.ndarray | None:
+        """World place (3,) [m] of the other end than the plane's."""
+        return self.places["tx"] if self.site.static_end is None else self.view.viewed.still(self.station)
 
     def _lay(self, part: Any) -> None:
         self.nodes[PLANE] = draw(self.client.scene, self.scene.frame, part)
@@ -446,6 +486,8 @@ class Session:
         shown += [self.power] if PLANE in self.nodes and self.power is not None else []
         name = NOTHING if self.chosen is None else self.chosen.value
         shown += [
-            Legend(one.label, *one.range(), one.colours) for _, one in self.view.layers if one.name == name
+            Legend(one.label, *one.range(), one.colours)
+            for _, one in self.view.layers
+            if map_name(one.name) == name
         ]
-        self.legend.content = legend_html(shown)
+        self.legend.content = legend_html(shown, self.scene.parts)

@@ -1,0 +1,91 @@
+"""What stands on the straight line between two places: known walls, boxes that were found, and Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsparc.data.site_objects import SiteObjects
+from gsparc.data.walls import SceneWalls
+
+APART_M = 0.5  # faces that are nearer to each other along a line are sides of one wall [m]
+
+
+@dataclass(frozen=True)
+class Obstacles:
+    """Faces as triangles, and boxes.
+
+    Attributes:
+        triangles: (T, 3, 3) corners [m], each face a fan about its first corner.
+        face: (T,) of which face each is.
+        boxes: (B, 2, 3) lower and upper corners [m].
+    """
+
+    triangles: np.ndarray
+    face: np.ndarray
+    boxes: np.ndarray
+
+    @classmethod
+    def of(cls, walls: SceneWalls) -> Obstacles:
+        """What is known of a scene."""
+        fans = [face[[0, i, i + 1]] for face in walls.faces for i in range(1, len(face) - 1)]
+        count = np.array([len(face) - 2 for face in walls.faces], np.int64)
+        triangles = np.array(fans).reshape(-1, 3, 3)
+        return cls(triangles, np.repeat(np.arange(len(count)), count), walls.boxes)
+
+    def crossed(self, start: np.ndarray, end: np.ndarray) -> int:
+        """Walls and boxes that the line between two places (3,) [m] passes; both sides of one count once."""
+        along = end - start
+        length = float(np.linalg.norm(along))
+        if length == 0:
+            return 0
+        at = np.sort(np.concatenate([self._faces(start, along), self._boxes(start, along)])) * length
+        return int(len(at) > 0) + int((np.diff(at) > APART_M).sum())
+
+    def _faces(self, start: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Shares of the line (n,) at which faces are crossed. Moeller and Trumbore 1997, equation 4."""
+        corner, one, two = (
+            self.triangles[:, 0],
+            self.triangles[:, 1] - self.triangles[:, 0],
+            self.triangles[:, 2] - self.triangles[:, 0],
+        )
+        across = np.cross(along, two)
+        determinant = (across * one).sum(1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = ((start - corner) * across).sum(1) / determinant
+            turned = np.cross(start - corner, one)
+            v = (turned @ along) / determinant
+            share = (turned * two).sum(1) / determinant
+            # Half open, so that the edge two triangles of a fan share belongs to one of them.
+            hit = (u >= 0) & (v > 0) & (u + v <= 1) & (share > 0) & (share < 1)
+        numbers, first, times = np.unique(self.face[hit], return_index=True, return_counts=True)
+        del numbers
+        return np.asarray(share[hit][first[times % 2 == 1]])  # a fan outside its face is crossed twice
+
+    def _boxes(self, start: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Shares of the line (n,) at which boxes are entered, 0 of those in which it begins."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            edges = (self.boxes - start) / along
+        enter, leave = np.nanmax(edges.min(1), axis=1), np.nanmin(edges.max(1), axis=1)
+        hit = (np.maximum(enter, 0) < np.minimum(leave, 1)) & np.isfinite(leave)
+        return np.asarray(np.maximum(enter, 0)[hit])
+
+
+def crossed_losses(objects: SiteObjects, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Losses (N,) [dB] of Gaussians on the straight line between two local places (3,) [m].
+
+    What a line through the middle loses, times exp(-d^2 / 2) of its least distance d in standard deviations.
+    """
+    cos, sin = np.cos(objects.turns), np.sin(objects.turns)
+
+    def own(vector: np.ndarray) -> np.ndarray:
+        x, y, z = vector.T
+        return np.column_stack([cos * x + sin * y, cos * y - sin * x, z]) / objects.scales
+
+    begin = own(start - objects.means)
+    along = own(np.broadcast_to(end - start, objects.means.shape))
+    square = np.maximum((along**2).sum(1), 1e-30)
+    share = np.clip(-(begin * along).sum(1) / square, 0, 1)
+    nearest = begin + share[:, None] * along
+    return np.asarray(objects.losses * np.exp(-0.5 * (nearest**2).sum(1)))

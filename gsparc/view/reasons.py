@@ -1,0 +1,168 @@
+"""Why a level is what it is: what is measured, what stands between the ends, and what the model holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from gsparc.data.site_objects import SiteObjects
+from gsparc.view.answer import SILENT_DB, Answer, azimuth_elevation
+from gsparc.view.crossed import Obstacles, crossed_losses
+
+NEAREST_M = 0.1  # where a distance law ends
+PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
+LEAST_LOSS_DB = 0.5  # of a Gaussian that is counted
+
+
+@dataclass(frozen=True)
+class Usual:
+    """What was measured at what distance: level = `at_one` - `slope` log10(distance).
+
+    Attributes:
+        at_one: [dB] at a metre.
+        slope: [dB per decade].
+        spread_db: of what was measured about it.
+        tree: of measured places, world (n, 3); of transmitters and receivers (n, 6) where both moved.
+        distance_m: (n,) of what was measured; empty where the other end is unknown.
+        level_db: (n,) there.
+    """
+
+    at_one: float
+    slope: float
+    spread_db: float
+    tree: cKDTree
+    distance_m: np.ndarray
+    level_db: np.ndarray
+
+    def at(self, distance_m: np.ndarray | float) -> np.ndarray:
+        """Level [dB] at distances [m]: that of the line, at most the strongest that was measured.
+
+        A line through places behind walls is too high near the other end, by tens of decibels.
+        """
+        line = self.at_one - self.slope * np.log10(np.maximum(distance_m, NEAREST_M))
+        return np.minimum(line, self.level_db.max(initial=-np.inf))
+
+
+def usual(places: np.ndarray, level_db: np.ndarray, other: np.ndarray | None) -> Usual:
+    """The distance law of measured levels (n,) [dB] at places (n, 3) [m], the other end at (3,) or (n, 3);
+    NaN where that is unknown."""
+    known = np.isfinite(level_db)
+    tree = cKDTree(places if other is None or other.ndim == 1 else np.column_stack([other, places]))
+    level = level_db[known]
+    if other is None or len(level) < 3:
+        return Usual(np.nan, np.nan, np.nan, tree, np.zeros(0), level)
+    distance = np.maximum(np.linalg.norm((places - other)[known], axis=1), NEAREST_M)
+    far = np.log10(distance)
+    slope, at_one = np.polyfit(far, level, 1) if np.ptp(far) > 0 else (0.0, level.mean())
+    spread = float(np.std(level - at_one - slope * far))
+    return Usual(float(at_one), float(-slope), spread, tree, distance, level)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What is known about the places of an answer.
+
+    Attributes:
+        usual: what was measured at what distance; None without data.
+        values: (n,) what was measured [dB], of spectra their means; NaN where nothing was heard.
+        objects: that the model found, local coordinates.
+        origin: (3,) of the local coordinates, world [m].
+        walls: that are known, and boxes that the model found, world; None: neither.
+        unit: of powers.
+    """
+
+    usual: Usual | None = None
+    values: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    objects: SiteObjects = field(default_factory=SiteObjects.of)
+    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    walls: Obstacles | None = None
+    unit: str = "dB"
+
+
+def reasons(answer: Answer, moving: str, about: Surroundings) -> list[str]:
+    """Why the level is what it is, one line each.
+
+    Args:
+        answer: at a place.
+        moving: the end that was dragged.
+        about: what is known there.
+    """
+    here, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
+    said = _among(answer, about.values)
+    if there is not None:
+        said += _between(answer, here, there, about)
+    if about.usual is not None:
+        said.append(_nearest(answer, here, about.usual.tree))
+    return said + _paths(answer)
+
+
+def _among(answer: Answer, values: np.ndarray) -> list[str]:
+    values = values[np.isfinite(values)]
+    spectrum = answer.spectrum is not None
+    value = answer.level_db if answer.spectrum is None else float(answer.spectrum.mean())
+    if value is None or not len(values):
+        return []
+    share = f"{'lower' if spectrum else 'weaker'} than {np.mean(values > value):.0%} of what was measured"
+    return [f"mean of the spectrum {value:.3f}, {share}" if spectrum else share]
+
+
+def _between(answer: Answer, here: np.ndarray, there: np.ndarray, about: Surroundings) -> list[str]:
+    known, far = about.usual, float(np.linalg.norm(here - there))
+    said, weak = [f"{far:.3g} m from the other end"], False
+    if known is not None and answer.level_db is not None and np.isfinite(known.at_one):
+        plain = float(known.at(far))
+        gap = answer.level_db - plain
+        weak = gap < -known.spread_db
+        how = "weaker" if weak else "stronger" if gap > known.spread_db else "as usual"
+        said.append(
+            f"distance alone: {plain:.1f} {about.unit}; here {abs(gap):.1f} dB "
+            f"{'less' if gap < 0 else 'more'} ({how}, measured levels spread {known.spread_db:.1f} dB)"
+        )
+    if about.walls is not None:
+        walls = about.walls.crossed(here, there)
+        said.append(
+            f"the straight path crosses {walls or 'no'} {'wall or box' if walls == 1 else 'walls or boxes'}"
+        )
+    if len(about.objects.means):
+        crossed = crossed_losses(about.objects, here - about.origin, there - about.origin)
+        strong = crossed[np.abs(crossed) >= LEAST_LOSS_DB]
+        word = "Gaussian that takes" if len(strong) == 1 else "Gaussians that take"
+        said.append(f"the straight path crosses {len(strong)} {word} {crossed.sum():.1f} dB by the model")
+    elif weak and about.walls is None and answer.paths is None:
+        said.append(
+            "what takes the rest is not known: this model holds no obstacles, and no walls=FILE is given"
+        )
+    return said
+
+
+def _nearest(answer: Answer, here: np.ndarray, tree: cKDTree) -> str:
+    if tree.m == 3:
+        apart = float(tree.query(here)[0])
+        return "measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away"
+    ends = np.concatenate([answer.ends["tx"], answer.ends["rx"]])
+    row = tree.data[int(tree.query(ends)[1])]
+    one, two = (float(np.linalg.norm(part)) for part in np.split(row - ends, 2))
+    if max(one, two) < 1e-3:
+        return "measured here"
+    return f"nearest measurement: transmitter {one:.3g} m and receiver {two:.3g} m away"
+
+
+def _paths(answer: Answer) -> list[str]:
+    rays = answer.paths
+    if rays is None or not len(rays.gain_db):
+        return []
+    more = ""
+    if rays.towards is not None:
+        more = " from azimuth {:.0f}°, elevation {:.0f}°".format(*azimuth_elevation(rays.towards[0]))
+    said = [
+        f"{len(rays.gain_db)} paths within {SILENT_DB:g} dB; strongest {rays.gain_db[0]:.1f} dB at "
+        f"{rays.delay_ns[0]:.1f} ns{more}"
+    ]
+    if answer.level_db is not None and len(rays.gain_db) > 1:
+        gap = answer.level_db - 10 * np.log10((10 ** (rays.gain_db / 10)).sum())
+        if abs(gap) >= PHASES_DB:
+            how = "cancel each other" if gap < 0 else "add up"
+            said.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")
+    return said
