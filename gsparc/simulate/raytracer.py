@@ -218,6 +218,7 @@ class RayTracer:
 
     def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
         """Place transmitter and receivers in the scene."""
+        import drjit as dr
         import mitsuba as mi
         import sionna.rt as rt
 
@@ -234,12 +235,18 @@ class RayTracer:
             scene.remove(name)
         if not scene.transmitters:
             scene.add(rt.Transmitter("tx", position=mi.Point3f(0, 0, 0)))
+
+        def point(coordinates: np.ndarray) -> Any:
+            # Plain numbers are constants of kernels: every other place would compile one anew.
+            made = mi.Point3f(*map(float, coordinates))
+            dr.make_opaque(made)
+            return made
+
         tx = scene.get("tx")
-        tx.position = mi.Point3f(*map(float, self.transmitter))
-        turn = np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0])
-        tx.orientation = mi.Point3f(*map(float, turn))
+        tx.position, ahead = point(self.transmitter), point(np.zeros(3))
+        tx.orientation = point(np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0]))
         for i, place in enumerate(receivers):
-            scene.add(rt.Receiver(f"rx{i}", position=mi.Point3f(*map(float, place))))
+            scene.add(rt.Receiver(f"rx{i}", position=point(place), orientation=ahead))
 
     def under_open_sky(self, points: np.ndarray) -> np.ndarray:
         """Whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""

@@ -6,6 +6,7 @@ import pytest
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.deciding import pays
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -184,3 +185,11 @@ def test_removals_and_combinations_are_complete():
 def test_a_choice_survives_its_file():
     choice = decided("coverage +-1 dB")
     assert Choice.from_dict(dataclasses.asdict(choice)) == choice
+
+
+def test_fewer_effects_are_compiled_for_only_where_that_pays():
+    """A decision taken over compiled the solver anew for rows whose time was less than that of compiling."""
+    unseen = dataclasses.replace(decided("coverage +-1 dB"), row_all=0.02, compiling=2.0)
+    assert not pays(unseen, 200, 0.2) and pays(unseen, 1000, 0.2)
+    assert pays(dataclasses.replace(unseen, row_chosen=0.018), 200, 0.2)  # its kernels are there
+    assert pays(dataclasses.replace(unseen, compiling=None), 200, 0.2)
