@@ -139,8 +139,13 @@ class Choice:
 
     @property
     def saved(self) -> float | None:
-        """Share of the tracing time that the choice saves against everything; None where not measured."""
-        return None if not (self.row_all and self.row_chosen) else 1 - self.row_chosen / self.row_all
+        """Share of the tracing time that the choice saves against everything; None where not measured.
+
+        None as well where everything is needed: two timings of the same differ by what else the machine does.
+        """
+        if not (self.row_all and self.row_chosen) or all(row.kept for row in self.table):
+            return None
+        return 1 - self.row_chosen / self.row_all
 
     @staticmethod
     def from_dict(stored: Mapping[str, Any]) -> Choice:

@@ -8,9 +8,11 @@ specular chains lost to one another (a hash table large enough for a batch), dup
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -151,8 +153,16 @@ class RayTracer:
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
         """
-        found = self.solutions(receivers, effects, seed)
-        return join([_collect(solution, count) for solution, count in found])
+        # How many receivers a call has is a constant of its kernels: any other number compiles them anew.
+        beneath = np.append(self.transmitter[:2], self._lowest - 1.0)
+        parts, first = [], 0
+        for count, size in calls(len(receivers), self.sampling.batch):
+            some = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
+            found = self.solutions(some, effects, seed)
+            part = join([_collect(solution, number) for solution, number in found])
+            parts.append(part.take(np.arange(count)))
+            first += count
+        return join(parts)
 
     def solutions(
         self, receivers: np.ndarray, effects: Effects, seed: int | None = None
@@ -266,6 +276,10 @@ class RayTracer:
         corners = self.triangles().reshape(-1, 3)
         return np.stack([corners.min(0), corners.max(0)])
 
+    @cached_property
+    def _lowest(self) -> float:
+        return float(self.box()[0, 2])
+
     def _objects(self) -> dict[str, np.ndarray]:
         """Triangles (n, 3, 3) of each object."""
         found = {}
@@ -317,6 +331,15 @@ class RayTracer:
         )
         ray = mi.Ray3f(origin, mi.Vector3f(*map(float, direction)))
         return self._scene.mi_scene.ray_intersect(ray)
+
+
+def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
+    """Receivers of each call, and to how many it is filled up: to a batch or a third of one, nothing else."""
+    third = math.ceil(batch / 3)
+    rest, parts = receivers % batch, [(batch, batch)] * (receivers // batch)
+    if rest > 2 * third:
+        return [*parts, (rest, batch)]
+    return [*parts, *((min(third, rest - first), third) for first in range(0, rest, third))]
 
 
 class _CountingGenerator:

@@ -126,15 +126,23 @@ def test_chains_do_not_cost_each_other_their_place(places):
     assert (np.abs(first - second) ** 2).sum() < 1e-5 * (np.abs(first) ** 2).sum()
 
 
+def test_calls_have_one_of_two_sizes():
+    assert raytracer.calls(464, 200) == [(200, 200), (200, 200), (64, 67)]
+    assert raytracer.calls(128, 200) == [(67, 67), (61, 67)] and raytracer.calls(150, 200) == [(150, 200)]
+    for receivers in (1, 50, 67, 68, 134, 135, 199, 200, 201):
+        assert sum(count for count, _ in raytracer.calls(receivers, 200)) == receivers
+
+
 def test_other_places_compile_nothing(places):
-    """Each receiver's coordinates were constants of a kernel of its own: a fifth of the time of tracing."""
+    """Each receiver's coordinates were constants of a kernel of its own, a fifth of the time of tracing, and
+    so was the number of receivers of a call."""
     import drjit as dr
 
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         room.trace(places[:20], PLAIN)
         dr.kernel_history()
-        room.trace(places[20:40], PLAIN)
+        room.trace(places[20:50], PLAIN)
         compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
     assert len(compiled) < 10  # of what follows the number of paths
 
@@ -241,10 +249,12 @@ def test_auto_in_the_conference_room(tmp_path):
 
 
 def test_killed_by_the_system_and_resumed(tmp_path):
-    """SIGKILL between shards: nothing finished is lost or made twice."""
+    """SIGKILL between shards of two transmitters: nothing finished is lost, every pair is made once."""
     out = tmp_path / "room.h5"
     command = [
-        sys.executable, "-m", "gsparc", "simulate", "scene=conference_room", "scene.num_receivers=60",
+        sys.executable, "-m", "gsparc", "simulate", "scene=conference_room", "scene.num_receivers=30",
+        "scene.transmitter_m=null",
+        "scene.transmitters=[{name: a, position_m: [3.1, 6.2, 3.7]}, {name: b, position_m: [11, 3, 3.5]}]",
         "sampling.samples=5000", "shard=10", "check=0", "spectrum.height=18", "spectrum.width=36",
         f"out={out}", f"hydra.run.dir={tmp_path / 'run'}",
     ]  # fmt: skip
@@ -260,7 +270,7 @@ def test_killed_by_the_system_and_resumed(tmp_path):
     again = subprocess.run(command, capture_output=True, text=True, timeout=240, check=True)
     assert f"{len(before)} of 6 shards are there already" in again.stdout + again.stderr or len(before) == 6
     with h5py.File(out) as file:
-        rows = file["rx_position"][()]
+        rows = np.column_stack([file["station"][()], file["rx_position"][()]])
         assert len(np.unique(rows, axis=0)) == 60 and len(file["spectrum"]) == 60
     facts = json.loads((tmp_path / "run" / "summary.json").read_text())
-    assert facts["dataset/receivers"] == 60
+    assert facts["dataset/receivers"] == 30 and facts["dataset/rows"] == 60
