@@ -334,12 +334,16 @@ class RayTracer:
 
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
-    """Receivers of each call, and to how many it is filled up: to a batch or a third of one, nothing else."""
-    third = math.ceil(batch / 3)
-    rest, parts = receivers % batch, [(batch, batch)] * (receivers // batch)
-    if rest > 2 * third:
+    """Receivers of each call, and to how many it is filled up: a batch, a third of one, a ninth ..."""
+    size, rest = math.ceil(batch / 3), receivers % batch
+    parts = [(batch, batch)] * (receivers // batch)
+    if rest > 2 * size:
         return [*parts, (rest, batch)]
-    return [*parts, *((min(third, rest - first), third) for first in range(0, rest, third))]
+    if rest > size:
+        return [*parts, (size, size), (rest - size, size)]
+    while size > 1 and math.ceil(size / 3) >= rest:
+        size = math.ceil(size / 3)
+    return [*parts, (rest, size)] if rest else parts
 
 
 class _CountingGenerator:

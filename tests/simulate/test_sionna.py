@@ -126,11 +126,14 @@ def test_chains_do_not_cost_each_other_their_place(places):
     assert (np.abs(first - second) ** 2).sum() < 1e-5 * (np.abs(first) ** 2).sum()
 
 
-def test_calls_have_one_of_two_sizes():
+def test_calls_have_one_of_few_sizes():
     assert raytracer.calls(464, 200) == [(200, 200), (200, 200), (64, 67)]
     assert raytracer.calls(128, 200) == [(67, 67), (61, 67)] and raytracer.calls(150, 200) == [(150, 200)]
-    for receivers in (1, 50, 67, 68, 134, 135, 199, 200, 201):
-        assert sum(count for count, _ in raytracer.calls(receivers, 200)) == receivers
+    assert raytracer.calls(1, 200) == [(1, 1)] and raytracer.calls(5, 200) == [(5, 8)]
+    for receivers in range(1, 402):
+        parts = raytracer.calls(receivers, 200)
+        assert sum(count for count, _ in parts) == receivers
+        assert all(count <= size and size in (1, 3, 8, 23, 67, 200) for count, size in parts)
 
 
 def test_other_places_compile_nothing(places):
