@@ -334,16 +334,14 @@ class RayTracer:
 
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
-    """Receivers of each call, and to how many it is filled up: a batch, a third of one, a ninth ..."""
-    size, rest = math.ceil(batch / 3), receivers % batch
-    parts = [(batch, batch)] * (receivers // batch)
-    if rest > 2 * size:
-        return [*parts, (rest, batch)]
-    if rest > size:
-        return [*parts, (size, size), (rest - size, size)]
-    while size > 1 and math.ceil(size / 3) >= rest:
+    """Receivers of each call, and to how many it is filled up: a batch, a third of one; of few a ninth ..."""
+    size, whole = math.ceil(batch / 3), receivers // batch if receivers > batch else 0
+    while size > 1 and math.ceil(size / 3) >= receivers:
         size = math.ceil(size / 3)
-    return [*parts, (rest, size)] if rest else parts
+    rest = receivers - whole * batch
+    if whole and rest > 2 * size:
+        return [*[(batch, batch)] * whole, (rest, batch)]
+    return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
 
 
 class _CountingGenerator:

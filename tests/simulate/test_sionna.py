@@ -82,7 +82,7 @@ def test_our_channels_are_the_solvers_own(room, places):
         diffuse_reflection=False, seed=QUICK.seed,
     )  # fmt: skip
     real, imaginary = found.cfr(frequencies=mi.Float(tones - tones.mean()), normalize_delays=False)
-    theirs = (real.numpy() + 1j * imaginary.numpy()).reshape(6, -1)
+    theirs = (real.numpy() + 1j * imaginary.numpy()).reshape(-1, len(tones))[:6]  # the call was filled up
     # float32 phases of the solver
     np.testing.assert_allclose(ours, theirs, atol=2e-2 * np.abs(theirs).max())
 
@@ -128,7 +128,8 @@ def test_chains_do_not_cost_each_other_their_place(places):
 
 def test_calls_have_one_of_few_sizes():
     assert raytracer.calls(464, 200) == [(200, 200), (200, 200), (64, 67)]
-    assert raytracer.calls(128, 200) == [(67, 67), (61, 67)] and raytracer.calls(150, 200) == [(150, 200)]
+    assert raytracer.calls(200, 200) == [(67, 67), (67, 67), (66, 67)] and len(raytracer.calls(150, 200)) == 3
+    assert raytracer.calls(208, 200) == [(200, 200), (8, 67)] and raytracer.calls(350, 200)[1] == (150, 200)
     assert raytracer.calls(1, 200) == [(1, 1)] and raytracer.calls(5, 200) == [(5, 8)]
     for receivers in range(1, 402):
         parts = raytracer.calls(receivers, 200)
