@@ -26,6 +26,7 @@ from gsparc.simulate.survey import Survey
 
 log = logging.getLogger(__name__)
 
+NONE = np.zeros(0, dtype=np.int64)
 OWN = ("name", "num_receivers", "test_share", "seed")  # of a scene's settings: not of what is decided
 
 
@@ -77,14 +78,19 @@ class Decision:
 class Traced:
     """Rows traced with everything, each once, and what they cost.
 
+    Args:
+        survey, effects: what is traced.
+        ahead: rows in the order in which they may be asked for.
+        size: rows of a call, which is filled up with those.
+
     Attributes:
         cold: CPU seconds of the first group, which compiles; None before.
         warm: of a row afterwards; None where there was one group only.
         compiling: of compiling, by the difference; None likewise.
     """
 
-    def __init__(self, survey: Survey, effects: Effects) -> None:
-        self.survey, self.effects = survey, effects
+    def __init__(self, survey: Survey, effects: Effects, ahead: np.ndarray = NONE, size: int = 1) -> None:
+        self.survey, self.effects, self._ahead, self._size = survey, effects, ahead, size
         self.rows = np.zeros(0, dtype=np.int64)
         self._parts: list[Paths] = []
         self.cold: float | None = None
@@ -95,6 +101,8 @@ class Traced:
         """Paths of rows (n,); those not traced before are."""
         missing = np.setdiff1d(rows, self.rows)
         if len(missing):
+            waiting = self._ahead[~np.isin(self._ahead, np.concatenate([self.rows, missing]))]
+            missing = np.concatenate([missing, waiting[: -len(missing) % self._size]])
             begin = busy_s()
             self._parts.append(self.survey.trace(missing, self.effects))
             self.rows, cost = np.concatenate([self.rows, missing]), busy_s() - begin
@@ -146,8 +154,9 @@ def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decisi
         log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
         choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
         return Decision(choice, _simulated(choice, full, len(survey)))
-    traced = Traced(survey, full)
     probes, held = _groups(survey, settings, campaign.scene.seed)
+    size = campaign.sampling.part if survey.engine.random else 1
+    traced = Traced(survey, full, np.concatenate([probes, held]), size)
     choice, changed = _look(campaign, settings, survey, traced, probes), None
     if choice.effects == full:
         log.info("auto: everything is needed")

@@ -57,6 +57,11 @@ class Sampling:
     batch: int = 200
     seed: int = 1
 
+    @property
+    def part(self) -> int:
+        """Receivers of a call of fewer than a batch."""
+        return math.ceil(self.batch / 3)
+
 
 class RayTracer:
     """One scene with one transmitter, ready to trace.
@@ -335,7 +340,7 @@ class RayTracer:
 
 def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     """Receivers of each call, and to how many it is filled up: a batch, a third of one; of few a ninth ..."""
-    size, whole = math.ceil(batch / 3), receivers // batch if receivers > batch else 0
+    size, whole = Sampling(batch=batch).part, receivers // batch if receivers > batch else 0
     while size > 1 and math.ceil(size / 3) >= receivers:
         size = math.ceil(size / 3)
     rest = receivers - whole * batch

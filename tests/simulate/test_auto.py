@@ -6,10 +6,11 @@ import pytest
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.deciding import pays
+from gsparc.simulate.deciding import Traced, pays
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings
+from gsparc.simulate.survey import Survey
 
 FULL = Effects(depth=2, polarisation=False)
 
@@ -201,3 +202,12 @@ def test_nothing_is_saved_where_everything_is_needed():
     assert choice.saved == pytest.approx(0.5)
     needed = tuple(dataclasses.replace(row, kept=True) for row in choice.table)
     assert dataclasses.replace(choice, table=needed).saved is None
+
+
+def test_calls_are_filled_up_with_rows_that_come_next():
+    """A call of 50 probes was filled up with places to throw away: a third of a small run's tracing."""
+    survey = Survey([Invented(RECORD)], np.zeros((40, 3)))
+    traced = Traced(survey, FULL, np.arange(30), 8)
+    assert len(traced.paths(np.arange(5))) == 5 and traced.rows.tolist() == list(range(8))
+    assert len(traced.paths(np.arange(10))) == 10 and sorted(traced.rows) == list(range(16))
+    assert len(traced.paths(np.arange(30))) == 30 and sorted(traced.rows) == list(range(30))
