@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ class Blockers:
     log_scales: Tensor
     turns: Tensor
     log_strengths: Tensor
-    most: float = math.inf
+    most: float = field(default=math.inf, kw_only=True)
 
     @classmethod
     def none(cls) -> Blockers:

@@ -144,7 +144,7 @@ class PowerField(ConditionalField):
     @property
     def blockers(self) -> Blockers:
         """The Gaussians as they are, with their gradients."""
-        return Blockers(self.means, self.log_scales, self.turns, self.log_strengths, self.most)
+        return Blockers(self.means, self.log_scales, self.turns, self.log_strengths, most=self.most)
 
     def objects(self) -> SiteObjects:
         """The Gaussians with the losses that rows say."""
