@@ -269,7 +269,7 @@ class PowerField(ConditionalField):
             **self.trend.state(),
             "still": [] if self.still is None else [*self.still],
             "seed": self.seed,
-            "most": self.most,
+            **({} if math.isinf(self.most) else {"most": self.most}),  # a checkpoint has finite numbers
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
