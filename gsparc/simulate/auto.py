@@ -16,13 +16,14 @@ from gsparc.simulate.effects import Effects
 
 log = logging.getLogger(__name__)
 
-# Share of a trace's processor time that goes with an effect, in the conference room and the street canyon
-# (docs/simulate.md). It ranks sets of effects; what a choice saves is measured on the rows of the file.
+# Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
+# street canyon and in the conference room (docs/simulate.md). It ranks sets of effects; what a choice
+# saves is measured on the rows of the file.
 PRICE = {
-    "line_of_sight": 0.0, "specular": 0.1, "refraction": 0.0, "diffraction": 0.25, "edge_diffraction": 0.08,
-    "diffuse": 0.05, "polarisation": 0.01,
+    "line_of_sight": 0.0, "specular": 0.25, "refraction": 0.0, "diffraction": 0.22, "edge_diffraction": 0.1,
+    "diffuse": 0.1, "polarisation": 0.02,
 }  # fmt: skip
-BOUNCES = 0.75  # and with the bounces, to equal parts
+BOUNCES = 0.8  # and with the bounces, to equal parts
 SIMILAR = 0.1  # of prices, within which the set of fewer effects is taken
 FIRST_LOOK = 0.5  # share of the probes
 SPENT = 1 / 3  # of the permitted probability of error, at the first look
@@ -120,6 +121,7 @@ class Choice:
         seconds: that deciding took, tracing the probes included, which are rows of the file [s].
         row_all, row_chosen: CPU seconds of a row with everything and with the choice, compiling excluded;
             None where none was traced so.
+        compiling: CPU seconds of compiling the solver for a set of effects; None where not measured.
         verdict: filled by `verify`.
         reused: whether it was taken over from an earlier run.
     """
@@ -131,13 +133,19 @@ class Choice:
     seconds: float = 0.0
     row_all: float | None = None
     row_chosen: float | None = None
+    compiling: float | None = None
     verdict: Verification | None = None
     reused: bool = False
 
     @property
     def saved(self) -> float | None:
-        """Share of the tracing time that the choice saves against everything; None where not measured."""
-        return None if not (self.row_all and self.row_chosen) else 1 - self.row_chosen / self.row_all
+        """Share of the tracing time that the choice saves against everything; None where not measured.
+
+        None as well where everything is needed: two timings of the same differ by what else the machine does.
+        """
+        if not (self.row_all and self.row_chosen) or all(row.kept for row in self.table):
+            return None
+        return 1 - self.row_chosen / self.row_all
 
     @staticmethod
     def from_dict(stored: Mapping[str, Any]) -> Choice:

@@ -151,9 +151,9 @@ def _trace_all(campaign: Campaign, survey: Survey, effects: Effects, shards: Sha
         return shards.path(number).exists() or shards.finished
 
     def work(number: int) -> None:
-        rows, start, busy = missing[number], time.perf_counter(), time.process_time()
+        rows, start, busy = missing[number], time.perf_counter(), deciding.busy_s()
         paths = survey.trace(rows, effects)
-        spent.append((time.process_time() - busy, len(rows)))
+        spent.append((deciding.busy_s() - busy, len(rows)))
         made = shard_arrays(paths, campaign, survey.engine.wavelength)
         shards.put(number, {**made, ROWS: rows, SECONDS: np.array(time.perf_counter() - start)})
         todo = sum(len(rows) for n, rows in missing.items() if not shards.path(n).exists())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
@@ -25,6 +26,7 @@ from gsparc.simulate.survey import Survey
 
 log = logging.getLogger(__name__)
 
+NONE = np.zeros(0, dtype=np.int64)
 OWN = ("name", "num_receivers", "test_share", "seed")  # of a scene's settings: not of what is decided
 
 
@@ -76,13 +78,19 @@ class Decision:
 class Traced:
     """Rows traced with everything, each once, and what they cost.
 
+    Args:
+        survey, effects: what is traced.
+        ahead: rows in the order in which they may be asked for.
+        size: rows of a call, which is filled up with those.
+
     Attributes:
         cold: CPU seconds of the first group, which compiles; None before.
         warm: of a row afterwards; None where there was one group only.
+        compiling: of compiling, by the difference; None likewise.
     """
 
-    def __init__(self, survey: Survey, effects: Effects) -> None:
-        self.survey, self.effects = survey, effects
+    def __init__(self, survey: Survey, effects: Effects, ahead: np.ndarray = NONE, size: int = 1) -> None:
+        self.survey, self.effects, self._ahead, self._size = survey, effects, ahead, size
         self.rows = np.zeros(0, dtype=np.int64)
         self._parts: list[Paths] = []
         self.cold: float | None = None
@@ -93,9 +101,11 @@ class Traced:
         """Paths of rows (n,); those not traced before are."""
         missing = np.setdiff1d(rows, self.rows)
         if len(missing):
-            begin = time.process_time()
+            waiting = self._ahead[~np.isin(self._ahead, np.concatenate([self.rows, missing]))]
+            missing = np.concatenate([missing, waiting[: -len(missing) % self._size]])
+            begin = busy_s()
             self._parts.append(self.survey.trace(missing, self.effects))
-            self.rows, cost = np.concatenate([self.rows, missing]), time.process_time() - begin
+            self.rows, cost = np.concatenate([self.rows, missing]), busy_s() - begin
             if self.cold is None:
                 self.cold, self._first = cost, len(missing)
             else:
@@ -108,41 +118,65 @@ class Traced:
         """CPU seconds of a row once compiled."""
         return self._spent / self._later if self._later else None
 
-    def pays(self, left: int, saved: float) -> bool:
-        """Whether saving a share of the time of the rows that are left pays for compiling anew [s]."""
+    @property
+    def compiling(self) -> float | None:
+        """CPU seconds of the first group beyond those of its rows; 0 of an engine that compiles nothing."""
         if self.warm is None or self.cold is None:
-            return left > 0
-        compiling = max(self.cold - self._first * self.warm, 0.0) if self.survey.engine.random else 0.0
-        return left * self.warm * saved > compiling
+            return None
+        return max(self.cold - self._first * self.warm, 0.0) if self.survey.engine.random else 0.0
+
+
+def busy_s() -> float:
+    """CPU seconds of this process, without the system's.
+
+    These are mostly of the first use of the solver's memory, which would pass for compiling.
+    """
+    return time.process_time() - os.times().system
+
+
+def pays(choice: Choice, rows: int, saved: float) -> bool:
+    """Whether a share of the time of so many rows, saved, pays for compiling the solver for other effects.
+
+    Where rows were traced with the choice before, its kernels are in Dr.Jit's cache.
+    """
+    if choice.row_chosen is not None or choice.row_all is None or choice.compiling is None:
+        return rows > 0
+    return rows * choice.row_all * saved > choice.compiling
 
 
 def decide(campaign: Campaign, settings: AutoSettings, survey: Survey) -> Decision:
     """Look the decision up, or take it and store it."""
     begin = time.perf_counter()
     stored = platform_cache() / "scenes" / f"{_key(campaign, settings, survey)}.json"
+    full = survey.engine.supported(settings.full)
     if settings.reuse and stored.exists():
         choice = Choice.from_dict(json.loads(stored.read_text(encoding="utf-8")))
         log.info("auto: as decided before for this scene and requirement: %s", choice.effects)
         choice = replace(choice, reused=True, seconds=time.perf_counter() - begin)
-        return Decision(choice, survey.engine.supported(choice.effects))
-    full = survey.engine.supported(settings.full)
-    traced = Traced(survey, full)
+        return Decision(choice, _simulated(choice, full, len(survey)))
     probes, held = _groups(survey, settings, campaign.scene.seed)
-    choice = _look(campaign, settings, survey, traced, probes)
-    changed, saved = None, 1 - auto.price(choice.effects, full)
+    size = campaign.sampling.part if survey.engine.random else 1
+    traced = Traced(survey, full, np.concatenate([probes, held]), size)
+    choice, changed = _look(campaign, settings, survey, traced, probes), None
     if choice.effects == full:
         log.info("auto: everything is needed")
     else:
         log.info("auto: %s; verifying on held-back receivers", choice.effects)
         choice, changed = _verify(campaign, settings, traced, choice, held)
-    effects = choice.effects
-    if effects != full and not traced.pays(len(survey) - len(traced.rows), saved):
-        log.info("auto: everything is simulated: for the receivers that are left, compiling anew costs more")
-        effects = full
-    choice = replace(choice, seconds=time.perf_counter() - begin, row_all=traced.warm)
+    choice = replace(choice, row_all=traced.warm, compiling=traced.compiling)
+    effects = _simulated(choice, full, len(survey) - len(traced.rows))
+    choice = replace(choice, seconds=time.perf_counter() - begin)
     _remember(stored, choice)
     rows = np.sort(traced.rows)
     return Decision(choice, effects, changed, rows, traced.paths(rows).under(effects))
+
+
+def _simulated(choice: Choice, full: Effects, rows: int) -> Effects:
+    """The choice, or everything where that is cheaper for so many rows."""
+    if choice.effects == full or pays(choice, rows, 1 - auto.price(choice.effects, full)):
+        return choice.effects
+    log.info("auto: everything is simulated: for %d receivers, compiling anew costs more", rows)
+    return full
 
 
 def remember(campaign: Campaign, settings: AutoSettings, survey: Survey, choice: Choice) -> None:

@@ -41,7 +41,7 @@ def floor_plan(outcome: Outcome, path: Path) -> None:
     if changed is not None:
         known = outcome.made.power[changed.rows] > 0
         errors, rows = changed.errors[known], changed.rows[known] % len(places)
-        label = "error by what was dropped" if np.ptp(errors) > 0 else "nothing dropped, no error"
+        label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
         _map(panels[2], places[rows], errors, f"{label}: held-back receivers", 40.0, clipped=0.0)
     for panel in panels:
         if (~reached).any():
@@ -120,5 +120,5 @@ def effect_shares(choice: Choice, path: Path) -> None:
         axes.set_xlabel(f"{label}: typical (dark), 95 % (light)")
         axes.grid(axis="x", alpha=0.3)
     right.set_xscale("log")
-    figure.suptitle(f"blue: simulated; grey: left out. {choice.deliverable}", fontsize="medium")
+    figure.suptitle(f"blue: needed; grey: not. {choice.deliverable}", fontsize="medium")
     figure.savefig(path, dpi=110)

@@ -8,9 +8,11 @@ specular chains lost to one another (a hash table large enough for a batch), dup
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -54,6 +56,11 @@ class Sampling:
     samples: int = 300_000
     batch: int = 200
     seed: int = 1
+
+    @property
+    def part(self) -> int:
+        """Receivers of a call of fewer than a batch."""
+        return math.ceil(self.batch / 3)
 
 
 class RayTracer:
@@ -151,8 +158,16 @@ class RayTracer:
         Raises:
             RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
         """
-        found = self.solutions(receivers, effects, seed)
-        return join([_collect(solution, count) for solution, count in found])
+        # How many receivers a call has is a constant of its kernels: any other number compiles them anew.
+        beneath = np.append(self.transmitter[:2], self._lowest - 1.0)
+        parts, first = [], 0
+        for count, size in calls(len(receivers), self.sampling.batch):
+            some = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
+            found = self.solutions(some, effects, seed)
+            part = join([_collect(solution, number) for solution, number in found])
+            parts.append(part.take(np.arange(count)))
+            first += count
+        return join(parts)
 
     def solutions(
         self, receivers: np.ndarray, effects: Effects, seed: int | None = None
@@ -218,6 +233,7 @@ class RayTracer:
 
     def _place_ends(self, receivers: np.ndarray, ports: int) -> None:
         """Place transmitter and receivers in the scene."""
+        import drjit as dr
         import mitsuba as mi
         import sionna.rt as rt
 
@@ -234,12 +250,18 @@ class RayTracer:
             scene.remove(name)
         if not scene.transmitters:
             scene.add(rt.Transmitter("tx", position=mi.Point3f(0, 0, 0)))
+
+        def point(coordinates: np.ndarray) -> Any:
+            # Plain numbers are constants of kernels: every other place would compile one anew.
+            made = mi.Point3f(*map(float, coordinates))
+            dr.make_opaque(made)
+            return made
+
         tx = scene.get("tx")
-        tx.position = mi.Point3f(*map(float, self.transmitter))
-        turn = np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0])
-        tx.orientation = mi.Point3f(*map(float, turn))
+        tx.position, ahead = point(self.transmitter), point(np.zeros(3))
+        tx.orientation = point(np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0]))
         for i, place in enumerate(receivers):
-            scene.add(rt.Receiver(f"rx{i}", position=mi.Point3f(*map(float, place))))
+            scene.add(rt.Receiver(f"rx{i}", position=point(place), orientation=ahead))
 
     def under_open_sky(self, points: np.ndarray) -> np.ndarray:
         """Whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""
@@ -258,6 +280,10 @@ class RayTracer:
         """(2, 3) lower and upper corner of everything [m]."""
         corners = self.triangles().reshape(-1, 3)
         return np.stack([corners.min(0), corners.max(0)])
+
+    @cached_property
+    def _lowest(self) -> float:
+        return float(self.box()[0, 2])
 
     def _objects(self) -> dict[str, np.ndarray]:
         """Triangles (n, 3, 3) of each object."""
@@ -310,6 +336,17 @@ class RayTracer:
         )
         ray = mi.Ray3f(origin, mi.Vector3f(*map(float, direction)))
         return self._scene.mi_scene.ray_intersect(ray)
+
+
+def calls(receivers: int, batch: int) -> list[tuple[int, int]]:
+    """Receivers of each call, and to how many it is filled up: a batch, a third of one; of few a ninth ..."""
+    size, whole = Sampling(batch=batch).part, receivers // batch if receivers > batch else 0
+    while size > 1 and math.ceil(size / 3) >= receivers:
+        size = math.ceil(size / 3)
+    rest = receivers - whole * batch
+    if whole and rest > 2 * size:
+        return [*[(batch, batch)] * whole, (rest, batch)]
+    return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
 
 
 class _CountingGenerator:

@@ -6,9 +6,11 @@ import pytest
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, Probe, combinations, removals
 from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.deciding import Traced, pays
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import Paths
 from gsparc.simulate.spectrum import SpectrumSettings
+from gsparc.simulate.survey import Survey
 
 FULL = Effects(depth=2, polarisation=False)
 
@@ -184,3 +186,28 @@ def test_removals_and_combinations_are_complete():
 def test_a_choice_survives_its_file():
     choice = decided("coverage +-1 dB")
     assert Choice.from_dict(dataclasses.asdict(choice)) == choice
+
+
+def test_fewer_effects_are_compiled_for_only_where_that_pays():
+    """A decision taken over compiled the solver anew for rows whose time was less than that of compiling."""
+    unseen = dataclasses.replace(decided("coverage +-1 dB"), row_all=0.02, compiling=2.0)
+    assert not pays(unseen, 200, 0.2) and pays(unseen, 1000, 0.2)
+    assert pays(dataclasses.replace(unseen, row_chosen=0.018), 200, 0.2)  # its kernels are there
+    assert pays(dataclasses.replace(unseen, compiling=None), 200, 0.2)
+
+
+def test_nothing_is_saved_where_everything_is_needed():
+    """Of florence a run said "-15% saved"."""
+    choice = dataclasses.replace(decided("coverage +-1 dB"), row_all=0.02, row_chosen=0.01)
+    assert choice.saved == pytest.approx(0.5)
+    needed = tuple(dataclasses.replace(row, kept=True) for row in choice.table)
+    assert dataclasses.replace(choice, table=needed).saved is None
+
+
+def test_calls_are_filled_up_with_rows_that_come_next():
+    """A call of 50 probes was filled up with places to throw away: a third of a small run's tracing."""
+    survey = Survey([Invented(RECORD)], np.zeros((40, 3)))
+    traced = Traced(survey, FULL, np.arange(30), 8)
+    assert len(traced.paths(np.arange(5))) == 5 and traced.rows.tolist() == list(range(8))
+    assert len(traced.paths(np.arange(10))) == 10 and sorted(traced.rows) == list(range(16))
+    assert len(traced.paths(np.arange(30))) == 30 and sorted(traced.rows) == list(range(30))

@@ -20,6 +20,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
 from gsparc.simulate import campaign as campaigns
+from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, assemble, shard_arrays
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
@@ -294,6 +295,16 @@ def test_where_few_are_left_everything_is_kept(tmp_path):
     asked = AutoSettings(probes=60, held_back=60, full=Effects(depth=4))
     outcome = simulate(plan(effects=asked), tmp_path / "box.h5")
     assert outcome.effects.depth == 4 and outcome.choice.effects.depth < 4
+
+
+def test_a_decision_taken_over_simulates_everything_where_few_rows_are_asked(tmp_path, monkeypatch):
+    asked = AutoSettings(probes=16, held_back=20, full=Effects(depth=4))
+    simulate(plan(effects=asked, shard=60), tmp_path / "first.h5")
+    monkeypatch.setattr(deciding, "pays", lambda choice, rows, saved: rows > 60)
+    few = simulate(plan(effects=asked), tmp_path / "few.h5")
+    assert few.choice.reused and few.effects.depth == 4 and few.choice.effects.depth < 4
+    many = simulate(plan(effects=asked, scene=replace(SCENE, num_receivers=61)), tmp_path / "many.h5")
+    assert many.choice.reused and many.effects == many.choice.effects
 
 
 def test_a_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path, monkeypatch):

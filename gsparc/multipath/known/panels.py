@@ -19,6 +19,9 @@ from gsparc.multipath.powers.blockers import Blockers
 WALL_DB = 8.0  # standard deviation of what a wall takes: COST 231 has 3.4 dB for light, 6.9 dB for heavy ones
 PART_DB = 3.0  # of what its parts take more or less
 THICK_M = 0.1  # [m], standard deviation across a wall
+# Of a path along a wall, which power goes around: as much as at 75 degrees from its normal. Without a bound
+# a place beside a wall of 28 m was 126 dB too dark.
+OBLIQUE = 4.0
 LEVEL, UPRIGHT = 0.995, 0.1  # of the normal's upward part: floors, walls; what leans is left out
 PANELS = (1, 2, 4)  # that a wall is cut into along its length, each more than the ones before
 
@@ -65,5 +68,6 @@ def panels(walls: SceneWalls, origin: np.ndarray) -> tuple[Blockers, int]:
         torch.from_numpy(np.array(scales).reshape(-1, 3)).log(),
         torch.tensor(turns, dtype=torch.float64),
         torch.tensor(levels, dtype=torch.float64).log(),
+        most=OBLIQUE,
     )
     return found, leaning

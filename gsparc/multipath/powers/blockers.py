@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -24,12 +24,14 @@ class Blockers:
         turns: (N,) angles from x to their first axes [rad].
         log_strengths: (N,) of the prior's deviation of what each takes of a path straight through it, of the
             square root of the process's amplitude.
+        most: that one takes of one path, in units of the way straight through it.
     """
 
     means: Tensor
     log_scales: Tensor
     turns: Tensor
     log_strengths: Tensor
+    most: float = field(default=math.inf, kw_only=True)
 
     @classmethod
     def none(cls) -> Blockers:
@@ -42,14 +44,15 @@ class Blockers:
 
     def joined(self, other: Blockers) -> Blockers:
         """These and others."""
-        return Blockers(*(torch.cat(pair) for pair in zip(self.parts(), other.parts(), strict=True)))
+        parts = (torch.cat(pair) for pair in zip(self.parts(), other.parts(), strict=True))
+        return Blockers(*parts, most=min(self.most, other.most))
 
     def relative_to(self, amplitude: float) -> Blockers:
         """The same, when strengths are in decibels, in units of a process's amplitude [dB^2]."""
         return replace(self, log_strengths=self.log_strengths - 0.5 * math.log(amplitude))
 
     def parts(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The attributes."""
+        """What each of them has of its own."""
         return self.means, self.log_scales, self.turns, self.log_strengths
 
     def shadows(self, places: Tensor, still: Place | None) -> Tensor:
@@ -60,7 +63,8 @@ class Blockers:
             still: of the end that stands [m]; None where both move.
         """
         other = places[:, 3:] if still is None else places.new_tensor(still).expand(len(places), 3)
-        return extinctions(places[:, :3], other, self.means, self.log_scales, self.turns)
+        taken = extinctions(places[:, :3], other, self.means, self.log_scales, self.turns)
+        return taken if math.isinf(self.most) else taken.clamp_max(self.most)
 
     def terms(self, places: Tensor, still: Place | None) -> Tensor:
         """The same (n, N) times their strengths: columns of the covariance's low-rank term."""

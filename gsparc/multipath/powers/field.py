@@ -113,6 +113,7 @@ class PowerField(ConditionalField):
         self.means, self.log_scales, self.turns, self.log_strengths = (
             nn.Parameter(part.clone()) for part in blockers.parts()
         )
+        self.most = blockers.most
         covariance = Covariance.of(kernel)
         self.log_lengths, self.share_logit, self.log_noise, self.log_amplitude = (
             nn.Parameter(part) for part in vars(covariance).values()
@@ -143,7 +144,7 @@ class PowerField(ConditionalField):
     @property
     def blockers(self) -> Blockers:
         """The Gaussians as they are, with their gradients."""
-        return Blockers(self.means, self.log_scales, self.turns, self.log_strengths)
+        return Blockers(self.means, self.log_scales, self.turns, self.log_strengths, most=self.most)
 
     def objects(self) -> SiteObjects:
         """The Gaussians with the losses that rows say."""
@@ -160,7 +161,7 @@ class PowerField(ConditionalField):
         kernel = kernel_of(settings, math.exp(self.log_amplitude.item()))
         if not len(self.means):
             return self.trend, kernel
-        still = Blockers(*(part.detach().clone() for part in self.blockers.parts()))
+        still = Blockers(*(part.detach().clone() for part in self.blockers.parts()), most=self.most)
         return ShadowedTrend.over(self.trend, still, self.still), kernel
 
     def loss(self, batch: Batch) -> Tensor:
@@ -268,6 +269,7 @@ class PowerField(ConditionalField):
             **self.trend.state(),
             "still": [] if self.still is None else [*self.still],
             "seed": self.seed,
+            **({} if math.isinf(self.most) else {"most": self.most}),  # a checkpoint has finite numbers
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
@@ -475,7 +477,8 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     two = len(state["log_lengths"]) == 2
     kernel = PowerKernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
     field = PowerField(
-        site, trend_of(state), kernel, Blockers(*(state[name] for name in names)),
+        site, trend_of(state), kernel,
+        Blockers(*(state[name] for name in names), most=float(state.get("most", math.inf))),
         _place(still), int(state["seed"]), fringes_of(state["fringes"]) if "fringes" in state else None,
     )  # fmt: skip
     with torch.no_grad():

@@ -201,6 +201,13 @@ def test_state_makes_it_again(blocked, tmp_path):
     assert torch.equal(field.mean_at(batch.tx, batch.rx), again.mean_at(batch.tx, batch.rx))
 
 
+def test_a_bound_on_what_walls_take_is_stored_and_no_bound_is_not(blocked):
+    """An infinite number made every checkpoint of a field without known walls unreadable."""
+    data, field, _ = blocked
+    assert "most" not in field.state()
+    assert restored(data.site, {**field.state(), "most": 4.0}).blockers.most == 4.0
+
+
 def test_both_ends_may_move():
     data = town(60)
     rng = np.random.default_rng(0)

@@ -126,7 +126,9 @@ class Prior:
     def state(self) -> dict[str, Any]:
         """Tensors and numbers that `restored_prior` needs."""
         law = [*vars(self.law).values()]
-        blockers = {name: part for name, part in vars(self.blockers).items()}
+        blockers = dict(
+            zip(("means", "log_scales", "turns", "log_strengths"), self.blockers.parts(), strict=True)
+        )
         return {
             **self.settings(),
             "inducing": self.inducing,
