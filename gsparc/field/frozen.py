@@ -148,9 +148,9 @@ def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
         field = torch.zeros(1, 2, model.site.grid.height, model.site.grid.width, requires_grad=True)
         parts = torch.view_as_real(response.measured(field)).flatten()
         by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
-        geometry = [part.detach() for part in model.gaussians.geometry()]
+        means, quats, scales, opacities = (part.detach() for part in model.gaussians.geometry())
         emitted = torch.zeros(count, len(parts), requires_grad=True)
         plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # may be made in inference mode
-        image = ops.composite(plan, *geometry, emitted).image
+        image = ops.composite(plan, means, quats, scales, opacities, emitted).image
         (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))
     return torch.view_as_complex(seen.view(count, -1, 2))
