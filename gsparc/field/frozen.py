@@ -153,4 +153,4 @@ def seen_by_array(model: GaussianModel, rx: Pose) -> Tensor:
         plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # may be made in inference mode
         image = ops.composite(plan, means, quats, scales, opacities, emitted).image
         (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))
-    return torch.view_as_complex(seen.view(count, -1, 2))
+    return torch.view_as_complex(seen.view(count, len(parts) // 2, 2))

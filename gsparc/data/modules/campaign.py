@@ -58,10 +58,8 @@ class Campaign(DataModule):
         selected = select(split_stations(raw, self.level_steps, self.file), self.selection, self.file)
         reading = interpret(selected.raw, self.file)
         said = [str(raw.attributes["left_out"])] if "left_out" in raw.attributes else []
-        for note in (*said, *selected.notes):
+        for note in (*said, *selected.notes, *reading.notes):
             log.warning("%s: %s", self.file, note)
-        for note in reading.notes:
-            log.info("%s: %s", self.file, note)
         for hint in suspicious_values(reading.data):
             log.warning("%s: units? %s", self.file, hint)
         return reading.data
