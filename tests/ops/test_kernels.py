@@ -2,6 +2,8 @@
 
 import math
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -122,7 +124,13 @@ def test_kernels_of_another_compiler_were_the_slowest_ones():
     has = set(flags[1].split())
     wide = {"avx512f", "avx512dq", "avx512vl", "avx512bw", "bmi2", "avx2", "fma"}
     best = "avx512" if wide <= has else "avx2" if {"avx2", "fma"} <= has else "baseline"
-    assert _native.instruction_set() == best
+    asks = (
+        "import sys, importlib.util as u; s = u.spec_from_file_location('_native', sys.argv[1]);"
+        "m = u.module_from_spec(s); s.loader.exec_module(m); print(m.instruction_set())"
+    )
+    # A process of its own, because another test may have chosen one here.
+    command = [sys.executable, "-c", asks, _native.__file__]
+    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == best
 
 
 @pytest.mark.parametrize("name", ["baseline", "avx2", "avx512"])
