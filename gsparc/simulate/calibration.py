@@ -8,6 +8,7 @@ is a replay of the stored paths under other materials and not a trace.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from scipy.optimize import minimize
 
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer
+
+log = logging.getLogger(__name__)
 
 TAILS = 4.0  # degrees of freedom of Student's t, the density of residuals: shadows are missed by tens of dB
 TINY_W = 1e-30  # power that has a logarithm, far below any path's
@@ -147,7 +150,11 @@ class Replay:
         apply(
             self._tracer, {name: Material.of(pair) for name, pair in materials.items()}
         )  # without gradients
-        return value, np.nan_to_num(gradient, nan=0.0, posinf=0.0, neginf=0.0)
+        lost = ~np.isfinite(gradient)
+        if lost.any():
+            said = "%d of %d slopes by materials are not finite: these do not move in this step"
+            log.warning(said, int(lost.sum()), len(gradient))
+        return value, np.where(lost, 0.0, gradient)
 
     def _powers(self) -> Any:
         """(R,) as the solver's array, with gradients: evaluated loops have them, and cost the same here."""

@@ -183,7 +183,8 @@ def fill_all(
             kept = "interrupted; finished cells are kept: the same command goes on with the others"
             raise KeyboardInterrupt(kept) from None
         except Exception as error:  # any error of a plugin: the other methods' table comes nevertheless
-            log.warning("%s cannot be filled: %s", one.cell, one_line(error))
+            unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
+            log.warning("%s cannot be filled: %s", one.cell, one_line(error), exc_info=unforeseen)
             broken.add(str(one.cell))
             if failed is not None:
                 failed.add(one.folder.name, one_line(error))

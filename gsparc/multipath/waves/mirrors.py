@@ -22,10 +22,8 @@ from gsparc.multipath.waves.probe import Probe
 from gsparc.physics.mirror_planes import Word, images
 
 LEVELS = (0.03, 0.1, 0.3)  # powers of an image that are tried, of the signal's
-MARGIN, LEAST_MARGIN_M = (
-    0.3,
-    2.0,
-)  # how far beyond places and ends planes may be, of their extent and at least
+MARGIN = 0.3  # how far beyond places and ends planes may be, of their extent
+LEAST_MARGIN_M = 2.0  # and at least
 TURN_RAD = 1.5  # phase across the places that a plane's azimuth may be off by
 STEP = 0.25  # wavelengths between offsets
 MOST_TURNS, MOST_OFFSETS = 96, 400  # of the grid
