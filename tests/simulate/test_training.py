@@ -69,6 +69,18 @@ def test_a_simulation_with_fewer_effects_is_tested_on_the_full_one(kind, box, tm
         with_true_targets(alone, dataclasses.replace(whole, release_split=None), "dataset.truth=x")
 
 
+def test_what_the_truth_hears_is_tested_though_the_training_file_heard_nothing(box):
+    whole = load({"name": "sionna", "file": str(box), "target": "rssi"})
+    test = whole.release_split[1]
+    deaf = np.zeros(len(whole), bool)
+    deaf[[test[0], whole.release_split[0][0]]] = True
+    fewer = dataclasses.replace(whole, censored=deaf, mask=~deaf[:, None])
+    mixed = with_true_targets(fewer, whole, "dataset.truth=x")
+    assert not mixed.censored[test].any() and mixed.mask[test].all() and mixed.censored.sum() == 1
+    back = with_true_targets(whole, fewer, "dataset.truth=x")
+    assert back.censored.sum() == 1 and back.censored[test[0]] and not back.mask[test[0]].any()
+
+
 @pytest.mark.parametrize("kind", ROAD)
 def test_a_simulated_dataset_is_trained_and_compared_like_any_other(kind, box, tmp_path):
     settings = [*ROAD[kind], f"dataset.file={box}", f"dataset.target={kind}", "threads=1", "logger=none"]

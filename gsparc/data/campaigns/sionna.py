@@ -6,6 +6,7 @@ import logging
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -53,8 +54,21 @@ def with_true_targets(data: Measurements, truth: Measurements, named: str) -> Me
     test, target = splits[0][1], data.target.copy()
     ratio = truth.site.target_scale / data.site.target_scale
     target[test] = truth.target[test] if ratio == 1 else truth.target[test] * target.dtype.type(ratio)
+    mask = _tested(data.mask, truth.mask, test, True)
+    censored = _tested(data.censored, truth.censored, test, False)
     mixed = sha256(f"{data.site.sha256} {truth.site.sha256}".encode()).hexdigest()
-    return replace(data, target=target, site=replace(data.site, sha256=mixed))
+    site = replace(data.site, sha256=mixed)
+    return replace(data, site=site, target=target, mask=mask, censored=censored)
+
+
+def _tested(train: np.ndarray | None, truth: np.ndarray | None, test: np.ndarray, plain: bool) -> Any:
+    """Flags (S, ...) of `train` with those of `truth` in test rows; None is `plain` everywhere."""
+    known = truth if train is None else train
+    if known is None:
+        return None
+    found = np.full(known.shape, plain) if train is None else train.copy()
+    found[test] = plain if truth is None else truth[test]
+    return found
 
 
 def _load(path: str | Path, target: str | None) -> Measurements:
@@ -89,11 +103,18 @@ def read_as(raw: Raw, target: str) -> Raw:
 
 
 def _heard(power: np.ndarray) -> dict[str, np.ndarray]:
-    """Powers (S,) in decibels; where no path arrives, they lie below the weakest that one brings."""
+    """Powers (S,) in decibels; where no path arrives, they lie below the weakest that is no outlier.
+
+    One path through five walls may be 70 dB below the next power: no receiver hears it, and a place without
+    any path is not weaker for it. Outliers are those of J. W. Tukey, "Exploratory Data Analysis" (1977).
+    """
     with np.errstate(divide="ignore"):
         decibels = 10 * np.log10(power)
-    silent = ~np.isfinite(decibels)
-    if not silent.any():
+    arrived = decibels[np.isfinite(decibels)]
+    if len(arrived) == len(decibels):
         return {"rssi_db": decibels}
-    level = decibels[~silent].min(initial=np.inf)
-    return {"rssi_db": np.where(silent, np.nan, decibels), "sensitivity_db": np.array(level)}
+    level = np.inf
+    if len(arrived):
+        lower, upper = np.quantile(arrived, (0.25, 0.75))
+        level = arrived[arrived >= lower - 1.5 * (upper - lower)].min()
+    return {"rssi_db": np.where(decibels < level, np.nan, decibels), "sensitivity_db": np.array(level)}
