@@ -41,6 +41,7 @@ class Row:
         behind_db: how much the problem's best has more, mean of the same draws [dB]; None unless drawn.
         behind_error_db: standard error of that [dB].
         coverage: share of measured powers within the predicted 90 % interval; None without variances.
+        outage: Brier score of predicted outages, 0 when perfect; None where every place heard something.
         after_constant: RMSE of powers after a constant of each station [dB]; where stations are held out.
         second, second_value: another figure for the reader.
         train_s, train_cpu_s: seconds of training per model, on the clock and of processor [s].
@@ -66,6 +67,7 @@ class Row:
     behind_db: float | None
     behind_error_db: float | None
     coverage: float | None
+    outage: float | None
     after_constant: float | None
     second: str
     second_value: float | None
@@ -149,7 +151,8 @@ def _row(same: list[Filled], latency: Latency | None, best: Mapping[int | None, 
         seeds=len(same), draws=drawn,
         figure=DECIDING[kind], value=value, value_error=value_error if drawn else None,
         behind_db=behind, behind_error_db=behind_error,
-        coverage=mean("test/interval/coverage_90"), after_constant=mean("test/rmse_db_after_constant"),
+        coverage=mean("test/interval/coverage_90"), outage=mean("test/outage/brier"),
+        after_constant=mean("test/rmse_db_after_constant"),
         second=SECOND[kind], second_value=mean(f"test/{SECOND[kind]}"),
         train_s=mean("time/train_s") or 0.0, train_cpu_s=mean("time/train_cpu_s") or 0.0,
         query_ms=latency.p50_ms if latency else None, query_p95_ms=latency.p95_ms if latency else None,
@@ -309,6 +312,8 @@ def _columns(block: Block) -> dict[str, Callable[[Row], str]]:
         found["after a constant, dB"] = lambda r: shown(r.after_constant, ".2f")
     if any(row.coverage is not None for row in block.rows):
         found["in 90 % interval"] = lambda r: shown(r.coverage, ".2f")
+    if any(row.outage is not None for row in block.rows):
+        found["outage, Brier score"] = lambda r: shown(r.outage, ".4f")
     if not drawn:
         found["seeds"] = lambda r: str(r.seeds)
     return found | {

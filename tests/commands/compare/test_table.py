@@ -48,7 +48,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     """The spread over draws is of the rows: what two methods differ by on the same rows is known better."""
     facts = {
         "dataset/kind": "rssi", "test/mae_db": 1.0, "problem/drawn": True, "time/train_s": 1.0,
-        "time/train_cpu_s": 1.0, "test/interval/coverage_90": 0.8,
+        "time/train_cpu_s": 1.0, "test/interval/coverage_90": 0.8, "test/outage/brier": 0.0125,
     }  # fmt: skip
     found = [
         Filled(Cell("city", "drawn", method, None, seed), None, {**facts, "test/rmse_db": error})
@@ -63,6 +63,7 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert (
         "3 draws (± standard error of the mean)" in page and "| 1.10 ± 0.06 |" in page and "| 0.80 |" in page
     )
+    assert "| outage, Brier score |" in page and "| 0.0125 |" in page
     assert "simple baseline wins" not in page, "there are no others"
     lines = overview([gp, idw]).splitlines()
     assert lines[0] == "### city: RMSE, dB, 3 draws of each split"
