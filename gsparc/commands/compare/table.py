@@ -246,6 +246,9 @@ def remarks(block: Block, ours: str) -> list[str]:
         spread = float(np.hypot(own.spread_db or 0.0, first.spread_db or 0.0))  # of both over seeds
         level = own.score_db >= first.score_db - spread
         found.append(gap + (", within the seeds' spread" if level else ""))
+    if own is not None and own.outage is not None and (first.outage or 0.0) > own.outage:
+        both = f"Brier score {first.outage:.4f}, of {ours} {own.outage:.4f}"
+        found.append(f"errors are of places that were heard; {first.method} predicts outages worse: {both}")
     for row in block.rows:
         if own is not None and row.method in SIMPLE and row.score_db > own.score_db and row is not first:
             found.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")

@@ -107,6 +107,19 @@ def test_losers_are_not_hidden():
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
 
 
+def test_the_smaller_error_may_have_the_worse_outages():
+    """Who leaves silent rows out is nearer at places that were heard, and calls a courtyard covered."""
+    facts = {"dataset/kind": "rssi", "test/mae_db": 1.0, "time/train_s": 1.0, "time/train_cpu_s": 1.0}
+    found = [
+        Filled(
+            Cell("town", "random", name, None, 0), None, {**facts, "test/rmse_db": e, "test/outage/brier": o}
+        )
+        for name, e, o in (("kriging", 7.0, 0.028), ("gsparc", 7.3, 0.015))
+    ]
+    said = " | ".join(remarks(blocks(rows(found, {}))[0], "gsparc"))
+    assert "kriging predicts outages worse: Brier score 0.0280, of gsparc 0.0150" in said
+
+
 def test_what_an_earlier_program_measured_is_said():
     old = filled("gsrf", 29.0, 0, 60.0)
     old = Filled(old.cell, None, {**old.facts, EARLIER: "0123abcd"})
