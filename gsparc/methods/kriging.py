@@ -69,7 +69,8 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     half = pdist(values[chosen][:, columns].astype(np.float64), "sqeuclidean") / (2 * len(columns))
     spread = float(half.mean()) if len(half) else 1.0
     limit = apart.max() / 2 if len(apart) else 1.0
-    edges = np.unique(np.quantile(apart[apart <= limit], np.linspace(0, 1, BINS + 1))) if len(apart) else []  # type: ignore[var-annotated]
+    inside = apart[apart <= limit]
+    edges = np.unique(np.quantile(inside, np.linspace(0, 1, BINS + 1))) if len(inside) else inside
     if len(edges) < 5 or spread <= 0:  # too few distances to see a law
         return Variogram(0.0, max(spread, 1e-9), max(limit, 1e-3))
     which = np.clip(np.digitize(apart, edges) - 1, 0, len(edges) - 2)

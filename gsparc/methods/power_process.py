@@ -39,7 +39,7 @@ TWO_LENGTHS_NEED = 100
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 EVIDENCE_LOOKS = 30
-AMPLITUDES_DB2 = (1e-4, 1e5)
+AMPLITUDES_DB2 = (1e-4, 1e3)  # as wide as powers of one station spread; more only where they were heard to
 
 
 @dataclass(frozen=True)
@@ -257,7 +257,8 @@ def _two_lengths(rows: Rows, one: _Candidate) -> _Candidate:
 def _weighed(rows: Rows, one: _Candidate) -> _Candidate:
     """The same with settings of largest evidence, silent rows among the rest."""
     distance, terms, values = _views(rows, one.trend)
-    low, high = np.array([*bounds_of(len(one.kernel.lengths), distance), tuple(np.log(AMPLITUDES_DB2))]).T
+    amplitudes = AMPLITUDES_DB2[0], max(AMPLITUDES_DB2[1], 4 * float((values[~rows.silent] ** 2).mean()))
+    low, high = np.array([*bounds_of(len(one.kernel.lengths), distance), tuple(np.log(amplitudes))]).T
 
     def objective(parameters: np.ndarray) -> tuple[float, np.ndarray]:
         kernel, amplitude = kernel_of(parameters[:-1]), math.exp(parameters[-1])

@@ -32,3 +32,9 @@ def test_nearest_places_screen_the_others(monkeypatch):
     near, wider = krige(places, decibels, queries)
     assert np.abs(near - whole).max() < 0.15 and np.sqrt(np.mean((near - whole) ** 2)) < 0.05
     assert (wider >= spread - 1e-9).all() and np.abs(wider / spread - 1).max() < 0.05
+
+
+def test_two_places_have_no_variogram():
+    """Their one distance is more than half the extent: no quantile of nothing could be taken."""
+    found = kriging.fit_variogram(np.array([[0.0, 0, 0], [3.0, 4, 0]]), np.array([[-60.0], [-70.0]]))
+    assert (found.nugget, found.range) == (0.0, 2.5) and found.sill > 0

@@ -18,6 +18,7 @@ from gsparc.data.schema import End, Links
 
 POWERS = ("rssi", "rssi_db")
 PER_ROW = ("noise_variance", "rx_orientation", "rx_rotation", "run", "row_name", "received_power")
+FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 STATION_FIELDS = ("station", "station_position", "station_name", "station_orientation", "sensitivity_db")
 
 
@@ -160,6 +161,12 @@ def _heard(check: Checker, measured: str, links: Links, of_level: np.ndarray, co
             named = links.named([str(name) for name in arrays["row_name"]])[row]
             wrong = f"{named}: {measured} is {values[row]:.4g}, below {floor[row]:.4g}"
             return check.refuse("sensitivity_db", f"{wrong}, under which nothing is heard")
+        highest, weakest = floor[censored].max(initial=-np.inf), values[~unknown & told].min(initial=np.inf)
+        if FAR_BELOW_DB < weakest - highest < np.inf:
+            check.notes.append(
+                f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
+                "is it the receiver's? places where nothing was heard count as weaker still"
+            )
         arrays[measured] = np.where(censored, floor, values)
     lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
     if mask is not None and lost.any():

@@ -68,6 +68,6 @@ def panels(walls: SceneWalls, origin: np.ndarray) -> tuple[Blockers, int]:
         torch.from_numpy(np.array(scales).reshape(-1, 3)).log(),
         torch.tensor(turns, dtype=torch.float64),
         torch.tensor(levels, dtype=torch.float64).log(),
-        most=OBLIQUE,
+        most=torch.tensor(OBLIQUE, dtype=torch.float64),
     )
     return found, leaning

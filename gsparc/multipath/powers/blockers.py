@@ -24,14 +24,14 @@ class Blockers:
         turns: (N,) angles from x to their first axes [rad].
         log_strengths: (N,) of the prior's deviation of what each takes of a path straight through it, of the
             square root of the process's amplitude.
-        most: that one takes of one path, in units of the way straight through it.
+        most: (N,) that each takes of one path, in units of the way straight through it; or one for all, ().
     """
 
     means: Tensor
     log_scales: Tensor
     turns: Tensor
     log_strengths: Tensor
-    most: float = field(default=math.inf, kw_only=True)
+    most: Tensor = field(default=torch.tensor(math.inf, dtype=torch.float64), kw_only=True)
 
     @classmethod
     def none(cls) -> Blockers:
@@ -45,7 +45,15 @@ class Blockers:
     def joined(self, other: Blockers) -> Blockers:
         """These and others."""
         parts = (torch.cat(pair) for pair in zip(self.parts(), other.parts(), strict=True))
-        return Blockers(*parts, most=min(self.most, other.most))
+        return Blockers(*parts, most=torch.cat([one.most.expand(len(one)) for one in (self, other)]))
+
+    def within(self, places: Tensor, still: Place | None) -> Blockers:
+        """The same, none of which takes more of any path than it does of the one that loses most in it here.
+
+        Args:
+            places: (n, 3) or (n, 6), and `still`: see `shadows`.
+        """
+        return replace(self, most=self.shadows(places, still).amax(0))
 
     def relative_to(self, amplitude: float) -> Blockers:
         """The same, when strengths are in decibels, in units of a process's amplitude [dB^2]."""
@@ -64,7 +72,7 @@ class Blockers:
         """
         other = places[:, 3:] if still is None else places.new_tensor(still).expand(len(places), 3)
         taken = extinctions(places[:, :3], other, self.means, self.log_scales, self.turns)
-        return taken if math.isinf(self.most) else taken.clamp_max(self.most)
+        return taken.minimum(self.most)
 
     def terms(self, places: Tensor, still: Place | None) -> Tensor:
         """The same (n, N) times their strengths: columns of the covariance's low-rank term."""

@@ -269,7 +269,7 @@ class PowerField(ConditionalField):
             **self.trend.state(),
             "still": [] if self.still is None else [*self.still],
             "seed": self.seed,
-            **({} if math.isinf(self.most) else {"most": self.most}),  # a checkpoint has finite numbers
+            "most": self.most.nan_to_num(),  # a checkpoint has finite numbers
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
@@ -476,9 +476,9 @@ def restored(site: Site, state: dict[str, Any]) -> PowerField:
     names = ("means", "log_scales", "turns", "log_strengths")
     two = len(state["log_lengths"]) == 2
     kernel = PowerKernel((1.0,) * (2 if two else 1), (0.5, 0.5) if two else (1.0,), 1.0, 1.0)
+    most = torch.as_tensor(state.get("most", math.inf)).double()
     field = PowerField(
-        site, trend_of(state), kernel,
-        Blockers(*(state[name] for name in names), most=float(state.get("most", math.inf))),
+        site, trend_of(state), kernel, Blockers(*(state[name] for name in names), most=most),
         _place(still), int(state["seed"]), fringes_of(state["fringes"]) if "fringes" in state else None,
     )  # fmt: skip
     with torch.no_grad():

@@ -70,18 +70,23 @@ class Seen:
 def gains(inverse: Tensor, values: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Log evidence (N,) that each column adds with its best strength, and the square of that (N,).
 
-    Zero where the values ask for a strength below nothing: a Gaussian takes power, it gives none.
+    Zero where the values ask for a strength below nothing: a Gaussian takes power, it gives none. The
+    evidence is of all rows but the one that speaks most for the column: one outlier is no wall.
 
     Args:
         inverse: (n, n) of the covariance of the values.
         values: (n,) [dB].
         columns: (n, N).
     """
-    by_value, by_column = columns.T @ (inverse @ values), (columns * (inverse @ columns)).sum(0) + TINY
+    each_value, each_column = columns * (inverse @ values)[:, None], columns * (inverse @ columns)
+    telling = each_value.argmin(0, keepdim=True)
+    by_value, by_column = each_value.sum(0), each_column.sum(0) + TINY
+    rest_value = by_value - each_value.gather(0, telling)[0]
+    rest = rest_value.square() / (by_column - each_column.gather(0, telling)[0]).clamp_min(TINY)
     ratio = by_value.square() / by_column
-    worth = 0.5 * (ratio - 1 - ratio.clamp_min(TINY).log())
-    takes = (ratio > 1) & (by_value < 0)
-    return torch.where(takes, worth, 0.0), torch.where(takes, (ratio - 1) / by_column, 0.0)
+    worth = 0.5 * (rest - 1 - rest.clamp_min(TINY).log())
+    worth = torch.where((rest > 1) & (rest_value < 0), worth, 0.0)
+    return worth, torch.where((ratio > 1) & (by_value < 0), (ratio - 1) / by_column, 0.0)
 
 
 def drawn(seen: Seen, count: int, rng: np.random.Generator) -> Blockers:
@@ -124,7 +129,7 @@ def search(
         found, total = found.joined(replace(one, log_strengths=0.5 * strength.log())), total + worth
         terms = np.c_[seen.terms, found.terms(seen.places, seen.still).numpy()]
         kernel = choose([kernel], seen.distance, terms, seen.values)[1]
-    return found, kernel, total
+    return found.within(seen.places, seen.still), kernel, total
 
 
 def _at(pool: Blockers, number: Tensor) -> Blockers:

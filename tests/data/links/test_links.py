@@ -99,6 +99,16 @@ def test_powers_below_the_sensitivity_are_kept_as_that():
     np.testing.assert_allclose(level, -80, atol=1e-3)
 
 
+def test_a_sensitivity_far_below_all_powers_is_said():
+    """A level of -399 dB, true or not, drew the process hundreds of decibels below all that was heard."""
+    holes = np.where(LEVELS < -80, np.nan, LEVELS)
+    (said,) = [
+        n for n in read(town(rssi_db=holes, sensitivity_db=-399.0)).notes if "is it the receiver's" in n
+    ]
+    assert said.startswith("sensitivity_db=-399 is 320 dB below") and "\n" not in said
+    assert not any("receiver's" in n for n in read(town(rssi_db=holes, sensitivity_db=-80.0)).notes)
+
+
 def test_the_mask_wins_over_the_sensitivity():
     holes = np.where(LEVELS < -80, np.nan, LEVELS)
     mask = np.ones_like(holes, bool)

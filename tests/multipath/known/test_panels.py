@@ -31,7 +31,7 @@ def test_a_path_along_a_wall_loses_no_more_than_an_oblique_one():
     found, _ = panels(SceneWalls((WALL * [1, 5, 1],), BOX[:0]), np.zeros(3))
     beside = torch.tensor([[2.05, 14.0, 1.5]], dtype=torch.float64)
     assert float(found.shadows(beside, (1.95, -14.0, 1.5)).max()) == OBLIQUE
-    assert float(replace(found, most=math.inf).shadows(beside, (1.95, -14.0, 1.5)).max()) > 50
+    assert float(replace(found, most=torch.tensor(math.inf)).shadows(beside, (1.95, -14.0, 1.5)).max()) > 50
 
 
 def test_floors_boxes_and_what_leans():

@@ -19,11 +19,20 @@ from gsparc.methods.gp import GaussianProcess
 from gsparc.methods.method import FitContext
 from gsparc.methods.nearest_process import NearestProcess
 from gsparc.methods.power_kernel import PowerKernel
+from gsparc.methods.power_process import fit_powers
 from gsparc.methods.registry import field_initialiser
 from gsparc.methods.trend import Trend
 from gsparc.multipath.powers import field as powers
 from gsparc.multipath.powers.blockers import Blockers
-from gsparc.multipath.powers.field import PowerField, PowerSettings, initialise, restored, rows_within
+from gsparc.multipath.powers.field import (
+    PowerField,
+    PowerSettings,
+    initialise,
+    restored,
+    rows_of,
+    rows_within,
+)
+from gsparc.multipath.powers.search import Seen, search
 from gsparc.ops import Pose
 
 STATION = (5.0, 20.0, 3.0)
@@ -122,6 +131,28 @@ def test_no_walls_are_found_where_there_are_none():
     assert not len(field.objects())
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_one_outlier_is_no_wall(seed):
+    """One power 30 dB too weak was taken for a wall, which took 66 dB of a path beside it."""
+    data = town(140, walls=False, seed=seed)
+    target = data.target.copy()
+    target[7] /= 1e3
+    rows = rows_of(replace(data, target=target), np.arange(140))
+    plain, _ = fit_powers(rows, data.site, "distance")
+    seen = Seen.of(rows, plain.trend, plain.trend.law.place)
+    assert len(search(seen, plain.kernel, 3, seed)[0]) == 0
+
+
+def test_no_path_loses_more_in_a_gaussian_than_measured_ones_do(blocked):
+    data, field, _ = blocked
+    still, near = field.still, torch.from_numpy(data.moving[:160])
+    seen = field.blockers.shadows(near, still).amax(0)
+    beyond = torch.from_numpy(np.random.default_rng(0).uniform([5, -20, 0], [90, 60, 9], (4_000, 3)))
+    assert (field.blockers.shadows(beyond, still).amax(0) <= seen + 1e-9).all()
+    free = replace(field.blockers, most=torch.tensor(math.inf).double())
+    assert (free.shadows(beyond, still).amax(0) > 1.05 * seen).any()
+
+
 def test_far_away_the_variance_is_the_priors(blocked):
     data, field, _ = blocked
     near = data.batch(np.arange(5))
@@ -201,11 +232,14 @@ def test_state_makes_it_again(blocked, tmp_path):
     assert torch.equal(field.mean_at(batch.tx, batch.rx), again.mean_at(batch.tx, batch.rx))
 
 
-def test_a_bound_on_what_walls_take_is_stored_and_no_bound_is_not(blocked):
+def test_a_bound_on_what_gaussians_take_is_stored_as_a_finite_number(blocked):
     """An infinite number made every checkpoint of a field without known walls unreadable."""
     data, field, _ = blocked
-    assert "most" not in field.state()
-    assert restored(data.site, {**field.state(), "most": 4.0}).blockers.most == 4.0
+    assert torch.isfinite(small_field(data).state()["most"]).all()
+    assert torch.equal(restored(data.site, field.state()).most, field.most)
+    earlier = {name: value for name, value in field.state().items() if name != "most"}
+    assert torch.isinf(restored(data.site, earlier).blockers.most)
+    assert restored(data.site, {**earlier, "most": 4.0}).blockers.most == 4.0
 
 
 def test_both_ends_may_move():
