@@ -78,12 +78,16 @@ def gains(inverse: Tensor, values: Tensor, columns: Tensor) -> tuple[Tensor, Ten
         values: (n,) [dB].
         columns: (n, N).
     """
-    each_value, each_column = columns * (inverse @ values)[:, None], columns * (inverse @ columns)
-    telling = each_value.argmin(0, keepdim=True)
-    by_value, by_column = each_value.sum(0), each_column.sum(0) + TINY
-    rest_value = by_value - each_value.gather(0, telling)[0]
-    rest = rest_value.square() / (by_column - each_column.gather(0, telling)[0]).clamp_min(TINY)
+    white, weights = inverse @ columns, inverse @ values
+    by_value, by_column = columns.T @ weights, (columns * white).sum(0) + TINY
     ratio = by_value.square() / by_column
+    # What a row adds to the forms c' K^-1 v and c' K^-1 c of all others, so that they are exact without it.
+    share = inverse.diagonal()[:, None]
+    telling = (white * weights[:, None] / share).argmin(0, keepdim=True)
+    own, at = white.gather(0, telling)[0], telling[0]
+    rest_value = by_value - own * weights[at] / share[at, 0]
+    rest_column = torch.maximum(by_column - own.square() / share[at, 0], 1e-9 * by_column)
+    rest = rest_value.square() / rest_column
     worth = 0.5 * (rest - 1 - rest.clamp_min(TINY).log())
     worth = torch.where((rest > 1) & (rest_value < 0), worth, 0.0)
     return worth, torch.where((ratio > 1) & (by_value < 0), (ratio - 1) / by_column, 0.0)

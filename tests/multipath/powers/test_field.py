@@ -32,7 +32,7 @@ from gsparc.multipath.powers.field import (
     rows_of,
     rows_within,
 )
-from gsparc.multipath.powers.search import Seen, search
+from gsparc.multipath.powers.search import Seen, drawn, gains, search
 from gsparc.ops import Pose
 
 STATION = (5.0, 20.0, 3.0)
@@ -145,12 +145,37 @@ def test_one_outlier_is_no_wall(seed):
 
 def test_no_path_loses_more_in_a_gaussian_than_measured_ones_do(blocked):
     data, field, _ = blocked
-    still, near = field.still, torch.from_numpy(data.moving[:160])
-    seen = field.blockers.shadows(near, still).amax(0)
-    beyond = torch.from_numpy(np.random.default_rng(0).uniform([5, -20, 0], [90, 60, 9], (4_000, 3)))
-    assert (field.blockers.shadows(beyond, still).amax(0) <= seen + 1e-9).all()
-    free = replace(field.blockers, most=torch.tensor(math.inf).double())
-    assert (free.shadows(beyond, still).amax(0) > 1.05 * seen).any()
+    near = torch.from_numpy(data.moving[:12])  # behind the first Gaussian's edge at most
+    beyond = torch.from_numpy(np.random.default_rng(0).uniform([-40, -40, -9], [40, 40, 9], (9_000, 3)))
+    invented = small_field(data)
+    bounded, still = invented.blockers.within(near, invented.still), invented.still
+    seen = bounded.shadows(near, still).amax(0)
+    assert torch.equal(seen, invented.blockers.shadows(near, still).amax(0))
+    assert (bounded.shadows(beyond, still).amax(0) <= seen).all()
+    assert (invented.blockers.shadows(beyond, still).amax(0) > 1.05 * seen).any()
+    assert field.most.shape == (field.count,) and torch.isfinite(field.most).all()
+
+
+def test_a_walls_evidence_without_its_most_telling_row_is_exact():
+    """Left out of sums alone, a row could leave next to nothing to divide by: evidence of 4e9 nats."""
+    data = town(60)
+    rows = rows_of(data, np.arange(60))
+    plain, _ = fit_powers(rows, data.site, "distance")
+    seen = Seen.of(rows, plain.trend, plain.trend.law.place)
+    gram = torch.from_numpy(plain.kernel.amplitude * plain.kernel.gram(seen.distance, seen.terms))
+    columns = drawn(seen, 400, np.random.default_rng(1)).shadows(seen.places, seen.still)
+    values = torch.from_numpy(seen.values)
+    worth, _ = gains(torch.linalg.inv(gram), values, columns)
+    assert (worth > 1).sum() > 3 and worth.max() < 100
+    for k in torch.nonzero(worth > 1)[:4, 0]:
+        without = []
+        for row in range(60):
+            kept = torch.arange(60) != row
+            inverse = torch.linalg.inv(gram[kept][:, kept])
+            column = columns[kept, k]
+            ratio = (column @ inverse @ values[kept]) ** 2 / (column @ inverse @ column)
+            without.append(0.5 * (ratio - 1 - ratio.log()))
+        assert torch.isclose(torch.stack(without), worth[k], rtol=1e-6).any()
 
 
 def test_far_away_the_variance_is_the_priors(blocked):
