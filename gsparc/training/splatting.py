@@ -141,13 +141,13 @@ class LearnedField(Method):
             if self.refit:
                 fold = Fold(np.sort(np.concatenate([fold.train, fold.val])), fold.val[:0], fold.test)
             seconds = self._stage("train", origin, data, fold, context, budget, seconds)
-            self._weigh_beside(data, fold)
+            self._weigh_process(data, fold)
             self.frozen = None
             return FitReport(seconds, limited_by=self._limited_by)
         if stage == "train":
             seconds += self._stage("train", origin, data, fold, context, budget, seconds)
             self._calibrate(data, fold)
-            self._weigh_beside(data, fold)
+            self._weigh_process(data, fold)
         elif resumed is not None:
             self.restore(data.site, resumed.state)
         if self.refit and len(fold.val):
@@ -244,8 +244,8 @@ class LearnedField(Method):
             self._paying = ran.position
         return prepared + ran.seconds
 
-    def _weigh_beside(self, data: Measurements, fold: Fold) -> None:
-        """A hook between the stages: what validation rows say of a process beside the field."""
+    def _weigh_process(self, data: Measurements, fold: Fold) -> None:
+        """A hook between the stages: what a process averaged with the field would gain."""
 
     def module(self, steps: int = 1, run_dir: Path = Path(), pace: Pace | None = None) -> GaussianModule:
         """What Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
