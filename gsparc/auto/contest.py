@@ -72,7 +72,7 @@ class Contest:
             if first and waiting == 1 and folds > 1 and self._settled(trial):
                 log.info("auto: %s: clearly better than all others, tried no further", trial.name)
                 break
-        self._say(trial)
+        self._log_trial(trial)
 
     def _seconds(self, trial: Trial, rest: float, folds: int) -> float:
         """Of the next fit [s], so that those that follow, and one to all rows, have as many.
@@ -120,7 +120,7 @@ class Contest:
         units = self.way.units(min(len(trial.residual), len(best.residual)))
         return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], units)
 
-    def _say(self, trial: Trial) -> None:
+    def _log_trial(self, trial: Trial) -> None:
         """One line of what was found."""
         if trial.refusal is not None:
             log.debug("%s: %s", trial.name, trial.refusal)

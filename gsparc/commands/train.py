@@ -95,7 +95,7 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     yaml = OmegaConf.to_yaml(config, resolve=True)
 
     def keep(number: int, method: Method, report: FitReport) -> None:
-        _tell(method, report, config.budget_s)
+        _log_fit(method, report, config.budget_s)
         extra = {"train_s": report.seconds, "fold": number, "split_sha256": split.sha256}
         checkpoint.save(files[number], method, yaml, extra)
 
@@ -187,7 +187,7 @@ def _resume(config: DictConfig, number: int, folds: int) -> Path | None:
     return own if own.exists() else None
 
 
-def _tell(method: Method, report: FitReport, budget_s: float | None) -> None:
+def _log_fit(method: Method, report: FitReport, budget_s: float | None) -> None:
     """What the fit found, and whether a budget or options of the Trainer were asked for and not used."""
     if budget_s is not None and not method.takes_budget:
         log.warning("budget_s=%g is not used: the seconds of %s cannot be chosen", budget_s, method.name)

@@ -56,7 +56,7 @@ class PhasedScene:
         return {
             "transmitter": scene.transmitter,
             "planes": scene.planes,
-            "words": [list(word) for word in scene.words],
+            "sequences": [list(sequence) for sequence in scene.sequences],
             "log_amplitude": scene.log_amplitude,
             "log_noise": scene.log_noise,
             "visibility": [float(kernel.constant), float(kernel.angle), float(kernel.length)],
@@ -70,9 +70,12 @@ class PhasedScene:
     @staticmethod
     def from_state(state: dict[str, Any]) -> PhasedScene:
         """Inverse of `state`."""
-        words, kernel = tuple(tuple(word) for word in state["words"]), KernelVisibility(*state["visibility"])
+        sequences, kernel = (
+            tuple(map(tuple, state.get("sequences") or state["words"])),
+            KernelVisibility(*state["visibility"]),
+        )
         clutter = Clutter(state["boxes"], state["patches"], tuple(state["patched"]))
-        sources = (words, state["log_amplitude"], float(state["log_noise"]))
+        sources = (sequences, state["log_amplitude"], float(state["log_noise"]))
         scene = Scene(state["transmitter"], state["planes"], *sources, kernel, clutter)
         return PhasedScene(scene, state["phase"], float(state["turning"]))
 

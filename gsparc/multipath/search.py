@@ -17,7 +17,7 @@ from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogon
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.source_types import box_of
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word, all_words, bisector, images, reflect
+from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, images, reflect
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
@@ -33,9 +33,9 @@ class SearchSettings:
         margin: of the search box around receivers and transmitter [m].
         order: largest reflection order of a source.
         max_sources: that end the search.
-        word_score: least score of a word over known planes.
+        sequence_score: least score of a sequence over known planes.
         free_score: least score of a source with a plane of its own.
-        words_per_round, free_per_round: most new sources in a round.
+        sequences_per_round, free_per_round: most new sources in a round.
         steps: of refinement after each round.
         final_steps: of refinement at the end.
         prune: least gain of a source kept [nats].
@@ -50,9 +50,9 @@ class SearchSettings:
     margin: float = 8.0
     order: int = 3
     max_sources: int = 60
-    word_score: float = 8.0
+    sequence_score: float = 8.0
     free_score: float = 15.0
-    words_per_round: int = 4
+    sequences_per_round: int = 4
     free_per_round: int = 2
     steps: int = 12
     final_steps: int = 80
@@ -101,7 +101,7 @@ class Search:
         s, stale, best = self.settings, 0, math.inf
         self._refine(s.steps)
         for number in range(60):
-            added = self._add_words()
+            added = self._add_sequences()
             free = not added
             if free:
                 added = self._add_free()
@@ -119,9 +119,9 @@ class Search:
             nll = Posterior(self.rows, self.scene).nll
             log.debug(
                 "round %d: %d sources, %d planes, nll %.1f, %s",
-                number, len(self.scene.words), len(self.scene.planes), nll, self.scene.visibility,
+                number, len(self.scene.sequences), len(self.scene.planes), nll, self.scene.visibility,
             )  # fmt: skip
-            if len(self.scene.words) >= s.max_sources:
+            if len(self.scene.sequences) >= s.max_sources:
                 break
             stale, best = (0, nll) if nll < best - s.progress else (stale + 1, best)
             if stale >= s.patience:
@@ -134,7 +134,7 @@ class Search:
         self._find_walls()
         self._reassign(orthogonal_walls(self.scene))
         self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
-        self._add_words()
+        self._add_sequences()
         self._refine(s.steps)
         self.scene = prune(self.rows, self.scene, s.prune, self.over)
         self._learn_visibility(10)
@@ -145,30 +145,30 @@ class Search:
         self.scene = refine(self.rows, self.scene, steps, late=self.over)
 
     def _learn_visibility(self, steps: int) -> None:
-        if len(self.scene.words) >= self.settings.learn_visibility_from:
+        if len(self.scene.sequences) >= self.settings.learn_visibility_from:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
             self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
 
-    def _add_words(self, most: int | None = None) -> int:
+    def _add_sequences(self, most: int | None = None) -> int:
         """Add the best reflections in known planes; returns how many."""
         s, scene = self.settings, self.scene
-        letters = list(range(len(scene.planes)))
-        longer: list[Word] = [
-            (*w, i) for w in scene.words if len(w) < s.order for i in letters if not w or w[-1] != i
+        indices = list(range(len(scene.planes)))
+        longer: list[Reflections] = [
+            (*w, i) for w in scene.sequences if len(w) < s.order for i in indices if not w or w[-1] != i
         ]
-        known = set(scene.words)
-        words = [w for w in dict.fromkeys(longer + all_words(letters, 2)) if w not in known]
-        if not words:
+        known = set(scene.sequences)
+        sequences = [w for w in dict.fromkeys(longer + all_sequences(indices, 2)) if w not in known]
+        if not sequences:
             return 0
-        position = images(scene.transmitter, scene.planes, words)
-        candidates = replace(scene, words=tuple(words)).images(self.rows)
+        position = images(scene.transmitter, scene.planes, sequences)
+        candidates = replace(scene, sequences=tuple(sequences)).images(self.rows)
         scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).factor)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
-            position, scores * clear, 0.5 * self.wavelength, most or s.words_per_round, s.word_score
+            position, scores * clear, 0.5 * self.wavelength, most or s.sequences_per_round, s.sequence_score
         )
         if chosen:
-            self.scene = scene.with_words([words[i] for i in chosen], amplitude[chosen])
+            self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
 
     def _add_free(self) -> int:
@@ -177,7 +177,7 @@ class Search:
         Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
         """
         s, posterior = self.settings, Posterior(self.rows, self.scene)
-        parents: list[Word | None] = [None] if self.rows.array is None else [*self._strong_parents()]
+        parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for parent in parents:
             spread = partial(self._spread, parent)
             found = search_box(
@@ -188,10 +188,10 @@ class Search:
             for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
                 if gained < s.free_score:
                     continue
-                word, plane = self._parent(position, posterior)
+                sequence, plane = self._parent(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
-                self.scene = replace(self.scene, planes=planes).with_words(
-                    [(*word, len(planes) - 1)], amplitude[None]
+                self.scene = replace(self.scene, planes=planes).with_sequences(
+                    [(*sequence, len(planes) - 1)], amplitude[None]
                 )
                 added += 1
             if added:
@@ -200,22 +200,22 @@ class Search:
 
     def _able(self, scene: Scene) -> list[int]:
         """Sources that may be reflected once more."""
-        return [i for i, word in enumerate(scene.words) if len(word) < self.settings.order]
+        return [i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order]
 
-    def _strong_parents(self) -> list[Word]:
-        """The static end, then the words of the loudest sources that may be reflected once more."""
+    def _strong_parents(self) -> list[Reflections]:
+        """The static end, then the sequences of the loudest sources that may be reflected once more."""
         loudness = self.scene.log_amplitude
         louder = sorted((i for i in self._able(self.scene) if i), key=lambda i: -float(loudness[i]))
-        return [self.scene.words[i] for i in (0, *louder[: PARENTS - 1])]
+        return [self.scene.sequences[i] for i in (0, *louder[: PARENTS - 1])]
 
-    def _spread(self, parent: Word | None, points: Tensor) -> Tensor:
+    def _spread(self, parent: Reflections | None, points: Tensor) -> Tensor:
         """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
         if parent is None:
             return points
-        scene = replace(self.scene, words=(parent,))
+        scene = replace(self.scene, sequences=(parent,))
         return reflect(scene.images(self.rows), bisector(scene.sources, points))
 
-    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Word, Tensor]:
+    def _parent(self, position: Tensor, posterior: Posterior) -> tuple[Reflections, Tensor]:
         """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
         scene, able = posterior.scene, self._able(posterior.scene)
         planes = bisector(scene.sources[able], position)
@@ -225,16 +225,16 @@ class Search:
         taken = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, taken).amin(1) > 0.5 * self.wavelength
         scores = score(self.rows, candidates, posterior.factor)[0].reshape(mirrored.shape[:2])
-        letters = torch.tensor([len(scene.words[i]) for i in able])
-        gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * letters
+        order = torch.tensor([len(scene.sequences[i]) for i in able])
+        gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas
             gain = gain + scores[torch.arange(len(able)), able]
         best = int(gain.argmax())
-        return scene.words[able[best]], planes[best]
+        return scene.sequences[able[best]], planes[best]
 
     def _find_walls(self) -> None:
         """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
-        if len(self.scene.words) < 6:
+        if len(self.scene.sequences) < 6:
             return
         self._reassign(find_walls(self.scene.sources))
 
@@ -246,7 +246,7 @@ class Search:
         self.scene = reassign(before, walls)
         self._refine(20)
         for _ in range(2):
-            if self._add_words(6):
+            if self._add_sequences(6):
                 self._refine(self.settings.steps)
         saved = len(before.planes) - len(self.scene.planes)
         allowed = Posterior(self.rows, before).nll + 4 * saved

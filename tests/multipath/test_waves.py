@@ -14,7 +14,7 @@ from gsparc.methods.method import FitContext
 from gsparc.multipath.complex_gp import ComplexGP
 from gsparc.multipath.waves import evidence
 from gsparc.multipath.waves.columns import bands, gather
-from gsparc.multipath.waves.covariance import Shape, Values, diffuse, disturbance, prior, told
+from gsparc.multipath.waves.covariance import Shape, Values, diffuse, disturbance, prior, specular
 from gsparc.multipath.waves.field import ChannelField, restored
 from gsparc.multipath.waves.initial import initialise
 from gsparc.multipath.waves.kernels import cells, directed, directions, isotropic, sphere
@@ -112,7 +112,7 @@ def test_covariance_is_hermitian_and_its_diagonal_the_prior():
     group = gather(data, np.arange(40), True)[0]
     shape, values = field.shape, field.values
     here = group.places
-    signal = diffuse(shape, values, K, here, here) + told(shape, values, group.slot, here, here)
+    signal = diffuse(shape, values, K, here, here) + specular(shape, values, group.slot, here, here)
     torch.testing.assert_close(signal, signal.mH)
     torch.testing.assert_close(signal.diagonal().real, prior(shape, values, group.slot, here))
     assert torch.linalg.eigvalsh(signal + disturbance(shape, values, group)).min() > 0
@@ -155,7 +155,7 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
         assert float(slope[number]) == pytest.approx((found[0] - found[1]) / 2e-5, rel=1e-4, abs=1e-4)
     group = groups[0]
     whole = diffuse(shape, values, K, group.places, group.places)
-    whole = whole + told(shape, values, group.slot, group.places, group.places)
+    whole = whole + specular(shape, values, group.slot, group.places, group.places)
     whole = whole + disturbance(shape, values, group)
     fit = (group.target.conj() * torch.linalg.solve(whole, group.target)).real.mean()
     expected = float(len(group) * fit.log() + torch.logdet(whole).real)
@@ -221,7 +221,7 @@ def test_variances_have_the_digits_they_need(noise, plain, dtype):
     (known,) = field.weights
     there, here = known.group.places, torch.from_numpy(data.moving[30:50]).double()
     shape, values, slot = field.shape, field._held, known.group.slot
-    cross = diffuse(shape, values, slot.wavenumber, here, there) + told(shape, values, slot, here, there)
+    cross = diffuse(shape, values, slot.wavenumber, here, there) + specular(shape, values, slot, here, there)
     exact = torch.linalg.solve_triangular(known.lower, cross.mH, upper=False).abs().square().sum(0)
     assert known.root.dtype == dtype
     assert (known.learned(cross) - exact).abs().max() < 2e-3 * noise + 1e-10

@@ -22,7 +22,7 @@ from gsparc.multipath.gp_likelihood import JITTER, Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
-from gsparc.physics.mirror_planes import Word, all_words
+from gsparc.physics.mirror_planes import Reflections, all_sequences
 from gsparc.physics.waves import LIGHT
 
 log = logging.getLogger(__name__)
@@ -45,9 +45,9 @@ class ClutterSearch:
     Attributes:
         epochs: rounds of everything, softer edges first. progress: nats; an epoch that gains fewer is the
         last. min_gain: least predicted gain of a candidate [nats]; `mirror_score`: of a mirror after its
-        offset search. boxes, mirrors, words: most new ones in an epoch. beyond: margin of clutter around the
-        receivers' box [m]. soft: width of edges in each epoch [m], the last for all that follow. steps: of
-        the descent on everything but clutter, at the end of each epoch.
+        offset search. boxes, mirrors, sequences: most new ones in an epoch. beyond: margin of clutter around
+        the receivers' box [m]. soft: width of edges in each epoch [m], the last for all that follow. steps:
+        of the descent on everything but clutter, at the end of each epoch.
     """
 
     epochs: int = 6
@@ -56,7 +56,7 @@ class ClutterSearch:
     mirror_score: float = 8.0
     boxes: int = 4
     mirrors: int = 5
-    words: int = 6
+    sequences: int = 6
     beyond: float = 0.15
     soft: tuple[float, ...] = (0.08, 0.05, 0.03)
     steps: int = 8
@@ -157,7 +157,7 @@ class _ClutterSearcher:
         best = start, self.phased
         for epoch in range(s.epochs):
             before = self.nll
-            for move in (self._mirrors, self._patches, self._boxes, self._words):
+            for move in (self._mirrors, self._patches, self._boxes, self._sequences):
                 if not late():
                     move()
             if not late():
@@ -169,17 +169,22 @@ class _ClutterSearcher:
                 self._descend(10)
                 self._drop()
                 self._refactor(self.phased)
-                self._drop_words()
-                words, prior = self.scene.words, self.phase_prior
+                self._drop_sequences()
+                sequences, prior = self.scene.sequences, self.phase_prior
                 found = refine_phase.refine(
-                    self.rows, self.phased, s.steps, self.noise_floor, partial(prior.cost, words=words)
+                    self.rows,
+                    self.phased,
+                    s.steps,
+                    self.noise_floor,
+                    partial(prior.cost, sequences=sequences),
                 )
                 self._refactor(found)
             best = min(best, (self.nll, self.phased), key=lambda b: b[0])
             log.debug(
                 "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
-                epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches), len(self.scene.words),
-                self.nll, start, math.exp(self.scene.log_noise), self.scene.visibility,
+                epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches),
+                len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
+                self.scene.visibility,
             )  # fmt: skip
             if late() or self.nll > before - s.progress:
                 break
@@ -198,11 +203,11 @@ class _ClutterSearcher:
         s, scene = self.settings, self.scene
         found = find_mirrors(
             self.rows, self._scorer(), scene.transmitter, scene.planes,
-            walls(scene.planes, scene.words), self.room, 2 * s.mirrors,
+            walls(scene.planes, scene.sequences), self.room, 2 * s.mirrors,
         )  # fmt: skip
         found = [mirror for mirror in found if mirror.score > s.min_gain]
         scorer = self._scorer()
-        placed = [self._placed(mirror, scorer) for mirror in [*found, *self._faces()]]
+        placed = [self._placed(mirror, scorer) for mirror in [*found, *self._mirrors_on_boxes()]]
         added: list[SmallMirror] = []
         for mirror in sorted(placed, key=lambda m: -m.score):
             if len(added) == s.mirrors or mirror.score < s.mirror_score:
@@ -211,7 +216,7 @@ class _ClutterSearcher:
             if not double and self._add_mirror(mirror):
                 added.append(mirror)
 
-    def _faces(self) -> list[SmallMirror]:
+    def _mirrors_on_boxes(self) -> list[SmallMirror]:
         """Faces of boxes that are not on floor or walls, as mirrors."""
         found = []
         for box in self.scene.clutter.boxes:
@@ -237,62 +242,68 @@ class _ClutterSearcher:
         moves = torch.arange(-SLIDE, SLIDE + 1e-9, SLIDE_STEP, dtype=torch.float64) * self.wavelength
         planes = mirror.plane.repeat(len(moves), 1)
         planes[:, 3] += moves
-        scene, known = self.scene, walls(self.scene.planes, self.scene.words)
+        scene, known = self.scene, walls(self.scene.planes, self.scene.sequences)
         first = len(scene.planes)
-        words = [word for i in range(len(moves)) for word in _words_over(first + i, known)]
-        trial = replace(scene, planes=torch.cat([scene.planes, planes]), words=tuple(words))
+        sequences = [sequence for i in range(len(moves)) for sequence in _sequences_over(first + i, known)]
+        trial = replace(scene, planes=torch.cat([scene.planes, planes]), sequences=tuple(sequences))
         paths = trial.unfolding.paths(self.rows.position)
         inside = within(paths.end @ tangents(mirror.plane).T, mirror.patch[None])[0]
-        inside = torch.where(paths.letter >= first, inside, 1.0).prod(-1)
+        inside = torch.where(paths.plane >= first, inside, 1.0).prod(-1)
         seen = visible_share(paths, scene.clutter, trial.planes) * inside * paths.valid
-        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.words))
+        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], trial.sequences))
         scores = scorer.score(trial.unobstructed(self.rows) * seen.T * turn)
         total = scores.view(len(moves), -1).sum(1)
         best = int(total.argmax())
         return SmallMirror(planes[best], mirror.patch, float(total[best]))
 
     def _add_mirror(self, mirror: SmallMirror) -> bool:
-        """Try a small mirror with its best words; a wide one as an infinite wall first."""
+        """Try a small mirror with its best sequences; a wide one as an infinite wall first."""
         scene, number = self.scene, len(self.scene.planes)
-        words = _words_over(number, walls(scene.planes, scene.words))
+        sequences = _sequences_over(number, walls(scene.planes, scene.sequences))
         endless = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]))
         trial = replace(endless, clutter=scene.clutter.with_patch(mirror.patch, number))
-        if self._wide(mirror) and self._add(endless, words, 1.5, WALL * self.parameter_cost, len(words)):
+        if self._wide(mirror) and self._add(
+            endless, sequences, 1.5, WALL * self.parameter_cost, len(sequences)
+        ):
             return True
-        return self._add(trial, words, 1.5, MIRROR * self.parameter_cost, len(words))
+        return self._add(trial, sequences, 1.5, MIRROR * self.parameter_cost, len(sequences))
 
     def _wide(self, mirror: SmallMirror) -> bool:
         """Whether a mirror covers most of the room."""
         ends = self.room @ tangents(mirror.plane).T
         return bool((mirror.patch[2:] - mirror.patch[:2] > 0.7 * (ends[1] - ends[0]).abs()).all())
 
-    def _word_scores(
-        self, scene: Scene, words: list[Word], scorer: CandidateScorer
+    def _sequence_scores(
+        self, scene: Scene, sequences: list[Reflections], scorer: CandidateScorer
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Of words over a scene's planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
-        candidates = replace(scene, words=tuple(words))
+        """Of sequences over planes: log-likelihood gains (W,), complex gains (W,), positions (W, 3)."""
+        candidates = replace(scene, sequences=tuple(sequences))
         paths = candidates.unfolding.paths(self.rows.position)
         seen = visible_share(paths, scene.clutter, scene.planes) * paths.valid
         waves = candidates.unobstructed(self.rows) * seen.T
         if self.phase_prior.concentration < MIN_CONCENTRATION:
             return *scorer.score_waves(waves), candidates.sources
-        turn = torch.polar(torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.words))
+        turn = torch.polar(
+            torch.ones(()), self.phase_prior.expected(self.phased.phase[0], candidates.sequences)
+        )
         scores, gains = scorer.score_positive(waves * turn)
         return scores, gains * turn, candidates.sources
 
-    def _add(self, scene: Scene, words: list[Word], min_score: float, least: float, most: int) -> bool:
-        """Try the words of at least `min_score` nats, on a scene that may have more planes and patches."""
-        # new patches occlude present words, too
+    def _add(
+        self, scene: Scene, sequences: list[Reflections], min_score: float, least: float, most: int
+    ) -> bool:
+        """Try sequences of at least `min_score` nats, on a scene that may have more planes and patches."""
+        # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.scorer(hidden, self.scene.log_amplitude)
-        scores, gains, sources = self._word_scores(scene, words, scorer)
+        scores, gains, sources = self._sequence_scores(scene, sequences, scorer)
         clear = torch.cdist(sources, self.scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(sources, scores * clear, 0.5 * self.wavelength, most, min_score)
         if not chosen:
             return False
         strong = gains[chosen].abs().clamp(0.02, float(self.scene.log_amplitude.exp().max()))
         phase = torch.cat([self.phased.phase, gains[chosen].angle()])
-        return self._try(scene.with_words([words[i] for i in chosen], strong), least, phase)
+        return self._try(scene.with_sequences([sequences[i] for i in chosen], strong), least, phase)
 
     def _patches(self) -> None:
         """Try patches on infinite mirrors."""
@@ -300,14 +311,14 @@ class _ClutterSearcher:
         visible_waves, found = self.waves * self.visible.T, []
         for number in set(range(len(scene.planes))) - set(scene.clutter.plane):
             patch, score = find_patch(
-                scorer, self.paths, scene.words, number, scene.planes[number], visible_waves, self.room,
+                scorer, self.paths, scene.sequences, number, scene.planes[number], visible_waves, self.room,
                 self.generator,
             )  # fmt: skip
             found.append((score, number, patch))
         for score, number, patch in sorted(found, key=lambda f: -f[0]):
             if score < self.settings.min_gain:
                 break
-            own = [k for k, word in enumerate(self.scene.words) if number in word]
+            own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
             louder = self.scene.log_amplitude.clone()
             louder[own] = louder[own].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.with_patch(patch, number)
@@ -325,17 +336,19 @@ class _ClutterSearcher:
             if not self._try(replace(self.scene, clutter=clutter), BOX * self.parameter_cost):
                 break
 
-    def _words(self) -> None:
-        """Try more words over the present planes."""
-        scene, known = self.scene, set(self.scene.words)
-        letters = list(range(len(scene.planes)))
-        longer = [(*w, i) for w in scene.words if 0 < len(w) < 3 for i in letters if w[-1] != i]
-        words = [w for w in dict.fromkeys(all_words(letters, 2) + longer) if w not in known]
-        if not words:
+    def _sequences(self) -> None:
+        """Try more sequences over the present planes."""
+        scene, known = self.scene, set(self.scene.sequences)
+        indices = list(range(len(scene.planes)))
+        longer = [(*w, i) for w in scene.sequences if 0 < len(w) < 3 for i in indices if w[-1] != i]
+        sequences = [w for w in dict.fromkeys(all_sequences(indices, 2) + longer) if w not in known]
+        if not sequences:
             return
-        scores, _ = self._scorer().score_waves(replace(scene, words=tuple(words)).unobstructed(self.rows))
-        best = scores.topk(min(60, len(words))).indices.tolist()
-        self._add(scene, [words[i] for i in best], 6.0, self.parameter_cost, self.settings.words)
+        scores, _ = self._scorer().score_waves(
+            replace(scene, sequences=tuple(sequences)).unobstructed(self.rows)
+        )
+        best = scores.topk(min(60, len(sequences))).indices.tolist()
+        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, self.settings.sequences)
 
     def _relocate_boxes(self) -> None:
         """Search for every box anew, given the others."""
@@ -365,7 +378,7 @@ class _ClutterSearcher:
                 self._set_scene(before)
                 number += 1
 
-    def _drop_words(self) -> None:
+    def _drop_sequences(self) -> None:
         """Remove sources whose constant and varying parts both gain too little."""
         gains = self.residual.nats_per_source(self.visible, self.scene.log_amplitude)
         kept = [k for k in range(len(gains)) if k == 0 or gains[k] > 0]
@@ -378,6 +391,6 @@ class _ClutterSearcher:
                 self._set_scene(before)
 
 
-def _words_over(number: int, known: list[int]) -> list[Word]:
+def _sequences_over(number: int, known: list[int]) -> list[Reflections]:
     """Words over a plane: itself, after and before each wall."""
     return [(number,), *((wall, number) for wall in known), *((number, wall) for wall in known)]

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
 from gsparc.multipath.waves.kernels import directed, envelope, isotropic, smooth, steering
-from gsparc.physics.mirror_planes import Word, images
+from gsparc.physics.mirror_planes import Reflections, images
 
 FAST_ROWS, DRIFT_ROWS = 3.0, 15.0  # rows over which errors are correlated
 DRIFT_FIELD = 0.7  # share of the drift that is one of the diffuse field; the rest is of all places alike
@@ -43,7 +43,7 @@ class Shape:
         sources: how many of given places.
         middle: (3,) float64 [m] of the places learned from, where waves have their nominal power.
         reach: length of what is fixed [m].
-        words: images of the static end in `Values.planes`; they count as sources after those of given places.
+        sequences: images of the static end in `Values.planes`; sources after those of given places.
     """
 
     angles: Tensor
@@ -54,12 +54,12 @@ class Shape:
     sources: int
     middle: Tensor
     reach: float
-    words: tuple[Word, ...] = ()
+    sequences: tuple[Reflections, ...] = ()
 
     @property
     def count(self) -> int:
         """Sources and images."""
-        return self.sources + len(self.words)
+        return self.sources + len(self.sequences)
 
     @property
     def is_real(self) -> bool:
@@ -131,20 +131,22 @@ def source_waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> Te
     if not shape.count:
         return places.new_zeros(0, len(places), dtype=torch.complex128)
     end = slot.end + values.offset
-    given = torch.cat([values.sources, images(end, values.planes, shape.words)])
+    given = torch.cat([values.sources, images(end, values.planes, shape.sequences)])
     reference = torch.linalg.vector_norm(given - shape.middle, dim=-1)
     waves = [
         steering(places, source, slot.wavenumber, away) for source, away in zip(given, reference, strict=True)
     ]
-    seen = mirrored(values.planes, shape.words, end, shape.middle)
+    seen = mirrored(values.planes, shape.sequences, end, shape.middle)
     return torch.stack(waves) * torch.cat([seen.new_ones(shape.sources), seen])[:, None]
 
 
-def mirrored(planes: Tensor, words: Sequence[Word], end: Tensor, middle: Tensor) -> Tensor:
-    """1 for words (W,) whose planes all have the end (3,) and the places' middle (3,) on one side, else 0."""
+def mirrored(planes: Tensor, sequences: Sequence[Reflections], end: Tensor, middle: Tensor) -> Tensor:
+    """1 for sequences (W,) whose planes all have end (3,) and the places' middle (3,) on one side, else 0."""
     sides = planes[:, :3] @ torch.stack([end, middle], 1) - planes[:, 3:]
     alike = (sides[:, 0] * sides[:, 1] > 0).tolist()
-    return torch.tensor([float(all(alike[letter] for letter in word)) for word in words], dtype=torch.float64)
+    return torch.tensor(
+        [float(all(alike[index] for index in sequence)) for sequence in sequences], dtype=torch.float64
+    )
 
 
 def diffuse(shape: Shape, values: Values, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
@@ -229,7 +231,7 @@ def explained(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) ->
     ) * smooth(distance, values.gain)
 
 
-def told(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
+def specular(shape: Shape, values: Values, slot: Slot, a: Tensor, b: Tensor) -> Tensor:
     """Covariance (n, m) of all but the diffuse field."""
     distance = apart(a, b)
     found = torch.zeros(len(a), len(b), dtype=torch.complex128)

@@ -27,7 +27,7 @@ from gsparc.multipath.waves.covariance import (
     disturbance,
     explained,
     prior,
-    told,
+    specular,
 )
 from gsparc.ops import Pose
 
@@ -145,7 +145,7 @@ class ChannelField(ConditionalField):
             "leakage": shape.constant,
             "direct": shape.direct,
             "sources": shape.sources > 0,
-            "mirrors": len(shape.words) > 0,
+            "mirrors": len(shape.sequences) > 0,
             "drift": shape.correlated,
         }
         return tuple(name for name, is_on in on.items() if is_on)
@@ -283,7 +283,7 @@ class ChannelField(ConditionalField):
             fields = diffuse_of(shape, values, slots[0].wavenumber, powers, places, learned)
             for number, (known, here, _) in enumerate(alike):
                 slot = slots[number]
-                cross = fields[min(number, len(fields) - 1)] + told(shape, values, slot, places, learned)
+                cross = fields[min(number, len(fields) - 1)] + specular(shape, values, slot, places, learned)
                 slot.put(mean, here, cross @ known.alpha)
                 if self.count:
                     slot.put(share, here, explained(shape, values, slot, places, learned) @ known.alpha)
@@ -397,14 +397,15 @@ class ChannelField(ConditionalField):
 
 def restored(site: Site, state: dict[str, Any]) -> ChannelField:
     """The field whose `state()` this was."""
-    words = tuple(tuple(int(letter) for letter in word) for word in state["shape"].get("words", ()))
-    shape, kept = Shape(**{**state["shape"], "words": words}), state["values"]
+    shape, kept = dict(state["shape"]), state["values"]
+    sequences = shape.pop("words", shape.get("sequences", ()))  # `words` in earlier versions, if at all
+    shape["sequences"] = tuple(tuple(int(index) for index in sequence) for sequence in sequences)
     lengths = kept["log_envelope"].exp(), kept["log_gain"].exp()
     # Earlier versions knew no angles to ends, and no mirrors.
     some = {name: kept[name] for name in ("towards", "planes") if name in kept}
     values = Values(kept["log_power"].exp(), *lengths, kept["offset"], kept["sources"], **some)
     antennas, tones = (int(n) for n in state["channel"])
-    field = ChannelField(site, shape, values, (antennas, tones))
+    field = ChannelField(site, Shape(**shape), values, (antennas, tones))
     with torch.no_grad():
         for name, parameter in field.named_parameters():
             parameter.copy_(kept[name])
@@ -421,7 +422,7 @@ def _covariances(groups: tuple[Group, ...], shape: Shape, values: Values) -> lis
     """(n, n) complex128 of each group's rows with what disturbs them, relative to its scale."""
     return [
         field
-        + told(shape, values, group.slot, group.places, group.places)
+        + specular(shape, values, group.slot, group.places, group.places)
         + disturbance(shape, values, group)
         for field, group in zip(diffuse_fields(groups, shape, values), groups, strict=True)
     ]

@@ -237,7 +237,7 @@ class _Search:
         direct = known and wanted.direct is not False
         if (direct or wanted.constant is not False) and not budget.over():
             forced = wanted.constant is True or wanted.direct is True or "auto"
-            best = self._step(best, self._with_told(best, direct), forced, "leakage and direct wave", notes)
+            best = self._step(best, self._with_fixed(best, direct), forced, "leakage and direct wave", notes)
         if len(self.sources) and not budget.over():
             best = self._step(best, self._with_sources(best), "auto", "sources", notes)
         if wanted.mirrors and best.shape.direct and ends_of(self.every) > 1 and not budget.over():
@@ -291,7 +291,7 @@ class _Search:
         numbers = sum(2 * group.target.numel() for group in self.groups)
         return 0.5 * parameters * math.log(numbers)
 
-    def _with_told(self, before: Candidate, direct: bool) -> Candidate:
+    def _with_fixed(self, before: Candidate, direct: bool) -> Candidate:
         """With leakage and the direct wave; the best of a few lengths."""
         shape = replace(before.shape, constant=self.settings.constant is not False, direct=direct)
         return self._moved(self._of_lengths(shape, before.values, before.shape, direct))
@@ -326,8 +326,8 @@ class _Search:
         shape = replace(before.shape, sources=len(self.sources))
         values = replace(before.values, sources=self.sources)
         if before.shape.direct:
-            return self._heard(self._with_waves(before, shape, values))
-        return self._heard(self._of_lengths(shape, values, before.shape, True))
+            return self._without_weak(self._with_waves(before, shape, values))
+        return self._without_weak(self._of_lengths(shape, values, before.shape, True))
 
     def _with_mirrors(self, before: Candidate, budget: TimeBudget) -> Candidate | None:
         """With images in planes that all ends share; None where none is found."""
@@ -335,13 +335,13 @@ class _Search:
         rough = replace(self, groups=thinned(self.every, ROUGH_ENDS, ROUGH_ROWS))._compressed(shape, values)
         wide = replace(self, groups=thinned(self.every, self.settings.ends, self.settings.rows))
         parts = wide._compressed(shape, values)
-        planes, words = find_mirrors(
+        planes, sequences = find_mirrors(
             rough, parts, shape, values, self.wavelength, self.settings.mirrors, budget.over
         )
-        if not words:
+        if not sequences:
             return None
-        found = self._with_waves(before, replace(shape, words=words), replace(values, planes=planes))
-        return self._heard(found)
+        found = self._with_waves(before, replace(shape, sequences=sequences), replace(values, planes=planes))
+        return self._without_weak(found)
 
     def _with_waves(self, before: Candidate, shape: Shape, values: Values) -> Candidate:
         """With sources or images that there were none of before."""
@@ -351,7 +351,7 @@ class _Search:
         fresh = torch.full((len(shape.names) - len(power),), level, dtype=torch.float64)
         return self._fitted(shape, replace(values, power=torch.cat([power[:end], fresh, power[end:]])))
 
-    def _heard(self, found: Candidate) -> Candidate:
+    def _without_weak(self, found: Candidate) -> Candidate:
         """Without the sources and images that have no power."""
         shape, values, power = found.shape, found.values, found.values.power
         fixed, varying = (torch.tensor(shape.where(name)) for name in ("source", "source_smooth"))
@@ -361,8 +361,8 @@ class _Search:
         silent = {*fixed[~heard].tolist(), *varying[~heard].tolist()}
         rest = power[[i for i in range(len(power)) if i not in silent]]
         given, seen = heard[: shape.sources], heard[shape.sources :].tolist()
-        words = tuple(word for word, has in zip(shape.words, seen, strict=True) if has)
-        shape = replace(shape, sources=int(given.sum()), words=words)
+        sequences = tuple(sequence for sequence, has in zip(shape.sequences, seen, strict=True) if has)
+        shape = replace(shape, sources=int(given.sum()), sequences=sequences)
         return self._fitted(shape, replace(values, power=rest, sources=values.sources[given]))
 
     def _with_directions(self, before: Candidate) -> Candidate:
