@@ -18,6 +18,7 @@ from gsparc.commands import cli
 from gsparc.commands.context import callbacks_of, context_of
 from gsparc.commands.continued import once
 from gsparc.commands.output import run_directory, show
+from gsparc.commands.run_lock import held
 from gsparc.commands.settings import RunSettings, plain
 from gsparc.commands.study.run import fit_and_score
 from gsparc.data.datamodule import DataModule
@@ -78,8 +79,13 @@ def train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
         The facts of `summary.json`, and the objects they were computed from.
 
     Raises:
-        ValueError: bad data, settings or checkpoint; one line each.
+        ValueError: bad data, settings or checkpoint, or another run writes there; one line each.
     """
+    with held(run_dir):
+        return _train(config, run_dir)
+
+
+def _train(config: DictConfig, run_dir: Path) -> tuple[dict[str, Any], Objects]:
     RunSettings.of(config)
     module = _data(config)
     data = module.measurements
