@@ -62,10 +62,10 @@ def _bare(data):
     """Groups, shape and values of a direct wave in a diffuse field."""
     groups = tuple(normalised(group) for group in gather(data, np.arange(len(data)), True))
     none, middle = torch.zeros(0, 3, dtype=torch.float64), torch.from_numpy(data.moving).mean(0)
-    shape = Shape(none, 8.0, False, True, False, 0, middle, 20.0)
+    shape = Shape(none, 8.0, False, True, False, middle, 20.0)
     power = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64)
     lengths = torch.tensor([2.0, 0.8], dtype=torch.float64)
-    return groups, shape, Values(power, lengths[0], lengths[1], torch.zeros(3).double(), none)
+    return groups, shape, Values(power, lengths[0], lengths[1], torch.zeros(3).double())
 
 
 def _covariance(group, shape, values):

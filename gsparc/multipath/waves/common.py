@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.waves.columns import Group, Slot
-from gsparc.multipath.waves.covariance import Shape, Values, direct_wave, prior, source_waves
+from gsparc.multipath.waves.covariance import Shape, Values, direct_wave, image_waves, prior
 from gsparc.physics.mirror_planes import images
 
 
@@ -64,8 +64,8 @@ def _waves(shape: Shape, values: Values, slot: Slot, places: Tensor) -> tuple[Te
     end = slot.end + values.offset
     placed = torch.cat([end[None], images(end, values.planes, shape.sequences)])
     away = torch.linalg.vector_norm(placed - shape.middle, dim=-1)
-    mirrors = source_waves(shape, values, slot, places)[shape.sources :]
-    power = [shape.of("direct", values.power), shape.of("source", values.power)[shape.sources :]]
+    mirrors = image_waves(shape, values, slot, places)
+    power = [shape.of("direct", values.power), shape.of("source", values.power)]
     return torch.cat([direct_wave(shape, values, slot, places)[None], mirrors]), torch.cat(power), away
 
 

@@ -16,7 +16,7 @@ from itertools import permutations
 import torch
 from torch import Tensor
 
-from gsparc.multipath.waves.covariance import Shape, Values, source_waves
+from gsparc.multipath.waves.covariance import Shape, Values, image_waves
 from gsparc.multipath.waves.evidence import Compressed
 from gsparc.multipath.waves.probe import Probe
 from gsparc.physics.mirror_planes import Reflections, images
@@ -46,10 +46,9 @@ class _Searcher:
 
     def waves(self, probe: Probe, planes: Tensor, sequences: tuple[Reflections, ...]) -> Tensor:
         """(W, n) of images in planes (P, 4)."""
-        none = self.values.sources[:0]
-        values = replace(self.values, sources=none, planes=planes)
-        return source_waves(
-            replace(self.shape, sources=0, sequences=sequences), values, probe.group.slot, probe.group.places
+        values = replace(self.values, planes=planes)
+        return image_waves(
+            replace(self.shape, sequences=sequences), values, probe.group.slot, probe.group.places
         )
 
     def gains(
