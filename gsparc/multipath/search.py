@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsparc.multipath.backprojection import Effort, pick_apart, score, search_box
+from gsparc.multipath.backprojection import pick_apart, score, search_box
 from gsparc.multipath.gp_likelihood import Posterior, Scene, steering
 from gsparc.multipath.refine import Late, learn_visibility, never, refine
 from gsparc.multipath.reflection_orders import drop_planes, find_walls, orthogonal_walls, prune, reassign
@@ -23,46 +23,33 @@ from gsparc.physics.waves import LIGHT
 log = logging.getLogger(__name__)
 
 PARENTS = 4  # of a new source, tried in turn until one is found
+SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
+SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
+STEPS = 12  # of refinement after each round
+PRUNE = 5.0  # least gain of a source kept [nats]
+PATIENCE, PROGRESS = 3, 8.0  # rounds without a gain of so many nats before the search ends
+LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
 
 
 @dataclass(frozen=True)
 class SearchSettings:
-    """Acceptance thresholds and effort of a search.
+    """How far a search goes, and what it starts from.
 
     Attributes:
         margin: of the search box around receivers and transmitter [m].
         order: largest reflection order of a source.
         max_sources: that end the search.
-        sequence_score: least score of a sequence over known planes.
-        free_score: least score of a source with a plane of its own.
-        sequences_per_round, free_per_round: most new sources in a round.
-        steps: of refinement after each round.
         final_steps: of refinement at the end.
-        prune: least gain of a source kept [nats].
-        patience: rounds without a gain of `progress` nats before the search ends.
-        progress: [nats].
-        learn_visibility_from: sources from which on the visibility's lengths are learned.
         noise: variance at the start, of unit signal power.
         visibility: initial kernel and centre of its prior.
-        effort: of each search in free space.
     """
 
     margin: float = 8.0
     order: int = 3
     max_sources: int = 60
-    sequence_score: float = 8.0
-    free_score: float = 15.0
-    sequences_per_round: int = 4
-    free_per_round: int = 2
-    steps: int = 12
     final_steps: int = 80
-    prune: float = 5.0
-    patience: int = 3
-    progress: float = 8.0
-    learn_visibility_from: int = 12
     noise: float = 0.1
     visibility: KernelVisibility = field(default_factory=KernelVisibility)
-    effort: Effort = field(default_factory=Effort)
 
 
 class Search:
@@ -99,7 +86,7 @@ class Search:
     def run(self) -> Scene:
         """Search until no source is accepted, then refine."""
         s, stale, best = self.settings, 0, math.inf
-        self._refine(s.steps)
+        self._refine(STEPS)
         for number in range(60):
             added = self._add_sequences()
             free = not added
@@ -107,13 +94,13 @@ class Search:
                 added = self._add_free()
             if not added or self.late():
                 break
-            self._refine(s.steps)
+            self._refine(STEPS)
             if free or number % 2:
                 self.scene = drop_planes(self.rows, self.scene, 2 * self.wavelength, late=self.over)
             if number >= 4 and number % 3 == 1:
                 self._find_walls()
             if number % 2:
-                self.scene = prune(self.rows, self.scene, s.prune, self.over)
+                self.scene = prune(self.rows, self.scene, PRUNE, self.over)
             if number % 3 == 2:
                 self._learn_visibility(6)
             nll = Posterior(self.rows, self.scene).nll
@@ -123,29 +110,28 @@ class Search:
             )  # fmt: skip
             if len(self.scene.sequences) >= s.max_sources:
                 break
-            stale, best = (0, nll) if nll < best - s.progress else (stale + 1, best)
-            if stale >= s.patience:
+            stale, best = (0, nll) if nll < best - PROGRESS else (stale + 1, best)
+            if stale >= PATIENCE:
                 break
         return self._finish()
 
     def _finish(self) -> Scene:
-        s = self.settings
         self._refine(20)
         self._find_walls()
         self._reassign(orthogonal_walls(self.scene))
         self.scene = drop_planes(self.rows, self.scene, 3 * self.wavelength, late=self.over)
         self._add_sequences()
-        self._refine(s.steps)
-        self.scene = prune(self.rows, self.scene, s.prune, self.over)
+        self._refine(STEPS)
+        self.scene = prune(self.rows, self.scene, PRUNE, self.over)
         self._learn_visibility(10)
-        self._refine(s.final_steps)
+        self._refine(self.settings.final_steps)
         return self.scene
 
     def _refine(self, steps: int) -> None:
         self.scene = refine(self.rows, self.scene, steps, late=self.over)
 
     def _learn_visibility(self, steps: int) -> None:
-        if len(self.scene.sequences) >= self.settings.learn_visibility_from:
+        if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
             few = self.rows.take(torch.randperm(len(self.rows), generator=self.generator)[:400])
             self.scene = learn_visibility(few, self.scene, steps, self.settings.visibility, self.over)
 
@@ -165,7 +151,7 @@ class Search:
         scores, amplitude = score(self.rows, candidates, Posterior(self.rows, scene).factor)
         clear = torch.cdist(position, scene.sources).amin(1) > 0.5 * self.wavelength
         chosen = pick_apart(
-            position, scores * clear, 0.5 * self.wavelength, most or s.sequences_per_round, s.sequence_score
+            position, scores * clear, 0.5 * self.wavelength, most or SEQUENCES_PER_ROUND, SEQUENCE_SCORE
         )
         if chosen:
             self.scene = scene.with_sequences([sequences[i] for i in chosen], amplitude[chosen])
@@ -176,17 +162,17 @@ class Search:
 
         Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
         """
-        s, posterior = self.settings, Posterior(self.rows, self.scene)
+        posterior = Posterior(self.rows, self.scene)
         parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
         for parent in parents:
             spread = partial(self._spread, parent)
             found = search_box(
-                self.rows, posterior.factor, self.box, 0.5 * self.wavelength, s.free_per_round,
-                self.generator, s.effort, spread,
+                self.rows, posterior.factor, self.box, 0.5 * self.wavelength, FREE_PER_ROUND,
+                self.generator, spread,
             )  # fmt: skip
             added = 0
             for position, gained, amplitude in zip(found.position, found.score, found.amplitude, strict=True):
-                if gained < s.free_score:
+                if gained < FREE_SCORE:
                     continue
                 sequence, plane = self._parent(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
@@ -247,7 +233,7 @@ class Search:
         self._refine(20)
         for _ in range(2):
             if self._add_sequences(6):
-                self._refine(self.settings.steps)
+                self._refine(STEPS)
         saved = len(before.planes) - len(self.scene.planes)
         allowed = Posterior(self.rows, before).nll + 4 * saved
         if Posterior(self.rows, self.scene).nll >= allowed:

@@ -8,13 +8,13 @@ import torch
 from gains import gains
 from rooms import PILLAR, WAVELENGTH, shoebox
 
-from gsparc.multipath.clutter import finite_mirrors
+from gsparc.multipath.clutter import finite_mirrors, search
 from gsparc.multipath.clutter.blocking import Clutter, Obstacles, tangents, visible_share
 from gsparc.multipath.clutter.boxes import find_box
 from gsparc.multipath.clutter.finite_mirrors import find_mirrors, find_patch, walls
 from gsparc.multipath.clutter.refine import ReflectionPhasePrior
 from gsparc.multipath.clutter.residual import Residual
-from gsparc.multipath.clutter.search import ClutterSearch, find_clutter
+from gsparc.multipath.clutter.search import find_clutter
 from gsparc.multipath.clutter.unfold import Unfolding
 from gsparc.multipath.gp_likelihood import Scene
 from gsparc.multipath.phased_gp import PhasedPosterior, PhasedScene
@@ -256,13 +256,14 @@ def test_an_infinite_mirror_becomes_finite():
     assert (learned == told).float().mean() > 0.85
 
 
-def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room():
+def test_clutter_search_finds_a_pillar_and_nothing_in_an_empty_room(monkeypatch):
     generator = torch.Generator().manual_seed(0)
-    few = ClutterSearch(epochs=1, boxes=2, mirrors=1)
+    for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():
+        monkeypatch.setattr(search, name, value)
     for clutter, boxes in ((_boxed(_box()), True), (Clutter.none(), False)):
         rows = _truth(_scene(clutter), _rows(150))
         start = PhasedScene(_scene(Clutter.none()), torch.zeros(7), 0.2)
-        found = find_clutter(rows, start, generator, few)
+        found = find_clutter(rows, start, generator)
         assert bool(len(found.scene.clutter.boxes)) == boxes
         bare, learned = (PhasedPosterior(rows, each).factor.nll for each in (start, found))
         assert learned <= bare

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -32,60 +32,41 @@ INITIAL_KERNEL, QUADRATURE = KernelVisibility(0.9, 0.6, 1.5), 0.15  # in the pre
 MIN_CONCENTRATION = 1.0  # of the phase prior, from which on it predicts phases of new sources
 SAME_FACE_M = 0.03  # [m]; a box face that has moved less is not tried again as a mirror
 NEAR_WALL_M = 0.25  # [m]; faces closer to the end of the room are not tried as mirrors
+EPOCHS = 6  # rounds of everything, softer edges first
+SOFT_EDGES = (0.08, 0.05, 0.03)  # [m] width of edges in each epoch, the last for all that follow
+STEPS = 8  # of the descent on everything but clutter, at the end of each epoch
+PROGRESS = 10.0  # [nats]; an epoch that gains fewer is the last
+MIN_GAIN, MIRROR_SCORE = 12.0, 8.0  # least [nats] of a candidate, predicted; of a mirror, offset searched
+BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
+BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 SLIDE, SLIDE_STEP = 0.8, 0.08  # of a wavelength: range and step of a mirror's offset search
-
-
-@dataclass(frozen=True)
-class ClutterSearch:
-    """Thresholds and effort of the clutter search.
-
-    A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
-
-    Attributes:
-        epochs: rounds of everything, softer edges first. progress: nats; an epoch that gains fewer is the
-        last. min_gain: least predicted gain of a candidate [nats]; `mirror_score`: of a mirror after its
-        offset search. boxes, mirrors, sequences: most new ones in an epoch. beyond: margin of clutter around
-        the receivers' box [m]. soft: width of edges in each epoch [m], the last for all that follow. steps:
-        of the descent on everything but clutter, at the end of each epoch.
-    """
-
-    epochs: int = 6
-    progress: float = 10.0
-    min_gain: float = 12.0
-    mirror_score: float = 8.0
-    boxes: int = 4
-    mirrors: int = 5
-    sequences: int = 6
-    beyond: float = 0.15
-    soft: tuple[float, ...] = (0.08, 0.05, 0.03)
-    steps: int = 8
 
 
 def find_clutter(
     rows: Rows,
     phased: PhasedScene,
     generator: torch.Generator,
-    settings: ClutterSearch = ClutterSearch(),
     late: Callable[[], bool] = lambda: False,
     noise_floor: float = JITTER,
 ) -> PhasedScene:
     """The phased scene with clutter, or unchanged when the likelihood gains too little.
 
+    A piece must gain half the logarithm of the number of real observations per parameter:
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
+
     Args:
         rows: of one output, as many as in a search.
         phased: from the final refinement of a search.
         generator: of the candidates.
-        settings: thresholds and effort.
         late: asked again and again; nothing new is tried when it says so.
         noise_floor: known variance of the noise, in units of the rows' power.
     """
     # The kernel learned without clutter explains it: reset
     bare, quadrature = replace(phased.scene, visibility=INITIAL_KERNEL), min(phased.quadrature, QUADRATURE)
     fresh = replace(phased, scene=bare, quadrature=quadrature)
-    found = _ClutterSearcher(rows, fresh, generator, settings, noise_floor).run(late)
+    found = _ClutterSearcher(rows, fresh, generator, noise_floor).run(late)
     before, after = (PhasedPosterior(rows, each, noise_floor).factor.nll for each in (phased, found))
-    return found if after < before - settings.progress else phased
+    return found if after < before - PROGRESS else phased
 
 
 class _ClutterSearcher:
@@ -94,14 +75,13 @@ class _ClutterSearcher:
         rows: Rows,
         phased: PhasedScene,
         generator: torch.Generator,
-        settings: ClutterSearch,
         noise_floor: float,
     ) -> None:
-        self.rows, self.generator, self.settings = rows, generator, settings
+        self.rows, self.generator = rows, generator
         self.noise_floor, self.wavelength = noise_floor, LIGHT / float(rows.frequency.mean())
         self.parameter_cost = math.log(2 * len(rows)) / 2  # cost of a parameter [nats]
         self.tried: list[SmallMirror] = []
-        ends = torch.stack([rows.position.amin(0) - settings.beyond, rows.position.amax(0) + settings.beyond])
+        ends = torch.stack([rows.position.amin(0) - BEYOND, rows.position.amax(0) + BEYOND])
         self.room = ends.float()
         self._refactor(phased)
 
@@ -153,15 +133,15 @@ class _ClutterSearcher:
 
     # ---- the loop ----
     def run(self, late: Callable[[], bool]) -> PhasedScene:
-        s, start = self.settings, self.nll
+        start = self.nll
         best = start, self.phased
-        for epoch in range(s.epochs):
+        for epoch in range(EPOCHS):
             before = self.nll
             for move in (self._mirrors, self._patches, self._boxes, self._sequences):
                 if not late():
                     move()
             if not late():
-                self._descend_soft(s.soft[min(epoch, len(s.soft) - 1)])
+                self._descend_soft(SOFT_EDGES[min(epoch, len(SOFT_EDGES) - 1)])
                 self._drop()
                 self._refactor(self.phased)
             if not late():
@@ -174,7 +154,7 @@ class _ClutterSearcher:
                 found = refine_phase.refine(
                     self.rows,
                     self.phased,
-                    s.steps,
+                    STEPS,
                     self.noise_floor,
                     partial(prior.cost, sequences=sequences),
                 )
@@ -186,7 +166,7 @@ class _ClutterSearcher:
                 len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
                 self.scene.visibility,
             )  # fmt: skip
-            if late() or self.nll > before - s.progress:
+            if late() or self.nll > before - PROGRESS:
                 break
         return best[1]
 
@@ -200,17 +180,17 @@ class _ClutterSearcher:
             self._descend(10)
 
     def _mirrors(self) -> None:
-        s, scene = self.settings, self.scene
+        scene = self.scene
         found = find_mirrors(
             self.rows, self._scorer(), scene.transmitter, scene.planes,
-            walls(scene.planes, scene.sequences), self.room, 2 * s.mirrors,
+            walls(scene.planes, scene.sequences), self.room, 2 * MIRRORS,
         )  # fmt: skip
-        found = [mirror for mirror in found if mirror.score > s.min_gain]
+        found = [mirror for mirror in found if mirror.score > MIN_GAIN]
         scorer = self._scorer()
         placed = [self._placed(mirror, scorer) for mirror in [*found, *self._mirrors_on_boxes()]]
         added: list[SmallMirror] = []
         for mirror in sorted(placed, key=lambda m: -m.score):
-            if len(added) == s.mirrors or mirror.score < s.mirror_score:
+            if len(added) == MIRRORS or mirror.score < MIRROR_SCORE:
                 break
             double = any(same_mirror(mirror, other, self.wavelength) for other in added)
             if not double and self._add_mirror(mirror):
@@ -316,7 +296,7 @@ class _ClutterSearcher:
             )  # fmt: skip
             found.append((score, number, patch))
         for score, number, patch in sorted(found, key=lambda f: -f[0]):
-            if score < self.settings.min_gain:
+            if score < MIN_GAIN:
                 break
             own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
             louder = self.scene.log_amplitude.clone()
@@ -326,11 +306,11 @@ class _ClutterSearcher:
             self._try(trial, PATCH * self.parameter_cost, exact=True)
 
     def _boxes(self) -> None:
-        for _ in range(self.settings.boxes):
+        for _ in range(BOXES):
             box, score = find_box(
                 self._scorer(), self.paths, self.waves * self.visible.T, self.room, self.generator
             )
-            if score < self.settings.min_gain:
+            if score < MIN_GAIN:
                 break
             clutter = self.scene.clutter.with_box(box)
             if not self._try(replace(self.scene, clutter=clutter), BOX * self.parameter_cost):
@@ -348,7 +328,7 @@ class _ClutterSearcher:
             replace(scene, sequences=tuple(sequences)).unobstructed(self.rows)
         )
         best = scores.topk(min(60, len(sequences))).indices.tolist()
-        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, self.settings.sequences)
+        self._add(scene, [sequences[i] for i in best], 6.0, self.parameter_cost, SEQUENCES)
 
     def _relocate_boxes(self) -> None:
         """Search for every box anew, given the others."""
