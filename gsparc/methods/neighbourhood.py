@@ -47,11 +47,6 @@ class Neighbourhood:
         sets = [np.flatnonzero(self.level == number) for number in range(int(self.level.max()) + 1)]
         return [(own, cKDTree(self.places[own])) for own in sets]
 
-    @property
-    def counts(self) -> list[int]:
-        """Places of the sparsest set, of it and the next, and so on."""
-        return np.cumsum(np.bincount(self.level)).tolist()
-
     def nearest(
         self, queries: np.ndarray, without: np.ndarray | None = None, most: int | None = None
     ) -> tuple[np.ndarray, np.ndarray]:

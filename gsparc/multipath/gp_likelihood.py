@@ -126,18 +126,33 @@ def add_covariance(real: Tensor, imag: Tensor, scaled: Tensor, correlation: Tens
 
 
 @dataclass(frozen=True)
-class Factor:
-    """A factored covariance of n rows with R outputs.
+class Factored:
+    """A factored covariance of n numbers with R outputs.
 
     Attributes:
-        lower: (n, n) complex64, Cholesky factor.
-        alpha: (n, R) complex64, K^-1 y.
+        lower: (n, n) complex64 or float32, Cholesky factor.
+        alpha: (n, R), K^-1 y.
         nll: negative log marginal likelihood up to a constant.
     """
 
     lower: Tensor
     alpha: Tensor
     nll: float
+
+    @cached_property
+    def root(self) -> Tensor:
+        """(n, n), inverse of `lower`: K^-1 = root^H root."""
+        eye = torch.eye(len(self.lower), dtype=self.lower.dtype)
+        return torch.linalg.solve_triangular(self.lower, eye, upper=False)
+
+    @cached_property
+    def inverse(self) -> Tensor:
+        """K^-1 (n, n)."""
+        return torch.cholesky_inverse(self.lower)
+
+
+class Factor(Factored):
+    """A factored covariance of n complex rows."""
 
     @staticmethod
     def of(covariance: Tensor, target: Tensor) -> Factor:
@@ -154,17 +169,6 @@ class Factor:
         level = max(1.0, float(covariance.diagonal().real.mean()))
         covariance.diagonal().add_(noise + JITTER * level)
         return Factor.of(covariance, target)
-
-    @cached_property
-    def root(self) -> Tensor:
-        """(n, n), inverse of `lower`: K^-1 = root^H root."""
-        eye = torch.eye(len(self.lower), dtype=self.lower.dtype)
-        return torch.linalg.solve_triangular(self.lower, eye, upper=False)
-
-    @cached_property
-    def inverse(self) -> Tensor:
-        """K^-1 (n, n)."""
-        return torch.cholesky_inverse(self.lower)
 
     @cached_property
     def slope(self) -> Tensor:

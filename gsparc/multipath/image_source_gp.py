@@ -397,7 +397,7 @@ class ImageSourceGP(FramedMethod):
         self._fitted()
         each = torch.stack([member.left_out() for member in self.members])
         predicted = (self.weights[:, None, None] * each).sum(0)
-        return self._left_out(self.members[0].rows, predicted, self.offsets != "none")
+        return self._left_out(self.members[0].rows, predicted)
 
     # ---- reductions ----
     def knobs(self) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from gsparc.multipath.clutter.blocking import Clutter
-from gsparc.multipath.gp_likelihood import JITTER, Posterior, Scene
+from gsparc.multipath.gp_likelihood import JITTER, Factored, Posterior, Scene
 from gsparc.multipath.ridge import cholesky
 from gsparc.multipath.rows import Rows
 from gsparc.multipath.visibility_kernel import KernelVisibility
@@ -106,19 +106,8 @@ def add_source(covariance: Tensor, wave: Tensor, quadrature: float, correlation:
     )
 
 
-@dataclass(frozen=True)
-class RealFactor:
-    """A factored covariance of 2 n real numbers with R outputs.
-
-    Attributes:
-        lower: (2 n, 2 n) float32, Cholesky factor.
-        alpha: (2 n, R) float32, K^-1 y.
-        nll: negative log marginal likelihood up to a constant.
-    """
-
-    lower: Tensor
-    alpha: Tensor
-    nll: float
+class RealFactor(Factored):
+    """A factored covariance of 2 n real numbers: the real parts of n rows, then the imaginary ones."""
 
     @staticmethod
     def of(covariance: Tensor, target: Tensor) -> RealFactor:
@@ -130,16 +119,6 @@ class RealFactor:
         determinant = lower.diagonal().double().log().sum()
         nll = 0.5 * (flat * alpha).double().sum() + target.shape[1] * determinant
         return RealFactor(lower, alpha, float(nll))
-
-    @cached_property
-    def root(self) -> Tensor:
-        """(2 n, 2 n), inverse of `lower`: K^-1 = root^T root."""
-        return torch.linalg.solve_triangular(self.lower, torch.eye(len(self.lower)), upper=False)
-
-    @cached_property
-    def inverse(self) -> Tensor:
-        """K^-1 (2 n, 2 n)."""
-        return torch.cholesky_inverse(self.lower)
 
     @property
     def slope(self) -> Tensor:

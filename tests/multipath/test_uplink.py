@@ -43,7 +43,7 @@ def test_finds_three_sources_off_the_grid_and_their_other_band() -> None:
         near = (found.delay[0] - truth.delay[0, which]).abs().argmin()
         assert (found.direction[0, near] - truth.direction[0, which]).abs().max() < 1e-2
         assert (found.gain[0, near] - truth.gain[0, which]).abs() < 1e-2
-    other = aperture.at(aperture.tones + 27)
+    other = replace(aperture, tones=aperture.tones + 27)
     miss = (found.response(other) - truth.response(other)).abs().square().mean()
     assert miss < 1e-3 * truth.response(other).abs().square().mean()
 
@@ -191,7 +191,7 @@ def test_posterior_tells_the_error_of_the_other_band() -> None:
     heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
     search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
     found, _ = search(heard, torch.full((count,), noise))
-    other = aperture.at(aperture.tones + 27)
+    other = replace(aperture, tones=aperture.tones + 27)
     for where in (other, Aperture(other.places[:1], other.tones[:5])):
         miss = (found.response(where) - truth.response(where)).abs().square().mean((1, 2))
         assert 0.6 < float(miss.median() / found.error_variance(where).median()) < 1.6
