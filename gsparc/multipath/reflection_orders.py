@@ -117,8 +117,8 @@ def orthogonal_walls(scene: Scene, most: int = 8, near: float = 0.06) -> Tensor 
     for direction in triad:
         apart = sources[second] - sources[first]
         along = apart @ direction
-        concatenate = (apart - along[:, None] * direction).norm(dim=1)
-        fits = (concatenate < torch.maximum(allowed[first], allowed[second])) & (
+        across = (apart - along[:, None] * direction).norm(dim=1)
+        fits = (across < torch.maximum(allowed[first], allowed[second])) & (
             along.abs() > 2 * MIN_IMAGE_SHIFT_M
         )
         offsets = ((sources[first] + sources[second]) @ direction / 2)[fits]
