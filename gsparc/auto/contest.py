@@ -1,4 +1,4 @@
-"""Candidates tried one after the other on inner folds, within seconds, the hopeless ones given up early."""
+"""Candidates tried in turn on inner folds, within seconds, the clearly worse ones given up early."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Contest:
             trial.seconds.append(self.budget.spent - began)
             trial.over_s = max(trial.over_s, trial.seconds[-1] - (seconds or 0.0))
             first = trial.refusal is None and len(trial.residual) == 1
-            trial.stopped = first and self._hopeless(trial)
+            trial.stopped = first and self._clearly_worse(trial)
             if first and waiting == 1 and folds > 1 and self._settled(trial):
                 log.info("auto: %s: clearly better than all others, tried no further", trial.name)
                 break
@@ -104,21 +104,21 @@ class Contest:
     def _squares(self, trials: Sequence[Trial]) -> np.ndarray:
         return products(trials, self.way, min(len(trial.residual) for trial in trials))
 
-    def _hopeless(self, trial: Trial) -> bool:
+    def _clearly_worse(self, trial: Trial) -> bool:
         best = self._best(other=trial)
         if best is None or len(self.way.asked) == 1:
             return False
         return self._behind(trial, best)
 
     def _settled(self, trial: Trial) -> bool:
-        """Whether all others are hopeless beside it: its fit to all rows has the seconds of more folds."""
+        """Whether all others are clearly worse: its fit to all rows has the seconds of more folds."""
         others = [one for one in self.trials if one.usable and one is not trial]
         return bool(others) and trial.usable and all(self._behind(one, trial) for one in others)
 
     def _behind(self, trial: Trial, best: Trial) -> bool:
         gram = self._squares([trial, best])
         units = self.way.units(min(len(trial.residual), len(best.residual)))
-        return stacking.hopeless(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], units)
+        return stacking.clearly_worse(gram[:, 0, 0], gram[:, 1, 1], gram[:, 0, 1], units)
 
     def _log_trial(self, trial: Trial) -> None:
         """One line of what was found."""
